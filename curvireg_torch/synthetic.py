@@ -17,7 +17,6 @@ from .mesh.mesh import mesh_centre, mesh_radius
 from .rendering import render_colour, render_depth
 
 __all__ = ["DemoScene", "demo_scene", "example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
-
 RED, STEEL, WOOD, RUBBER = (196, 44, 34, 255), (120, 124, 130, 255), (222, 190, 138, 255), (44, 44, 48, 255)
 PAINT = [STEEL, RED, RED, WOOD, WOOD, WOOD, STEEL, *[RUBBER] * 6]  # of the parts, in their order
 DEFOCUS = 1.5  # blur of the background in px

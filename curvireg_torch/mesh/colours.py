@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 
 from ..errors import MAX_IMAGE_PIXELS
 
-TEXTURE_SIDE = 512
-"""Textures are reduced to this longer side in px; views are smaller."""
-
-ROW = 1024
-"""Samples in a row of the map that OpenCV is given, whose sides are limited."""
-
+TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
+ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
 

@@ -35,23 +35,18 @@ from ..errors import (
 from ..utils.files import file_digest, text_digest
 from .colours import colours_of_parts
 
+# Formats whose files may name buffers, material files or textures beside them
 _WITH_COMPANIONS = (".glb", ".gltf", ".obj", ".ply")
-"""Formats whose files may name buffers, material files or textures beside them."""
-
+# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or trimesh reads them
 _READ_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "EXT_texture_webp")
-"""Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or trimesh reads them."""
-
-
-Triangles = list[list[list[int]]]
-"""For each face its triangles, as positions among its corners."""
-
+Triangles = list[list[list[int]]]  # For each face its triangles, as positions among its corners
+# Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than
+# three corners, with indices that count back from the end, or with index 0
 _UNUSUAL_OBJ = re.compile(
     rb"^(?:[ \t]+\S|(?:v|vt|vn|f)\t|f +(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n]"
     rb"|[^\r\n]*(?:[-#]|(?<=[ \t/])0+(?![^/ \t\r\n]))))",
     re.MULTILINE,
 )
-"""Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than
-three corners, with indices that count back from the end, or with index 0."""
 
 
 def mesh_files(path: Path) -> list[Path]:

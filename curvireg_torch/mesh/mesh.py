@@ -85,8 +85,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     return mesh
 
 
-MANY_POINTS = 4096
-"""Points of a hull: to project more of them in every view costs more than to cast the rays."""
+MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
 
 
 def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -30,28 +30,13 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 __all__ = ["Detector", "Proposals", "detect"]
-
-TEMPLATE_SIDE = 96
-"""Side of the template views in px."""
-
-SIZE_STEP = 2.0**0.5
-"""Factor between successive sizes of the object."""
-
-SAME_OBJECT_OVERLAP = 0.5
-"""Intersection over union from which boxes show the same object."""
-
-MIN_OBJECT_SIDE = 32.0
-"""Longer side in px of the smallest object that can be recognised."""
-
-MAX_PEAKS = 500
-"""Best peaks of a photograph that boxes are selected from."""
-
-MAX_COMPARED_VIEWS = 1500
-"""Largest number of views, evenly spread over the bank, whose pairwise distances are computed."""
-
-MEDOID_ROUNDS = 10
-"""Largest number of rounds of k-medoids."""
-
+TEMPLATE_SIDE = 96  # Side of the template views in px
+SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
+SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
+MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
+MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
+MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
+MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
 Results = list[Registration | FailedRegistration]
 
 

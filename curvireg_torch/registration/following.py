@@ -22,12 +22,10 @@ from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
 __all__ = ["Follower"]
-
+# Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better
 TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
-"""Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better."""
-
+# Confidence from which a pose is followed; while it is lower, each frame is registered to check it
 BELIEVED_CONFIDENCE = 0.5
-"""Confidence from which a pose is followed; while it is lower, each frame is registered to check it."""
 
 
 class Follower:

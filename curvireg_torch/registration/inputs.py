@@ -44,21 +44,12 @@ __all__ = [
     "is_missing",
     "rig_cameras",
 ]
-
-MIN_BOX_SIDE = 12
-"""Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98."""
-
-SMALL_BOX_SIDE = 24
-"""Pixels; of a smaller box a result carries a warning."""
-
+MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
+SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
+# Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
-"""Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees."""
-
-SAME_PICTURE = 0.8
-"""Correlation of small copies of two photographs from which they may come from the same place."""
-
-MISSING_SHARE = 0.2
-"""Part of a box without pixels of the photograph, from which a result carries a warning."""
+SAME_PICTURE = 0.8  # Correlation of small copies of two photographs from which they may come from the same place
+MISSING_SHARE = 0.2  # Part of a box without pixels of the photograph, from which a result carries a warning
 
 
 @dataclass(frozen=True)

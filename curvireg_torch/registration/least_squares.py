@@ -25,18 +25,10 @@ __all__ = [
     "project",
     "step_fraction",
 ]
-
-MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1
-"""Longest step: radians, and fraction of the object's distance."""
-
-INLIER_SCALE = 2.0
-"""Distance in px at which a point match counts a quarter."""
-
-MIN_MATCHES = 8
-"""Point matches that a pose needs."""
-
-POINT_DAMPING = 1e-5
-"""Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J."""
+MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1  # Longest step: radians, and fraction of the object's distance
+INLIER_SCALE = 2.0  # Distance in px at which a point match counts a quarter
+MIN_MATCHES = 8  # Point matches that a pose needs
+POINT_DAMPING = 1e-5  # Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J
 
 
 @dataclass(frozen=True)
@@ -177,24 +169,18 @@ def nearest_rigid(T: Tensor) -> Tensor:
     return transform(U @ V, T[:, :3, 3])
 
 
+# Side in px of the square cells within which errors of contour points are correlated, and cells per side
 CELL_SIDE, CELLS_PER_SIDE = 32.0, 16
-"""Side in px of the square cells within which errors of contour points are correlated, and cells per side."""
-
+# Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
+# the surface turns away)
 NORMAL_ERROR, SIGHT_ERROR = 0.05, 0.05
-"""Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
-the surface turns away)."""
-
+# Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common
 POINT_ERROR, SHARED_ERROR = 0.6, 6.0
-"""Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common."""
-
+# A direction counts as known if this fraction of its information does not come from such errors
 OBSERVABLE_FRACTION = 0.75
-"""A direction counts as known if this fraction of its information does not come from such errors."""
-
+# Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance
 UNKNOWN_ROTATION = math.pi
-"""Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance."""
-
-MIN_TOTAL_WEIGHT = 6.0
-"""Sum of weights that a covariance needs."""
+MIN_TOTAL_WEIGHT = 6.0  # Sum of weights that a covariance needs
 
 
 def pose_covariance(

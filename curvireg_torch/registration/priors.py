@@ -14,21 +14,14 @@ from .inputs import ImageItem
 from .poses import Poses, placed
 
 __all__ = ["Limits"]
-
+# Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next
 VIEW_SPACING = 7.5
-"""Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next."""
-
+# Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known
 FIT_TOLERANCE = 3.0
-"""Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known."""
-
-AT_LIMIT_ANGLE = 1.0
-"""Degrees from a limit within which a result is reported to lie at the limit."""
-
-DISTANCE_TOLERANCE, AT_LIMIT_DISTANCE = 0.03, 0.01
-"""The same two for the distance, as fractions of its limits."""
-
+AT_LIMIT_ANGLE = 1.0  # Degrees from a limit within which a result is reported to lie at the limit
+DISTANCE_TOLERANCE, AT_LIMIT_DISTANCE = 0.03, 0.01  # The same two for the distance, as fractions of its limits
+# Fraction of a limit by which the distance at which the mesh fills the box may miss it: boxes are not exact
 BOX_DISTANCE_TOLERANCE = 0.1
-"""Fraction of a limit by which the distance at which the mesh fills the box may miss it: boxes are not exact."""
 
 
 class Limits:

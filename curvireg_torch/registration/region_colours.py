@@ -7,27 +7,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 __all__ = ["RegionModel", "colour_bins", "line_posterior"]
-
-COLOUR_LEVELS = 8
-"""Levels of each colour channel in a histogram."""
-
-SECTORS = 12
-"""Directions from the object's centre in the image, each with its own histograms."""
-
-LOCAL_WEIGHT = 0.7
-"""Weight of a sector's own histogram; the rest is the mean of all sectors."""
-
-MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3
-"""Added to probabilities, so that a colour never seen is not proof."""
-
-MAX_LOG_RATIO = 4.0
-"""Largest log ratio of one pixel."""
-
-LOG_RATIO_FACTOR = 0.3
-"""Factor of log ratios: neighbouring pixels are not independent."""
-
-HALF_RATE_COUNT = 20.0
-"""Pixels of a sector with which it learns at half of the rate."""
+COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
+SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
+LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors
+MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3  # Added to probabilities, so that a colour never seen is not proof
+MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
+LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
+HALF_RATE_COUNT = 20.0  # Pixels of a sector with which it learns at half of the rate
 
 
 def colour_bins(colours: Tensor) -> Tensor:

@@ -41,25 +41,12 @@ __all__ = [
     "used_box",
     "verdict",
 ]
-
-UNKNOWN_ROTATION = 1.0
-"""Radians of standard deviation from which the rotation about an axis counts as unknown."""
-
-RIVAL_FRACTION = 0.5
-"""Fraction of the first pose's probability from which another one makes the answer ambiguous."""
-
-HALF_TURN = 150.0
-"""Degrees from which the rotation between two poses counts as a half turn."""
-
-MIRROR_ANGLE = 30.0
-"""Degrees within which two directions of view count as mirror images of each other."""
-
-STEEP_ELEVATION = 70
-"""Degrees of elevation beyond which an object is seen from above or below."""
-
-SCHEMA = 3
-"""Version of the keys of ``result.json``; raised when a key is removed or changes its meaning."""
-
+UNKNOWN_ROTATION = 1.0  # Radians of standard deviation from which the rotation about an axis counts as unknown
+RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which another one makes the answer ambiguous
+HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
+MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
+STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
+SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
     "translation": "in the mesh file's unit; null without a camera",

@@ -41,31 +41,21 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 __all__ = ["Answer", "Found", "Rig", "RigPhotograph", "RigProblem"]
-
+# World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size
 FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
-"""World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size."""
-
+# Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
+# pose stands for it
 SAME_ANGLE, SAME_SHIFT = 15.0, 0.5
-"""Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
-pose stands for it."""
-
+# Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
+# distance, and across it in object radii
 DEPTH_ERROR, RIG_ERROR, CENTRE_ERROR = 0.08, 0.01, 0.1
-"""Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
-distance, and across it in object radii."""
-
-MAX_PLACE_DISTANCE = 16.0
-"""Squared Mahalanobis distance up to which two photographs see the object in the same place."""
-
-MIN_OVERLAP = 0.3
-"""Overlap (IoU) with the box of a photograph below which a pose lies elsewhere."""
-
+MAX_PLACE_DISTANCE = 16.0  # Squared Mahalanobis distance up to which two photographs see the object in the same place
+MIN_OVERLAP = 0.3  # Overlap (IoU) with the box of a photograph below which a pose lies elsewhere
+# Degrees within which two photographs show partly the same; the weights of equal ones add up to one
 SAME_DIRECTION = 30.0
-"""Degrees within which two photographs show partly the same; the weights of equal ones add up to one."""
-
+# Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
+# distance from the object's size that is a mistake in the unit
 MIN_PARALLAX, MAX_UNIT_FACTOR = 0.03, 30.0
-"""Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
-distance from the object's size that is a mistake in the unit."""
-
 ELSEWHERE = "where the other photographs have the object, it lies outside this one or its box"
 
 
@@ -175,8 +165,7 @@ class RigPhotograph:
         return visible & (box_iou(boxes, self.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
 
 
-Found = dict[int, RigPhotograph | CurviregError]
-"""Photographs of a rig by their index, or why they failed."""
+Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by their index, or why they failed
 
 
 @dataclass(frozen=True)

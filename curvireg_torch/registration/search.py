@@ -10,18 +10,11 @@ from ..matching import ViewDescriber
 from .poses import Poses, similarities
 
 __all__ = ["search"]
-
-STOP_MOTION = 0.05
-"""|T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)."""
-
-SEARCH_ANGLE = 15.0
-"""Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees."""
-
+STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)
+SEARCH_ANGLE = 15.0  # Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees
+# Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel
 FIRST_STEP, FINEST_STEP = 5.0, 1.0
-"""Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel."""
-
-MAX_ROUNDS = 8
-"""Largest number of rounds of six poses each."""
+MAX_ROUNDS = 8  # Largest number of rounds of six poses each
 
 
 @torch.no_grad()

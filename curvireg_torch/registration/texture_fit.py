@@ -18,39 +18,25 @@ from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, ContourSta
 from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
 
 __all__ = ["fit_texture", "surface_corners", "turned"]
-
+# Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
+# one's
 MAX_CORNERS, CORNER_SPACING, CORNER_QUALITY = 160, 5, 0.005
-"""Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the
-strongest one's."""
-
-HALF_PATCH = 7
-"""Patches around corners are 15 px wide, and lie within the silhouette."""
-
+HALF_PATCH = 7  # Patches around corners are 15 px wide, and lie within the silhouette
+# Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal
 MIN_CORRELATION = 0.4
-"""Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal."""
-
+# A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along an
+# edge
 RIVAL_DISTANCE, CLEAR_MARGIN = 4, 0.1
-"""A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along
-an edge."""
-
+# Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step
 FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
-"""Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step."""
-
+# Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and after
+# the second: patches seen from another side are found less exactly than those of the next frame, and correlate less
 PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.03, 0.15
-"""Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and
-after the second: patches seen from another side are found less exactly than those of the next frame, and correlate
-less."""
-
+# Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
+# the first round reaches
 TURN = 16.0
-"""Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
-the first round reaches."""
-
-JOINT_STEPS = 3
-"""Steps of the fit to both corners and edges."""
-
-MAX_SUPPORT_LOSS = 0.03
-"""Edge support that a fit may lose."""
-
+JOINT_STEPS = 3  # Steps of the fit to both corners and edges
+MAX_SUPPORT_LOSS = 0.03  # Edge support that a fit may lose
 Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
 
 

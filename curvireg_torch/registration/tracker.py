@@ -34,55 +34,30 @@ from .region_colours import RegionModel, colour_bins, line_posterior
 from .texture_fit import surface_corners
 
 __all__ = ["OUTSIDE", "TrackedPose", "Tracker", "boxes_at"]
-
-WINDOW_SIZE = 256
-"""Side in px of the part of a frame around the object, which all measurements share."""
-
+WINDOW_SIZE = 256  # Side in px of the part of a frame around the object, which all measurements share
+# Added around the object's box, as a fraction of its longer side: room for motion that was not predicted
 WINDOW_MARGIN = 0.3
-"""Added around the object's box, as a fraction of its longer side: room for motion that was not predicted."""
-
+# Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
-"""Message of a :class:`LostObjectError`."""
-
-SEARCH_RADII = (6.0, 4.0, 2.5)
-"""Search radius in px of edges and of the end of the object's colours, one a round."""
-
-STEPS_PER_ROUND = 2
-"""Least-squares steps per round."""
-
+SEARCH_RADII = (6.0, 4.0, 2.5)  # Search radius in px of edges and of the end of the object's colours, one a round
+STEPS_PER_ROUND = 2  # Least-squares steps per round
+# Weights, relative to edges, of colours and of points from the last frame and from a keyframe
 REGION_WEIGHT, POINT_WEIGHT, KEYFRAME_WEIGHT = 2.0, 0.3, 0.5
-"""Weights, relative to edges, of colours and of points from the last frame and from a keyframe."""
-
-REGION_VARIANCE = 0.5
-"""Variance in px² added to that of the end of the object's colours."""
-
-LEARNING_RATE = 0.2
-"""Weight of a new frame in the colour histograms."""
-
-LEARNED_BAND = (2, 24)
-"""Nearest and farthest distance in px from the outline at which colours are learned."""
-
-REGION_FEATURE_RADIUS = 8
-"""Radius in px of the posterior from which :attr:`TrackedPose.features` are computed."""
-
+REGION_VARIANCE = 0.5  # Variance in px² added to that of the end of the object's colours
+LEARNING_RATE = 0.2  # Weight of a new frame in the colour histograms
+LEARNED_BAND = (2, 24)  # Nearest and farthest distance in px from the outline at which colours are learned
+REGION_FEATURE_RADIUS = 8  # Radius in px of the posterior from which TrackedPose.features are computed
+# Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another
 MAX_KEYFRAMES, KEYFRAME_ANGLE = 30, 8.0
-"""Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another."""
-
+# Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place
 PYRAMID_LAST, PYRAMID_KEYFRAME = 3, 1
-"""Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place."""
-
-FLOW_PATCH = 15
-"""Side of the patches of the optical flow in px."""
-
-MAX_RETURN_ERROR = 1.5
-"""Largest distance in px between a corner and where the flow back from its match ends."""
-
+FLOW_PATCH = 15  # Side of the patches of the optical flow in px
+MAX_RETURN_ERROR = 1.5  # Largest distance in px between a corner and where the flow back from its match ends
+# Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree
 FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
-"""Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree."""
-
+# Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
+# outline: nearer to it, patches show the background
 CORNER_QUALITY, CORNER_INSET = 0.01, 3
-"""Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
-outline: nearer to it, patches show the background."""
 
 
 @dataclass(frozen=True)

@@ -16,17 +16,12 @@ from ..utils.threads import for_each
 from .depth import NEAREST, check_render_arguments
 
 __all__ = ["EmbreeRenderer", "RasterRenderer", "RayScene"]
-
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
-
+# Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws
 BESIDE = 1e-3
-"""Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws."""
-
-
-FARTHEST = 1000.0
-"""Depth, in object radii, beyond which single precision does not separate object and background."""
+FARTHEST = 1000.0  # Depth, in object radii, beyond which single precision does not separate object and background
 
 
 class RayScene:

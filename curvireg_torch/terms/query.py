@@ -13,10 +13,8 @@ from ..geometry.crops import check_boxes, crop_squares, square_boxes
 from ..utils.checks import as_numbers, check_photograph, check_tensor
 
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
-
+# Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
-"""Shifts in x and y in units of the box jitter, and the exponent of the scale."""
-
 _BATCHED = ("regions", "field", "descriptors", "points", "shapes")
 
 

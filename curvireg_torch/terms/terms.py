@@ -385,5 +385,5 @@ class _AppearanceModule(RerankingModule):
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 
 
+# Terms by the name that JSON files of pipelines use
 TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape, Appearance)}
-"""Terms by the name that JSON files of pipelines use."""
