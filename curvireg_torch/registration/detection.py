@@ -221,11 +221,8 @@ def _score(result: Registration) -> float:
 
 @dataclass(frozen=True)
 class _Templates:
-    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading.
-
-    ``boxes`` (K, 4) are in px of the templates, from the outer border; at the distances ``unit`` (K,) a camera with a
-    focal length of 1 px sees the object at this size.
-    """
+    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading; ``boxes`` (K, 4) in px of the
+    templates, from the outer border; ``unit`` (K,) distances at which a focal length of 1 px shows this size."""
 
     views: Tensor
     weights: list[list[Tensor]]
@@ -236,14 +233,13 @@ class _Templates:
 class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
-    A few representative views (``representative_views``) are compared with every position of the photograph, at
-    sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of the backbone's features of the view,
-    shaded grey and, where the mesh has colours, in colour, and of the photograph over the cells that the view covers;
-    its response is the similarity in standard deviations above its mean over the photograph. Peaks over position, size
-    and view are boxes.
+    A few representative views are compared with every position of the photograph, at sizes in steps of :math:`\sqrt 2`.
+    A view's similarity is the mean cosine of the backbone's features of the view, shaded grey and, where the mesh has
+    colours, in colour, and of the photograph over the cells that the view covers; its response is the similarity in
+    standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
 
     Args:
-        matcher: of the bank; ``locate`` of its pipeline holds the settings.
+        matcher: of the bank; ``detection`` of its pipeline holds the settings.
 
     Example:
         >>> import trimesh
@@ -405,8 +401,7 @@ def representative_views(bank: ViewBank, count: int) -> Tensor:
     """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``.
 
     The distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their
-    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before;
-    views are then assigned to their nearest medoid, and medoids recomputed, until nothing changes.
+    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before.
     """
     views = torch.arange(len(bank))
     if len(views) > MAX_COMPARED_VIEWS:

@@ -79,15 +79,6 @@ class Follower:
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
-
-        Example:
-            >>> import curvireg_torch as cr
-            >>> from curvireg_torch.synthetic import example_mesh
-            >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), progress=False)
-            >>> follow = Follower(cr.Registrar(bank), cr.camera_matrix(150.0, 150.0, 79.5, 59.5))
-            >>> pose = torch.eye(4)
-            >>> pose[2, 3] = 8.0
-            >>> follow.start(torch.rand(3, 120, 160), pose)
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))

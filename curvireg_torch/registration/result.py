@@ -82,17 +82,16 @@ class Hypothesis:
         translation: (3,) float64 in model units, None without a camera matrix.
         score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose, how clearly and how
             near to its outline the object's colours end.
-        evidence: the features that the hypotheses are ordered by, see :data:`.poses.POSE_FEATURES`; of a tracked
-            pose, those of its confidence.
+        evidence: the features that the hypotheses are ordered by; of a tracked pose, those of its confidence.
         allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
-        distance: distance of the object's centre in model units.
+        distance: of the object's centre in model units.
         projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto
             the photograph; without a camera matrix, those of a camera that looks straight at the object.
         view: index of the bank's view that the hypothesis started from.
         edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
         covariance: (6, 6) float64 of rotation (rad) about the camera's x, y, z axes and translation (model units) along
-            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose; None without a camera matrix,
-            without contour fit, and where too few edges were found. It assumes that the camera matrix is right.
+            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose and camera matrix; None
+            without a camera matrix, without contour fit, and where too few edges were found.
     """
 
     rotation: Tensor
@@ -158,15 +157,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class PhotographPose:
-    """The pose of an object that was registered in several photographs, in one of them.
+    """The pose in one of the photographs that an object was registered in together.
 
     Attributes:
         T_cam_from_model: (4, 4) float64.
-        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared: the given one, one that replaced
-            it, or one around the pose; None for a photograph that was not read.
+        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it was not read.
         edge_support, similarity: of the pose in this photograph; None where it was not compared.
-        contribution: score by which the photograph prefers the pose to its best rival: negative if it prefers the
-            rival, 0 if it does not count.
+        contribution: score by which the photograph prefers the pose to its best rival, 0 if it does not count.
         failure: why the photograph does not count, in words; None if it does.
     """
 
@@ -179,24 +176,17 @@ class PhotographPose:
 
     def to_dict(self) -> dict[str, Any]:
         """All attributes as JSON values, the pose as ``rotation`` and ``translation``."""
-        T, box = self.T_cam_from_model, self.box
-        return {
-            "rotation": T[:3, :3].tolist(),
-            "translation": T[:3, 3].tolist(),
-            "box": None if box is None else box.tolist(),
-            "edge_support": self.edge_support,
-            "similarity": self.similarity,
-            "contribution": self.contribution,
-            "failure": self.failure,
-        }
+        rest = dict(vars(self))
+        T, box = rest.pop("T_cam_from_model"), rest.pop("box")
+        pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
+        return {**pose, "box": None if box is None else box.tolist(), **rest}
 
 
 @dataclass(frozen=True)
 class Registration:
     """Poses of one object in one photograph, best first.
 
-    The attributes of the best :class:`Hypothesis` (``rotation``, ``translation``, ``score``, ``viewpoint``,
-    ``edge_support``, ``projection``, ...) are attributes of the registration too; ``covariance`` and
+    The attributes of the best :class:`Hypothesis` are attributes of the registration too; ``covariance`` and
     ``standard_deviations`` are None where it is not reliable.
 
     Attributes:
@@ -208,11 +198,9 @@ class Registration:
         detection: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
         prior: the limits on the pose that were given.
-        prior_contradiction: "better outside": a pose outside the limits fits better by the same evidence, or the box
-            asks for a distance outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a
-            limit. None otherwise.
-        warnings: what is questionable about the box, the camera and the mesh, in words; a result with one is not
-            reliable.
+        prior_contradiction: "better outside": a pose outside the limits fits better, or the box asks for a distance
+            outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None otherwise.
+        warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
         model: number of the mesh, of several.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
             ``T_world_from_model``, along the world's axes.
@@ -400,13 +388,10 @@ class FailedRegistration:
 
 
 def ambiguity(rotations: Tensor) -> str | None:
-    """How poses differ, in words; None for a single one.
+    """How poses (K, 3, 3) differ, in words; None for a single one.
 
-    "half turn": the second differs from the first by a rotation of nearly 180 degrees. "mirror": they are seen from
-    directions that are mirror images at a coordinate plane of the mesh. "several": anything else, or more than two.
-
-    Args:
-        rotations: (K, 3, 3).
+    "half turn": by a rotation of nearly 180 degrees; "mirror": they are seen from directions that are mirror images at
+    a coordinate plane of the mesh; "several": anything else, or more than two.
 
     Example:
         >>> ambiguity(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))]))
@@ -452,21 +437,12 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
     found = [(result, result.detection) for result in results if result.detection is not None]
     first = found[0][1]
-    return {
-        "score": first.score,
-        "proposals": [
-            {"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)
-        ],
-        "instances": [
-            {
-                "box": at.box.tolist(),
-                "score": at.score,
-                "confidence": result.confidence,
-                **result.hypotheses[0].pose_dict(),
-            }
-            for result, at in found
-        ],
-    }
+    proposals = [{"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)]
+    instances = [
+        {"box": at.box.tolist(), "score": at.score, "confidence": result.confidence, **result.hypotheses[0].pose_dict()}
+        for result, at in found
+    ]
+    return {"score": first.score, "proposals": proposals, "instances": instances}
 
 
 def used_box(document: Mapping[str, Any]) -> list[float]:
@@ -506,11 +482,9 @@ def verdict(probability: float | None, none: float | None, reliable: bool) -> st
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which the object is seen, in degrees that the option ``--azimuth`` takes.
+    """The side from which a (3, 3) rotation shows the object, in degrees that the option ``--azimuth`` takes.
 
-    Args:
-        rotation: (3, 3), from the mesh file's axes to the camera.
-        up, front: axes of the mesh, see :func:`.object_frame`.
+    ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`.
 
     Example:
         >>> from curvireg_torch.geometry import rotation_from_viewpoint

@@ -112,8 +112,8 @@ def in_frames(axes: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RigPhotograph:
-    """A registered photograph ``index`` of a rig: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the
-    ``box`` (4,) in which poses are compared, the crops of it, and the registration of it alone."""
+    """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the ``box``
+    (4,) in which poses are compared, the crops of it, and the registration of it alone."""
 
     index: int
     camera: Tensor
@@ -171,7 +171,7 @@ Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by thei
 @dataclass(frozen=True)
 class Answer:
     """M candidate poses in the world, best first, with ``evidence`` (V, M, 4) and ``scores`` (V, M) in V photographs,
-    and covariances (M, 6, 6), NaN for those that are not finished."""
+    and covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
     evidence: Tensor

@@ -43,17 +43,11 @@ Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
 def surface_corners(
     grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
 ) -> tuple[np.ndarray, Tensor]:
-    """Corners inside the object's outline, and the points of the surface that they show.
+    """uv (C, 2) px, whole numbers in float32, of corners of ``grey`` (S, S) uint8, and the points (1, C, 3) of the
+    model there.
 
-    Args:
-        grey: (S, S) uint8.
-        depth: (1, 1, S, S) of the mesh at the pose.
-        T, K: (1, 4, 4) pose and (1, 3, 3) camera.
-        quality: least strength as a fraction of the strongest corner's.
-        inside: least distance from the outline in px.
-
-    Returns:
-        uv (C, 2) px, whole numbers in float32, and points of the model (1, C, 3).
+    They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4, 4) with
+    camera ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest.
     """
     side = 2 * inside + 1
     mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
@@ -182,13 +176,8 @@ def _as_array(picture: Tensor) -> np.ndarray:
 def match_patches(
     view: np.ndarray, photograph: np.ndarray, corners: np.ndarray, radius: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (C, 2) in px to where patches of a view correlate most, and weights (C,) in [0, 1] of these matches.
-
-    Args:
-        view, photograph: (S, S, 3) float32.
-        corners: (C, 2) whole numbers, x and y of the middles of the patches, which lie within the view.
-        radius: of the search in px.
-    """
+    """Offsets (C, 2) in px to where patches of a view correlate most within a ``radius`` of the photograph, both (S, S,
+    3) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of these matches."""
     border = HALF_PATCH + radius
     padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
     offset, weight = np.zeros((len(corners), 2)), np.zeros(len(corners))

@@ -73,13 +73,10 @@ class Frame:
 
     @classmethod
     def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
-        """The square around a mesh, ``WINDOW_SIZE`` px wide.
+        """The square around a mesh at ``T`` (1, 4, 4), of an image (1 or 3, H, W) in [0, 1] or uint8 with camera ``K``
+        (3, 3).
 
-        Args:
-            image: (C, H, W), C = 1 or 3, in [0, 1] or uint8; missing pixels are filled from their neighbours.
-            K: (3, 3) float64 camera matrix in px.
-            hull, contours: (V, 3) float64 points, and contours, of the mesh.
-            T: (1, 4, 4) float64 pose.
+        Missing pixels are filled from their neighbours.
 
         Raises:
             LostObjectError: the mesh lies behind the camera, or outside the image.
@@ -216,11 +213,8 @@ class Tracker:
         self.accept(first)
 
     def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
-        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is.
-
-        Raises:
-            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
-        """
+        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is; errors as
+        :meth:`start`."""
         start = T.detach().cpu().double()[None]
         frame = self._frame(image, K, start)
         return self._tracked(frame, frame.problem.state(start), [])
