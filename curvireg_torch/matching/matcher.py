@@ -8,7 +8,6 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from ..errors import InvalidInputError
 from ..features import field_points
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
@@ -27,6 +26,7 @@ from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
 __all__ = ["Ranking", "ViewMatcher", "distinct_views"]
+CHUNK_SIZE = 16  # photographs in memory at a time
 MAX_CACHED_VIEWS = 2048  # Views whose reranking features are cached, 35 kB each at 128 px
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose reranking features are computed at a time
@@ -67,12 +67,10 @@ class Ranking:
 
     @property
     def hog(self) -> Tensor:
-        """``terms["hog"]``."""
         return self.terms["hog"]
 
     @property
     def repeatability(self) -> Tensor:
-        """``terms["repeatability"]``."""
         return self.terms["repeatability"]
 
     def top(self, k: int) -> Tensor:
@@ -108,11 +106,6 @@ def distinct_views(
 
     Returns:
         (K,) view indices, best first, K <= count.
-
-    Example:
-        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))])     # 180 degrees about z
-        >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
-        [1]
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
@@ -136,8 +129,8 @@ class ViewMatcher(nn.Module):
     The box of each photograph is cropped as the views are, filtered and described; each ranking term compares it with
     all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms take the best over a few jittered crops.
 
-    Photographs are described and compared in batches. The composition of a batch and the number of torch's threads
-    change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar` prevents that.
+    The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
+    :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
         bank: the views of a mesh.
@@ -145,9 +138,7 @@ class ViewMatcher(nn.Module):
             the bank, unless the bank's views were passed by the caller.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
             photographs as (B, 3, S, S).
-        box_jitter: instead of the pipeline's.
         renderer: for views that a :class:`RerankingTerm` needs.
-        chunk_size: photographs in memory at a time.
 
     Raises:
         BankError: the bank was built with other settings or for another pose prior than the pipeline's.
@@ -167,19 +158,13 @@ class ViewMatcher(nn.Module):
         *,
         pipeline: Pipeline | None = None,
         field: nn.Module | None = None,
-        box_jitter: float | None = None,
         renderer: str | DepthRenderer = "auto",
-        chunk_size: int = 16,
     ) -> None:
         super().__init__()
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
-        if box_jitter is not None:
-            pipeline = replace(pipeline, box_jitter=box_jitter)
-        if chunk_size < 1:
-            raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        self.bank, self.chunk_size, self._renderer = bank, chunk_size, renderer
+        self.bank, self._renderer = bank, renderer
         self._feature_cache: dict[str, dict[int, Tensor]] = {}
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
@@ -205,8 +190,8 @@ class ViewMatcher(nn.Module):
         """
         boxes = as_boxes(boxes, len(images))
         parts = [
-            self.rank(self.query(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size]))
-            for i in range(0, max(1, len(images)), self.chunk_size)
+            self.rank(self.query(images[i : i + CHUNK_SIZE], boxes[i : i + CHUNK_SIZE]))
+            for i in range(0, max(1, len(images)), CHUNK_SIZE)
         ]
         return Ranking.cat(parts)
 

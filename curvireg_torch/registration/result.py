@@ -3,10 +3,10 @@
 import html
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -24,6 +24,8 @@ from .confidence import RELIABLE
 
 if TYPE_CHECKING:
     from .registrar import Registrar
+
+Value = TypeVar("Value")
 
 __all__ = [
     "SCHEMA",
@@ -182,6 +184,16 @@ class PhotographPose:
         return {**pose, "box": None if box is None else box.tolist(), **rest}
 
 
+class _OfBest(Generic[Value]):
+    """An attribute of a registration that is one of its best hypothesis."""
+
+    def __init__(self, get: Callable[[Hypothesis], Value]) -> None:
+        self._get = get
+
+    def __get__(self, result: "Registration", owner: type) -> Value:
+        return self._get(result.hypotheses[0])
+
+
 @dataclass(frozen=True)
 class Registration:
     """Poses of one object in one photograph, best first.
@@ -221,41 +233,15 @@ class Registration:
     ok = True
     """False of a :class:`FailedRegistration`."""
 
-    @property
-    def rotation(self) -> Tensor:
-        return self.hypotheses[0].rotation
-
-    @property
-    def translation(self) -> Tensor | None:
-        return self.hypotheses[0].translation
-
-    @property
-    def transform(self) -> Tensor | None:
-        return self.hypotheses[0].transform
-
-    @property
-    def viewpoint(self) -> tuple[float, float, float]:
-        return self.hypotheses[0].viewpoint
-
-    @property
-    def score(self) -> float:
-        return self.hypotheses[0].score
-
-    @property
-    def edge_support(self) -> float | None:
-        return self.hypotheses[0].edge_support
-
-    @property
-    def allocentric_rotation(self) -> Tensor:
-        return self.hypotheses[0].allocentric_rotation
-
-    @property
-    def distance(self) -> float:
-        return self.hypotheses[0].distance
-
-    @property
-    def projection(self) -> tuple[Tensor, Tensor]:
-        return self.hypotheses[0].projection
+    rotation = _OfBest(lambda best: best.rotation)
+    translation = _OfBest(lambda best: best.translation)
+    transform = _OfBest(lambda best: best.transform)
+    viewpoint = _OfBest(lambda best: best.viewpoint)
+    score = _OfBest(lambda best: best.score)
+    edge_support = _OfBest(lambda best: best.edge_support)
+    allocentric_rotation = _OfBest(lambda best: best.allocentric_rotation)
+    distance = _OfBest(lambda best: best.distance)
+    projection = _OfBest(lambda best: best.projection)
 
     @property
     def confidence(self) -> float | None:
