@@ -65,17 +65,6 @@ def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkey
         Backbone()
 
 
-def test_backbone_spreads_match_measured_standard_deviations(network):
-    """Measured on procedural clutter, whose features vary slightly less than those of ImageNet."""
-    generator = torch.Generator().manual_seed(0)
-    pictures = torch.stack([procedural_background((128, 128), generator) for _ in range(8)])
-    for features, spread, (low, high) in zip(
-        network(pictures), network.spreads, ((0.8, 0.95), (0.7, 0.82)), strict=True
-    ):
-        measured = (features - features.mean(dim=(2, 3), keepdim=True)).square().mean(dim=(0, 2, 3)).sqrt()
-        assert low < float((measured / spread).median()) < high
-
-
 def images(n, size=64, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return torch.stack([procedural_background((size, size), generator) for _ in range(n)])

@@ -180,10 +180,3 @@ def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide() -> None:
     field = torch.zeros(1, 2, 5, 8)
     field[0, 0, :, 2:6] = torch.tensor([1.0, 2.0, 2.0, 1.0])
     assert field_points(field, fraction=1.0)[0, 0].sum(dim=1).tolist() == [1] * 5
-
-
-def test_field_points_of_zero_fields_and_bad_input() -> None:
-    assert not field_points(torch.zeros(2, 2, 8, 8)).any()
-    assert field_points(torch.zeros(0, 2, 8, 8)).shape == (0, 1, 8, 8)
-    with pytest.raises(InvalidInputError, match="fraction"):
-        field_points(torch.zeros(1, 2, 8, 8), fraction=0.0)

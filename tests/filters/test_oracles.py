@@ -10,7 +10,7 @@ from skimage.feature import hessian_matrix_eigvals
 
 from curvireg_torch import filters
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
-from curvireg_torch.filters.operations import central_derivatives, is_directional_maximum, smooth
+from curvireg_torch.filters.operations import central_derivatives, smooth
 
 from .layer_cases import photos
 
@@ -156,18 +156,3 @@ def test_dominant_eigenvector_against_lapack() -> None:
     value = (rayleigh * v).sum(dim=1)
     torch.testing.assert_close(rayleigh, value[:, None] * v, atol=1e-12, rtol=1e-9)
     torch.testing.assert_close(value.abs(), values.abs().amax(dim=1))
-
-
-@pytest.mark.parametrize("angle", [0.0, 22.0, 23.0, 45.0, 67.0, 68.0, 90.0, 112.0, 113.0, 135.0, 157.0, 158.0])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_is_directional_maximum_rounds_directions_to_45_degrees(angle: float, sign: float) -> None:
-    """Only the two neighbours on the rounded axis count."""
-    axis = [(1, 0), (1, 1), (0, 1), (-1, 1)][round(angle / 45.0) % 4]
-    length = torch.full((1, 1, 3, 3), 2.0)
-    length[..., 1, 1] = 1.0
-    radians = torch.deg2rad(torch.tensor(angle))
-    x, y = (sign * f(radians).expand(1, 1, 3, 3) for f in (torch.cos, torch.sin))
-    assert not bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])
-    for side in (1, -1):
-        length[..., 1 + side * axis[1], 1 + side * axis[0]] = 0.5
-    assert bool(is_directional_maximum(length, x, y)[0, 0, 1, 1])

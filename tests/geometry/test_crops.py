@@ -15,14 +15,6 @@ def ramp(height: int, width: int) -> torch.Tensor:
     return torch.stack([x, y])[None]
 
 
-def test_square_boxes_match_values_by_hand() -> None:
-    boxes = torch.tensor([[10.0, 20.0, 30.0, 24.0], [0.0, 0.0, 2.0, 8.0]])
-    assert g.square_boxes(boxes, 0.0).tolist() == [[10.0, 12.0, 30.0, 32.0], [-3.0, 0.0, 5.0, 8.0]]
-    assert g.square_boxes(boxes, 0.25).tolist() == [[5.0, 7.0, 35.0, 37.0], [-5.0, -2.0, 7.0, 10.0]]
-    with pytest.raises(InvalidInputError, match="margin"):
-        g.square_boxes(boxes, -0.1)
-
-
 def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
@@ -86,14 +78,10 @@ def test_crop_images_is_batch_independent() -> None:
     ("box", "match"),
     [
         ([float("nan"), 0.0, 5.0, 5.0], "finite"),
-        ([0.0, 0.0, float("inf"), 5.0], "finite"),
         ([0.0, 0.0, 1e9, 5.0], r"beyond 1e\+06 px; give pixel coordinates of the 30 x 20"),
         ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
-        ([0.0, 6.0, 5.0, 5.0], "X0 < X1"),
         ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),
-        ([0.0, -9.0, 5.0, -0.5], "entirely outside"),
         ([29.5, 0.0, 40.0, 5.0], "entirely outside"),
-        ([0.0, 19.5, 5.0, 40.0], "entirely outside"),
     ],
 )
 def test_check_boxes_refuses_boxes_without_pixels(box: list[float], match: str) -> None:

@@ -69,11 +69,6 @@ def test_bank_key_depends_on_everything(monkeypatch):
     assert len(set(keys)) == len(keys)
 
 
-def test_bank_key_depends_on_code_that_exists():
-    package = Path(cache.__file__).parents[1]
-    assert not [part for part in cache._SOURCES if not (package / part).exists()]
-
-
 def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
     meshes = [trimesh.creation.box(), standing(), textured(uv=100.0), textured(uv=100.0, level=1)]
     options = {"pipeline": PIPELINE, "folder": tmp_path, "progress": False}
@@ -173,21 +168,6 @@ def test_cached_bank_warns_of_an_unwritable_folder(tmp_path, monkeypatch):
     for _ in range(2):
         cached_box(tmp_path / "new")
     assert list_cache(tmp_path / "new") == []
-
-
-def test_cached_bank_warns_of_files_that_cannot_be_removed(tmp_path, monkeypatch):
-    unlink = Path.unlink
-
-    def refuse_banks(path, missing_ok=False):
-        if path.suffix == ".safetensors":
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        unlink(path, missing_ok=missing_ok)
-
-    cached_box(tmp_path)
-    monkeypatch.setattr(Path, "unlink", refuse_banks)
-    monkeypatch.setenv("CURVIREG_CACHE_LIMIT", "10")
-    with pytest.warns(UserWarning, match=r"exceeds its limit: .*bank-.* cannot be removed \(Permission denied"):
-        assert len(cached_box(tmp_path, 2.0)) == len(VIEWS)
 
 
 def needs_fork(test):

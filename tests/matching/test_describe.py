@@ -52,16 +52,6 @@ def test_cameras_of_boxes_approximate_parallel_projection(truck):
     assert float((projected_boxes(describe.hull, T, K) - boxes).abs().max()) < 130.0 * 0.02
 
 
-def test_silhouettes_fill_their_crops_up_to_the_margin(bank):
-    S = bank.settings.image_size
-    expected = S / (1.0 + 2.0 * bank.settings.margin)
-    for silhouette in bank.silhouettes_at(torch.arange(0, len(bank), 7)):
-        y, x = silhouette.nonzero(as_tuple=True)
-        longer = max(int(y.max() - y.min()), int(x.max() - x.min())) + 1
-        assert abs(longer - expected) < 2.5
-        assert bool(silhouette[S // 2].any())
-
-
 def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     fine = trimesh.util.concatenate([trimesh.creation.icosphere(5), trimesh.creation.box((0.4, 0.5, 2.6))])
     views = sample_views(azimuth_step=120, elevations=[-20, 35])

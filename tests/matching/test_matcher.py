@@ -44,14 +44,15 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     assert ranking.top(3).equal(ranking.order[:, :3])
 
 
-def test_matcher_is_batch_independent(bank, matcher):
+def test_matcher_is_batch_independent(matcher, monkeypatch):
     images, boxes = batch(0, 1, 2)
     together = matcher(images, boxes)
     loader = DataLoader(list(zip(images, boxes, strict=True)), batch_size=2)
     parts = [Ranking.cat([matcher(*part) for part in loader]) for _ in range(2)]
     assert torch.equal(parts[0].scores, parts[1].scores)
     assert torch.equal(parts[0].order, parts[1].order)
-    chunked = ViewMatcher(bank, chunk_size=2)(images, boxes)
+    monkeypatch.setattr("curvireg_torch.matching.matcher.CHUNK_SIZE", 2)
+    chunked = matcher(images, boxes)
     single = Ranking.cat([matcher(images[i : i + 1], boxes[i : i + 1]) for i in range(3)])
     for other in (parts[0], chunked, single, matcher(list(images), boxes)):
         torch.testing.assert_close(other.scores, together.scores, rtol=1e-4, atol=1e-5)
@@ -79,10 +80,7 @@ def test_ranking_breaks_ties_in_the_order_of_the_bank(bank, matcher):
     [
         (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
         (torch.rand(1, 3, 64, 64), [[500.0, 5, 600, 50]], "outside"),
-        (torch.rand(1, 3, 64, 64), [[5, 5, float("nan"), 50]], "finite"),
-        (torch.rand(1, 3, 64, 64), [[5.0, 5, 50]], "shape"),
         (torch.rand(2, 3, 64, 64), [[5.0, 5, 50, 50]] * 3, r"shape \(2, 4\), one for each image, got \(3, 4\)"),
-        (torch.rand(1, 4, 64, 64), [[5.0, 5, 50, 50]], "channels"),
         (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
     ],
 )
@@ -94,12 +92,6 @@ def test_matcher_refuses_unusable_input(matcher, image, boxes, message):
 def test_matcher_takes_an_empty_batch(bank, matcher):
     ranking = matcher([], torch.zeros(0, 4))
     assert ranking.scores.shape == ranking.order.shape == ranking.hog.shape == (0, len(bank))
-
-
-def test_ranking_slice_owns_its_memory(matcher):
-    ranking = matcher(*batch(0, 1, 2))[1:2]
-    for x in (ranking.scores, ranking.order, *ranking.terms.values()):
-        assert x.untyped_storage().nbytes() == x.numel() * x.element_size()
 
 
 @pytest.mark.parametrize("channels", [3, 1])
@@ -126,16 +118,6 @@ def test_matcher_weights_terms(bank):
     torch.testing.assert_close(ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0)
     alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(images, boxes)
     assert set(alone.terms) == {"hog"}
-
-
-def test_matcher_in_half_precision(bank):
-    for whitening in ("none", "bank"):
-        pipeline = bank.pipeline.with_term("hog", whitening=whitening)
-        single = ViewMatcher(bank, pipeline=pipeline)(*batch(0))
-        half = ViewMatcher(bank, pipeline=pipeline).half()(*batch(0))
-        assert half.scores.dtype == torch.float32
-        torch.testing.assert_close(half.hog, single.hog, rtol=0, atol=4e-3)
-        torch.testing.assert_close(half.repeatability, single.repeatability, rtol=0, atol=4e-3)
 
 
 def test_distinct_views_applies_symmetries_to_the_model():

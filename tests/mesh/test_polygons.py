@@ -11,7 +11,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh.files import divide_faces, obj_with_triangles, off_with_triangles
+from curvireg_torch.mesh.files import divide_faces, obj_with_triangles
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
@@ -198,10 +198,3 @@ def test_load_mesh_refuses_damaged_polygons(tmp_path: Path, kind: str) -> None:
         path.write_bytes(damaged)
         with pytest.raises(MeshError, match=path.name):
             cr.load_mesh(path)
-
-
-def test_triangles_are_left_unchanged(tmp_path: Path) -> None:
-    for suffix, rewrite in (("obj", obj_with_triangles), ("off", off_with_triangles)):
-        trimesh.creation.box().export(tmp_path / f"a.{suffix}")
-        data = (tmp_path / f"a.{suffix}").read_bytes()
-        assert rewrite(data) == data

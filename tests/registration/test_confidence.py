@@ -22,7 +22,6 @@ from curvireg_torch.registration.confidence import (
     are_near,
     concentration,
     confidence_features,
-    detection_probability,
     hypothesis_probabilities,
     is_calibrated,
     registration_confidence,
@@ -98,18 +97,12 @@ def test_probabilities_of_hypotheses_in_closed_form():
     assert hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
-def test_response_and_similarity_raise_the_probability_of_a_detection():
-    assert detection_probability(8.0, 0.7) > detection_probability(4.0, 0.7)
-    assert detection_probability(5.0, 0.8) > detection_probability(5.0, 0.7)
-
-
 @pytest.mark.parametrize(
     ("pipeline", "calibrated"),
     [
         (Pipeline(), True),
         (replace(Pipeline(), hypotheses=1, box_jitter=0.0), True),
         (replace(Pipeline(), contours=False), False),
-        (Pipeline().with_term("hog", whitening="bank"), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),

@@ -42,13 +42,6 @@ def test_symmetric_poses_are_not_distinct():
     assert distinct_poses(turned, score, symmetry_transforms(HALF_TURN)).tolist() == [True, False]
 
 
-def test_poses_are_joined_and_replaced():
-    joined = Poses.cat([poses([1.0, 2.0]), poses([3.0])])
-    assert joined.view.tolist() == [0, 1, 0]
-    put = joined.replaced(torch.tensor([1]), joined[torch.tensor([2])])
-    assert torch.equal(put.rotation, joined.rotation[[0, 2, 2]])
-
-
 def ranking(scores: torch.Tensor, allowed: torch.Tensor | None = None) -> Ranking:
     return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {}, allowed)
 

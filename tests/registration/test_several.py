@@ -10,7 +10,6 @@ from curvireg_torch import Registration, rotation_error, rotation_from_viewpoint
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration.result import result_document
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
@@ -194,11 +193,3 @@ def test_bad_photographs_and_boxes():
         registered(images, boxes[:2], cameras)
     with pytest.raises(InvalidInputError, match="needs the camera matrix"):
         learned_registrar().register_views(images, boxes, None, cameras)
-
-
-def test_document_lists_the_photographs(easy):
-    document = result_document(easy, learned_registrar(), {})
-    assert document["rotation"] == easy.rotation.tolist()
-    assert [set(view) for view in document["views"]] == [
-        {"rotation", "translation", "box", "edge_support", "similarity", "contribution", "failure"}
-    ] * 3

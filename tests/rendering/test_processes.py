@@ -67,21 +67,3 @@ def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
     """embree and torch work in the child; OpenGL cannot, and the error says what to do."""
     require(*backends)
     assert run_script(_SCENE + _FORK, *backends, OMP_NUM_THREADS="2").split() == codes
-
-
-def test_opengl_context_is_deleted_at_exit() -> None:
-    require("pyrender")
-    script = """
-atexit.register(lambda: print(opengl._context))  # runs last, because it is registered first
-for i in range(30):
-    make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (30 + i % 3, 40))
-print(len(opengl._context[1]._renderer._meshes))
-"""
-    assert run_script(_SCENE + script).split() == ["1", "None"]
-
-
-def test_triton_loads_after_opengl() -> None:
-    """Mesa's LLVM and triton's in one process crash unless triton's is loaded first."""
-    pytest.importorskip("triton")
-    require("pyrender")
-    run_script(_SCENE + 'make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (32, 32)); import triton')
