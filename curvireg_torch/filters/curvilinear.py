@@ -236,35 +236,19 @@ def principal_curvature_image(
 
 
 class ImageGradient(FunctionModule, function=image_gradient, learnable=("sigma",)):
-    """Module twin of :func:`image_gradient`.
-
-    Example:
-        >>> len(list(ImageGradient(learnable=True).parameters()))
-        1
-    """
+    """Module twin of :func:`image_gradient`."""
 
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
 
 
 class ImageCurvilinearSaliency(FunctionModule, function=image_curvilinear_saliency, learnable=("sigma",)):
-    """Module twin of :func:`image_curvilinear_saliency`.
-
-    Example:
-        >>> ImageCurvilinearSaliency(sigma=2.0)
-        ImageCurvilinearSaliency(sigma=2.0)
-    """
+    """Module twin of :func:`image_curvilinear_saliency`."""
 
     def __init__(self, *, sigma: float = 1.0, learnable: bool = False) -> None: ...
 
 
 class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency, learnable=("sigma",)):
-    """Module twin of :func:`depth_curvilinear_saliency`.
-
-    Example:
-        >>> plane = torch.arange(32.0).expand(1, 1, 32, 32) + 10
-        >>> round(float(DepthCurvilinearSaliency()(plane).norm()), 3)
-        0.0
-    """
+    """Module twin of :func:`depth_curvilinear_saliency`."""
 
     def __init__(
         self,
@@ -277,11 +261,6 @@ class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency,
 
 
 class PrincipalCurvatureImage(FunctionModule, function=principal_curvature_image):
-    """Module twin of :func:`principal_curvature_image`.
-
-    Example:
-        >>> PrincipalCurvatureImage(eigenvalue="smallest")(torch.rand(2, 3, 32, 32)).shape
-        torch.Size([2, 2, 32, 32])
-    """
+    """Module twin of :func:`principal_curvature_image`."""
 
     def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None: ...

@@ -129,12 +129,7 @@ def multiscale_focus_curves(
 
 
 class EdgeBlur(FunctionModule, function=edge_blur):
-    """Module twin of :func:`edge_blur`.
-
-    Example:
-        >>> EdgeBlur(reblur_sigmas=(1.0, 2.0))(torch.rand(1, 1, 32, 32)).shape
-        torch.Size([1, 2, 32, 32])
-    """
+    """Module twin of :func:`edge_blur`."""
 
     def __init__(
         self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
@@ -142,13 +137,7 @@ class EdgeBlur(FunctionModule, function=edge_blur):
 
 
 class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, learnable=("sigma",)):
-    """Module twin of :func:`multiscale_focus_curves`.
-
-    Example:
-        >>> from curvireg_torch import HOG
-        >>> torch.nn.Sequential(MultiScaleFocusCurves(), HOG())(torch.rand(2, 3, 64, 64)).shape
-        torch.Size([2, 1764])
-    """
+    """Module twin of :func:`multiscale_focus_curves`."""
 
     def __init__(
         self,

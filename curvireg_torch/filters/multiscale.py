@@ -136,13 +136,7 @@ def _normalised_saliency(level: Tensor, sigma: float | Tensor) -> tuple[Tensor, 
 
 
 class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learnable=("kappa",)):
-    """Module twin of :func:`anisotropic_diffusion`.
-
-    Example:
-        >>> noise = torch.rand(1, 3, 32, 32)
-        >>> bool(AnisotropicDiffusion(iterations=10, kappa=1.0)(noise).std() < 0.5 * noise.std())
-        True
-    """
+    """Module twin of :func:`anisotropic_diffusion`."""
 
     def __init__(
         self,
@@ -158,12 +152,7 @@ class AnisotropicDiffusion(FunctionModule, function=anisotropic_diffusion, learn
 class MultiScaleCurvilinearSaliency(
     FunctionModule, function=multiscale_curvilinear_saliency, learnable=("sigma", "kappa")
 ):
-    """Module twin of :func:`multiscale_curvilinear_saliency`.
-
-    Example:
-        >>> MultiScaleCurvilinearSaliency(scales=3)(torch.rand(2, 3, 32, 32)).shape
-        torch.Size([2, 2, 32, 32])
-    """
+    """Module twin of :func:`multiscale_curvilinear_saliency`."""
 
     def __init__(
         self,

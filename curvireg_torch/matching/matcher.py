@@ -1,6 +1,6 @@
 """All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -26,7 +26,6 @@ from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
 __all__ = ["Ranking", "ViewMatcher", "distinct_views"]
-CHUNK_SIZE = 16  # photographs in memory at a time
 MAX_CACHED_VIEWS = 2048  # Views whose reranking features are cached, 35 kB each at 128 px
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose reranking features are computed at a time
@@ -41,7 +40,7 @@ class Ranking:
         order: (B, N) view indices, best first; ties in the order of the bank.
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
-            S_box in [0, 1], similarity of the boxes' aspect ratios, best view 1.
+            similarity of the boxes' aspect ratios in [0, 1], best view 1.
         allowed: (B, N) bool, which views a pose prior leaves; None without one.
         outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
             without a prior.
@@ -61,10 +60,6 @@ class Ranking:
     def __len__(self) -> int:
         return self.scores.shape[0]
 
-    def __getitem__(self, index: slice) -> "Ranking":
-        """Rankings of some photographs, as copies that do not keep the batch in memory."""
-        return self._of(lambda *parts: parts[0][index].clone(), self)
-
     @property
     def hog(self) -> Tensor:
         return self.terms["hog"]
@@ -76,21 +71,6 @@ class Ranking:
     def top(self, k: int) -> Tensor:
         """(B, k) indices of the best views; fewer if the bank is smaller."""
         return self.order[:, :k]
-
-    @staticmethod
-    def cat(parts: Sequence["Ranking"]) -> "Ranking":
-        """Concatenate rankings of the same views."""
-        return Ranking._of(lambda *tensors: torch.cat(tensors), *parts)
-
-    @staticmethod
-    def _of(make: Callable[..., Tensor], *parts: "Ranking") -> "Ranking":
-        """The ranking each of whose tensors is made of that of the parts."""
-        terms = {name: make(*(part.terms[name] for part in parts)) for name in parts[0].terms}
-        columns = zip(*((p.scores, p.order, p.allowed, p.outside) for p in parts), strict=True)
-        scores, order, allowed, outside = (None if each[0] is None else make(*each) for each in columns)
-        assert scores is not None
-        assert order is not None
-        return Ranking(scores, order, terms, allowed, outside)
 
 
 def distinct_views(
@@ -188,12 +168,7 @@ class ViewMatcher(nn.Module):
             InvalidInputError: wrong shape or dtype, another number of boxes than of images, or an unusable box.
             ImageError: pixels of the crop of a box are missing (NaN or infinite) or outside [0, 1].
         """
-        boxes = as_boxes(boxes, len(images))
-        parts = [
-            self.rank(self.query(images[i : i + CHUNK_SIZE], boxes[i : i + CHUNK_SIZE]))
-            for i in range(0, max(1, len(images)), CHUNK_SIZE)
-        ]
-        return Ranking.cat(parts)
+        return self.rank(self.query(images, boxes))
 
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
@@ -301,14 +276,8 @@ class ViewMatcher(nn.Module):
     def reranking_score(
         self, name: str, query: QueryFeatures, ranking: Ranking, pictures: Tensor, image_index: Tensor
     ) -> Tensor:
-        """(H,) float64 log scores of pictures of poses by a :class:`RerankingTerm`, as if they were ranked views.
-
-        Args:
-            name: of the term.
-            query, ranking: of B photographs.
-            pictures: (H, C, S, S), of :meth:`ViewDescriber.shaded`.
-            image_index: (H,) photograph that each picture is compared with.
-        """
+        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses by the :class:`RerankingTerm` called ``name``,
+        as if they were ranked views; ``image_index`` (H,) is the photograph of ``query`` and ``ranking`` of each."""
         module, term = cast(RerankingModule, self._terms[name]), next(t for t in self.terms if t.name == name)
         raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)

@@ -25,11 +25,8 @@ BOX_DISTANCE_TOLERANCE = 0.1
 
 
 class Limits:
-    """The limits of a photograph's ``prior``.
-
-    They hold for rotations in the photograph's own camera; without a camera matrix, in one that looks straight at the
-    box. Views are allocentric, and are rotated towards the ray through the centre of the box.
-    """
+    """The limits of a photograph's ``prior``, for rotations in its own camera; without a camera matrix, in one that
+    looks straight at the box. Views are allocentric, and are rotated towards the ray through the centre of the box."""
 
     def __init__(self, item: ImageItem, bank: ViewBank) -> None:
         assert item.prior is not None
@@ -79,13 +76,9 @@ class Limits:
         return (self._excess(poses) <= FIT_TOLERANCE) & (self._distance_excess(poses) <= DISTANCE_TOLERANCE)
 
     def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
-        """How the best pose contradicts the limits, see :attr:`Registration.prior_contradiction`.
-
-        Args:
-            best: one pose.
-            filling: the same, at the distance at which the mesh fills the box.
-            better_outside: whether a pose outside the limits has a higher score.
-        """
+        """How the best pose contradicts the limits, see :attr:`Registration.prior_contradiction`; ``filling`` is the
+        same at the distance at which the mesh fills the box, ``better_outside`` whether a pose outside has a higher
+        score."""
         if better_outside or bool(self._distance_excess(filling) > BOX_DISTANCE_TOLERANCE):
             return "better outside"
         at_limit = self._excess(best) > -AT_LIMIT_ANGLE, self._distance_excess(best) > -AT_LIMIT_DISTANCE

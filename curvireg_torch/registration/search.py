@@ -19,15 +19,11 @@ MAX_ROUNDS = 8  # Largest number of rounds of six poses each
 
 @torch.no_grad()
 def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tensor:
-    """Return (H, 3, 3) allocentric rotations whose views match the photographs best, near those of the starts.
+    """Return (H, 3, 3) allocentric rotations whose views match (B, D) photographs' ``descriptors`` best, near the
+    starts.
 
     Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is halved where
     none of them is better, and the search ends where the pose stops moving at the finest step.
-
-    Args:
-        describer: of the mesh.
-        descriptors: (B, D) of the photographs' fields, computed by the describer.
-        starts: poses in those photographs.
     """
     axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     best, score = starts.rotation, similarities(describer, descriptors, starts)

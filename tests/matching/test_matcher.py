@@ -4,12 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.matching import Ranking, distinct_views
+from curvireg_torch.matching import distinct_views
 from curvireg_torch.terms import Correlation, Repeatability
 from tests._support.scenes import scene
 
@@ -44,19 +43,14 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     assert ranking.top(3).equal(ranking.order[:, :3])
 
 
-def test_matcher_is_batch_independent(matcher, monkeypatch):
+def test_matcher_is_batch_independent(matcher):
     images, boxes = batch(0, 1, 2)
     together = matcher(images, boxes)
-    loader = DataLoader(list(zip(images, boxes, strict=True)), batch_size=2)
-    parts = [Ranking.cat([matcher(*part) for part in loader]) for _ in range(2)]
-    assert torch.equal(parts[0].scores, parts[1].scores)
-    assert torch.equal(parts[0].order, parts[1].order)
-    monkeypatch.setattr("curvireg_torch.matching.matcher.CHUNK_SIZE", 2)
-    chunked = matcher(images, boxes)
-    single = Ranking.cat([matcher(images[i : i + 1], boxes[i : i + 1]) for i in range(3)])
-    for other in (parts[0], chunked, single, matcher(list(images), boxes)):
-        torch.testing.assert_close(other.scores, together.scores, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(other.hog, together.hog, rtol=1e-5, atol=1e-5)
+    assert torch.equal(matcher(list(images), boxes).scores, together.scores)
+    for i in range(3):
+        alone = matcher(images[i : i + 1], boxes[i : i + 1])
+        torch.testing.assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
 
 
 def test_matcher_takes_bytes_and_mixed_channels(matcher):
