@@ -169,16 +169,10 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
     divided by its standard deviation on ImageNet. All cells have unit length, and both strides equal weight.
 
     Args:
-        images: (N, 1 or 3, S, S) in [0, 1]; photographs in colour, views from :func:`curvireg_torch.rendering.shade`.
-            Missing pixels (NaN or infinite) are filled from their surroundings.
-        backbone: the feature network.
+        images: (N, 1 or 3, S, S) in [0, 1]; missing pixels (NaN or infinite) are filled from their surroundings.
 
     Returns:
         (N, D) float16 of unit length; D = 17 408 at S = 128.
-
-    Example:
-        >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
-        torch.Size([2, 4352])
     """
     # One image on a CPU, where larger batches are no faster and the rounding depends on the batch size.
     chunks = images.split(1 if images.device.type == "cpu" else IMAGES_AT_A_TIME)
@@ -196,12 +190,8 @@ def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """Mean cosine similarity of the cells, maximum over the crops of each photograph, (B, N) float32 in [-1, 1].
-
-    Args:
-        photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
-        views: (N, D).
-    """
+    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (N, D) of views and (B, K, D) of K crops of
+    each photograph, the best of these."""
     check_tensor(photographs, "photographs", (None, None, None))
     check_tensor(views, "views", (None, photographs.shape[-1]))
     crops = photographs.flatten(0, 1).float()

@@ -171,16 +171,11 @@ MIN_TENSOR_SIGMA = 1e-3  # px, below which a kernel is a single 1 in every dtype
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
-    """Separable Gaussian smoothing with replicated borders.
+    """Separable Gaussian smoothing of (B, C, H, W) with replicated borders; NaN spreads.
 
     Args:
-        x: (B, C, H, W), as the result. NaN spreads.
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
             ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are clamped to 0.001 px, not checked.
-
-    Example:
-        >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
-        torch.Size([1, 1, 5, 5])
     """
     return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(x.dtype)
 

@@ -98,8 +98,8 @@ class Undistorted(NamedTuple):
     """What a camera with the same matrix, but without distortion, shows.
 
     Attributes:
-        image: (C, H, W), of the dtype and on the device of the photograph. Pixels that were not recorded, or that lie
-            where the distortion is unknown, repeat the border of what is known, as pixels outside a photograph do.
+        image: (C, H, W); pixels that were not recorded, or whose distortion is unknown, repeat the border of what is
+            known.
         box: (4,) around the outline of the given box; None without one.
         mask: (H, W) float32; None without one.
         missing: (H, W) bool, True where the border is repeated.
@@ -180,10 +180,7 @@ def _distorted(rays: Array, K: Array, D: Array, model: str) -> Array:
 
 
 def _growing_radii(distortion: Sequence[float], model: str) -> tuple[Array, Array, float]:
-    """Radii of rays (x, y, 1), their distorted radii, as far as these grow, and the radius where they stop, or inf.
-
-    The radial part of the distortion only.
-    """
+    """Radii of rays (x, y, 1), their radially distorted radii, as far as these grow, and where they stop, or inf."""
     angle = np.linspace(0.0, MAX_ANGLE, 5000)
     radius = np.tan(angle)
     k = np.zeros(8)

@@ -22,10 +22,8 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dt
 
 
 def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
-    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px.
-
-    Pixels are square, the principal point is in the centre.
-    """
+    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px, with
+    square pixels and the principal point in the centre."""
     if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):
         raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}")
     H, W = size
@@ -45,12 +43,9 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
-        T_cam_from_model: (N, 4, 4) or (4, 4), rigid.
+        T_cam_from_model: (N, 4, 4) or (4, 4), rigid and finite.
         K: (N, 3, 3) or (3, 3), without skew.
         orthographic: do not divide by z; focal lengths are in px per model unit.
-
-    Raises:
-        InvalidInputError: a pose is not rigid and finite, or the camera matrix is unusable.
 
     Example:
         >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
@@ -81,10 +76,8 @@ def boxes_around(pixels: Tensor) -> Tensor:
 
 
 def rotation_towards(rays: Tensor) -> Tensor:
-    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays of any length with z > 0.
-
-    They turn allocentric rotations into poses.
-    """
+    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z > 0: they turn
+    allocentric rotations into poses."""
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)

@@ -82,12 +82,7 @@ class PosePrior:
 
     @classmethod
     def side(cls, name: str) -> "PosePrior":
-        """The side of the object that faces the camera: one of ``SIDES``, 45 degrees to either side of it.
-
-        Example:
-            >>> PosePrior.side("front").azimuth
-            (315.0, 45.0)
-        """
+        """The side of the object that faces the camera: one of ``SIDES``, 45 degrees to either side of it."""
         check_option(name, SIDES, "side")
         return cls(azimuth=((SIDES[name] - SIDE_WIDTH) % 360.0, (SIDES[name] + SIDE_WIDTH) % 360.0))
 
@@ -155,13 +150,9 @@ class PosePrior:
 def object_frame(up: str = "z", front: str | None = None) -> Tensor:
     """(3, 3) float64 rotation from a mesh file's axes to those of :class:`PosePrior`: z up, the front at azimuth 0.
 
-    Args:
-        up: the mesh's axis that points up, such as "z" or "-y".
-        front: the mesh's axis that points out of its front; default "-y" where z is up, as in PASCAL3D+, and what
-            :func:`up_rotation` turns to it where another axis is.
-
-    Raises:
-        InvalidInputError: an unknown axis, or front and up on the same axis.
+    ``up`` and ``front`` name axes of the mesh, such as "z" or "-y"; the default front is "-y" where z is up, as in
+    PASCAL3D+, and what :func:`up_rotation` turns to it where another axis is. Other names, and front and up on the same
+    axis, raise :class:`InvalidInputError`.
 
     Example:
         >>> (object_frame("y", "z") @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).round().tolist()

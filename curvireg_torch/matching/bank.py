@@ -38,8 +38,8 @@ class ViewBank:
         views: the N viewpoints.
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool, unpacked on demand. For a large bank use :meth:`points_at` and
-            :meth:`silhouettes_at`, which unpack a few views at a time.
+        points, silhouettes: (N, S, S) bool, unpacked on demand; of some views by :meth:`points_at` and
+            :meth:`silhouettes_at`.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
         reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
             large bank. Meshes with colours have grey features followed by coloured ones.

@@ -222,11 +222,6 @@ def divide_faces(vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]) 
 
     Raises:
         ValueError: a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.errors`.
-
-    Example:
-        >>> dart = np.array([[0.0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]])
-        >>> [sorted(map(sorted, triangles)) for triangles in divide_faces(dart, [[0, 1, 2, 3]])]
-        [[[0, 1, 2], [0, 2, 3]]]
     """
     if sum(max(len(face) - 2, 0) for face in faces) > MAX_MESH_FACES:
         raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")

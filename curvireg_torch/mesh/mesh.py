@@ -117,14 +117,7 @@ def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int
 
 
 def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
-    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them.
-
-    Example:
-        >>> mesh = trimesh.creation.box()
-        >>> mesh.units = "millimeters"
-        >>> mesh_unit(mesh)
-        'mm'
-    """
+    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them."""
     if mesh.units in UNITS:
         return str(mesh.units)
     try:

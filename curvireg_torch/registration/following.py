@@ -37,17 +37,13 @@ class Follower:
     Where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the last pose that a registration confirmed. It never exceeds the
-    latter, nor that of a doubtful pose that was kept: no pose gains confidence from being followed, unless a further
-    registration is reliable.
+    of the truth: the tracker's own, times that of the last pose that a registration confirmed, which it never exceeds.
+    No pose gains confidence from being followed, unless a further registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
         camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
         prior: limits on the pose in frames that are registered.
-
-    Raises:
-        InvalidInputError: a registrar of several meshes.
 
     Example:
         >>> import curvireg_torch as cr

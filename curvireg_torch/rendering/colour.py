@@ -77,8 +77,7 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 15.5], [0, 100.0, 15.5], [0, 0, 1]])
-        >>> wall = torch.full((1, 1, 32, 32), 5.0)
-        >>> round(float(shade(wall, K)[0, 0, 16, 16]), 2)
+        >>> round(float(shade(torch.full((1, 1, 32, 32), 5.0), K)[0, 0, 16, 16]), 2)
         0.9
     """
     check_image(depth, "depth")

@@ -86,14 +86,13 @@ def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
 
 
 def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float) -> Tensor:
-    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them; reads only the pixels it needs.
+    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them, on the device of the boxes.
 
     Args:
         images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
             get three channels.
         boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is replaced by the first
-            box, which must not be outside. The crops are on the device of the boxes.
-        size, margin: see :func:`crop_images`.
+            box, which must not be outside.
     """
     for image in images:
         check_photograph(image)
