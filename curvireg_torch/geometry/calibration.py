@@ -17,7 +17,6 @@ from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
 
-__all__ = ["Camera", "Undistorted", "undistorted"]
 # Numbers of coefficients of each distortion model
 MODELS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
 MAX_ANGLE = 1.55  # Radians from the optical axis up to which distortion is computed: 89 degrees

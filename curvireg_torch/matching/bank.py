@@ -23,7 +23,6 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
-__all__ = ["FORMAT", "FORMAT_VERSION", "ViewBank", "colour_arrays"]
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
 RERANKING = "reranking."  # Prefix of the names of reranking features among a bank's tensors
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each

@@ -25,7 +25,6 @@ from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
-__all__ = ["Ranking", "ViewMatcher", "distinct_views"]
 MAX_CACHED_VIEWS = 2048  # Views whose reranking features are cached, 35 kB each at 128 px
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose reranking features are computed at a time

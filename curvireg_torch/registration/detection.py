@@ -29,7 +29,6 @@ from .result import Detection, FailedRegistration, Registration
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["Detector", "Proposals", "detect"]
 TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object

@@ -21,7 +21,6 @@ from .registrar import Registrar
 from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
-__all__ = ["Follower"]
 # Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better
 TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
 # Confidence from which a pose is followed; while it is lower, each frame is registered to check it

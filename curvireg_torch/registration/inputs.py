@@ -34,16 +34,6 @@ from ..utils.checks import (
     type_and_shape,
 )
 
-__all__ = [
-    "ImageItem",
-    "camera_warnings",
-    "check_box_side",
-    "check_crop",
-    "image_item",
-    "image_items",
-    "is_missing",
-    "rig_cameras",
-]
 MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees

@@ -13,18 +13,6 @@ from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
 from .confidence import COVARIANCE_SCALE
 
-__all__ = [
-    "Measurements",
-    "PointMatches",
-    "apply_twist",
-    "fit_points",
-    "least_squares_step",
-    "nearest_rigid",
-    "pixels",
-    "pose_covariance",
-    "project",
-    "step_fraction",
-]
 MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1  # Longest step: radians, and fraction of the object's distance
 INLIER_SCALE = 2.0  # Distance in px at which a point match counts a quarter
 MIN_MATCHES = 8  # Point matches that a pose needs

@@ -13,7 +13,6 @@ from ..mesh.mesh import mesh_centre, mesh_radius
 from .inputs import ImageItem
 from .poses import Poses, placed
 
-__all__ = ["Limits"]
 # Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next
 VIEW_SPACING = 7.5
 # Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known

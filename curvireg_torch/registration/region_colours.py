@@ -6,7 +6,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-__all__ = ["RegionModel", "colour_bins", "line_posterior"]
 COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
 SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
 LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors

@@ -27,22 +27,6 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 
-__all__ = [
-    "SCHEMA",
-    "Detection",
-    "FailedRegistration",
-    "Hypothesis",
-    "PhotographPose",
-    "Registration",
-    "ambiguity",
-    "corners",
-    "detection_document",
-    "pose_in_words",
-    "remarks",
-    "result_document",
-    "used_box",
-    "verdict",
-]
 UNKNOWN_ROTATION = 1.0  # Radians of standard deviation from which the rotation about an axis counts as unknown
 RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which another one makes the answer ambiguous
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn

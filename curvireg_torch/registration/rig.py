@@ -40,7 +40,6 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["Answer", "Found", "Rig", "RigPhotograph", "RigProblem"]
 # World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size
 FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
 # Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a

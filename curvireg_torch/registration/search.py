@@ -9,7 +9,6 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..matching import ViewDescriber
 from .poses import Poses, similarities
 
-__all__ = ["search"]
 STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)
 SEARCH_ANGLE = 15.0  # Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees
 # Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel

@@ -25,8 +25,6 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["register_views"]
-
 
 def _contradicted(confidence: float, others: Sequence[float | None]) -> float:
     """A confidence after photographs that were left out, in so far as they alone are confident of another pose.

@@ -17,7 +17,6 @@ from ..rendering.contours import ContourPoints, MeshContours
 from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, ContourState, full_size_problem
 from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
 
-__all__ = ["fit_texture", "surface_corners", "turned"]
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
 # one's
 MAX_CORNERS, CORNER_SPACING, CORNER_QUALITY = 160, 5, 0.005

@@ -33,7 +33,6 @@ from .least_squares import (
 from .region_colours import RegionModel, colour_bins, line_posterior
 from .texture_fit import surface_corners
 
-__all__ = ["OUTSIDE", "TrackedPose", "Tracker", "boxes_at"]
 WINDOW_SIZE = 256  # Side in px of the part of a frame around the object, which all measurements share
 # Added around the object's box, as a fraction of its longer side: room for motion that was not predicted
 WINDOW_MARGIN = 0.3

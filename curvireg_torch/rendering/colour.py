@@ -13,7 +13,6 @@ from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_image, check_tensor
 from .depth import DepthRenderer, check_render_arguments, make_renderer
 
-__all__ = ["render_colour", "shade"]
 AMBIENT, LIT = 0.3, 0.9  # Grey levels of a surface seen edge on and face on; the background is 1
 SUPERSAMPLING = 2  # Samples per pixel and axis, because textures are finer than views
 

@@ -12,7 +12,6 @@ from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_option, check_pose
 from ..utils.choices import RENDERER_NAMES
 
-__all__ = ["NEAREST", "DepthRenderer", "check_render_arguments", "make_renderer", "render_depth"]
 NEAREST = 1e-3  # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
 
 

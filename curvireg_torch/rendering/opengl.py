@@ -17,7 +17,6 @@ from ..geometry.conversions import opencv_from_opengl
 from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
 from .depth import NEAREST, check_render_arguments
 
-__all__ = ["PyrenderRenderer"]
 _lock = threading.Lock()
 # The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none survives a fork
 _context: tuple[int, Any] | None = None
