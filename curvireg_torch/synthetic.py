@@ -95,10 +95,8 @@ def synthesize_photograph(
     texture: float = 0.35,
 ) -> tuple[Tensor, Tensor]:
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box (4,) in px.
-
     ``texture`` is the contrast of a random solid pattern; a mesh with face colours shows those instead. The background
-    (3, H, W), default :func:`procedural_background`, is out of focus.
-    """
+    (3, H, W), default :func:`procedural_background`, is out of focus."""
     H, W = size
     # Supersampling by two.
     K = torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]).double() @ camera_matrix.double()

@@ -17,10 +17,8 @@ MIN_RELATIVE_RANGE = 1e-6  # of visible depths, relative to the largest; below i
 
 def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Depth with missing pixels at the largest number; nearest depth and depth range of each image, (B, 1, 1, 1).
-
     Missing pixels are 0, negative, inf, NaN or outside ``mask``. For a range of rounding, which must not be stretched,
-    the largest depth is returned instead. The range of an empty image is 1.
-    """
+    the largest depth is returned instead. The range of an empty image is 1."""
     clean = depth.nan_to_num(0.0, 0.0, 0.0)
     if mask is not None:
         clean = torch.where(mask, clean, 0.0)
@@ -122,10 +120,8 @@ def _shape_operator(z: Tensor, formula: str) -> ops.Planes:
 def dominant_eigenvector(
     m11: Tensor, m12: Tensor, m21: Tensor, m22: Tensor, sign: float | Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvector (vx, vy), of any length, of [[m11, m12], [m21, m22]], and half the difference of its eigenvalues.
-
-    Its eigenvalue is the largest in absolute value, or with ``sign=1`` the largest; it is 0 for a multiple of I.
-    """
+    """Eigenvector (vx, vy), of any length, of [[m11, m12], [m21, m22]], and half the difference of its eigenvalues. Its
+    eigenvalue is the largest in absolute value, or with ``sign=1`` the largest; it is 0 for a multiple of I."""
     gap = m11 - m22
     # tr^2 / 4 - det in a form without cancellation.
     half_gap = ops.safe_sqrt((m12 * m21).addcmul_(gap, gap, value=0.25))

@@ -44,12 +44,9 @@ def _twin_docstring(summary: str, function: Callable[..., Any], learnable: tuple
 
 
 class FunctionModule(nn.Module):
-    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``.
-
-    It holds the function's options, refuses what the function refuses, and has its documentation. A twin writes its
-    constructor only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive
-    parameters.
-    """
+    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``. It holds
+    the function's options, refuses what the function refuses, and has its documentation. A twin writes its constructor
+    only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive parameters."""
 
     _function: ClassVar[Callable[..., Tensor]]
 

@@ -70,11 +70,7 @@ class Camera:
         return self.model == "fisheye" or any(self.distortion)
 
     def at(self, size: tuple[int, int]) -> "Camera":
-        """Return the camera of the same photographs, resized to (H, W).
-
-        Raises:
-            InvalidInputError: another aspect ratio than that of the calibration.
-        """
+        """Return the camera of the same photographs, resized to (H, W); another aspect ratio is refused."""
         (h, w), (H, W) = self.size or size, size
         if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:  # sides of resized pictures are rounded
             turned = abs(h * H / w - W) <= 1

@@ -39,12 +39,7 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty.
-
-    Example:
-        >>> box_iou(torch.tensor([[0.0, 0.0, 2.0, 2.0]]), torch.tensor([[1.0, 0.0, 3.0, 2.0]]))
-        tensor([[0.3333]])
-    """
+    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty."""
     common = torch.minimum(boxes[:, None, 2:], others[:, 2:]) - torch.maximum(boxes[:, None, :2], others[:, :2])
     overlap = common.clamp(min=0).prod(dim=-1)
     first, second = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(dim=-1) for box in (boxes, others))
@@ -134,9 +129,7 @@ def crop_images(
 
 def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
     """(K, C, size, size) crops of K squares (K, 4) in px of one image (C, H, W), floating or uint8; at least float32.
-
-    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read.
-    """
+    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read."""
     # Half types cannot represent pixel coordinates: bfloat16 has eight bits.
     dtype = torch.promote_types(image.dtype, torch.float32)
     borders = squares.to("cpu", dtype)  # many small steps

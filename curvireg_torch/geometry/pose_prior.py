@@ -92,10 +92,8 @@ class PosePrior:
         return {name: value for name, value in plain.items() if value is not None}
 
     def excess(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
-        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations.
-
-        Negative within all limits: minus the distance to the nearest of them, at least -180.
-        """
+        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations. Negative within all
+        limits: minus the distance to the nearest of them, at least -180."""
         worst = torch.full_like(rotations[..., 0, 0], -180.0)
         if self.azimuth or self.elevation or self.theta:
             azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
@@ -190,12 +188,10 @@ def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:
 
 
 def _outside(angle: Tensor, limits: tuple[float, ...], elevation: Tensor) -> Tensor:
-    r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range.
-
-    An azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
+    r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range. An
+    azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
     :math:`\sin d = \cos e \sin \delta`; beyond 90 degrees the nearest point is the pole. The same holds for theta and
-    the up axis, which :math:`e` tilts towards the camera.
-    """
+    the up axis, which :math:`e` tilts towards the camera."""
     beyond, width = _position(angle, limits)
     if width == 360.0:
         return torch.full_like(angle, -180.0)

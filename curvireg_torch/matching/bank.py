@@ -98,10 +98,8 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_compatible(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``.
-
-        Views that were passed by the caller (``pose="given"``) fit every view policy.
-        """
+        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``. Views that
+        were passed by the caller (``pose="given"``) fit every view policy."""
         mine, theirs = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
             mine |= self.pipeline.views.key_fields()

@@ -40,11 +40,9 @@ class CachedBank(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
-
-    Banks are stored in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have
-    such a name are ever listed, overwritten or removed.
-    """
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Banks are stored
+    in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have such a name are
+    ever listed, overwritten or removed."""
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):

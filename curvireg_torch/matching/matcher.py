@@ -198,10 +198,8 @@ class ViewMatcher(nn.Module):
         )
 
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
-        """Compare B described photographs with all views; errors as :meth:`forward`.
-
-        ``allowed`` (B, N) bool leaves views out, whose score is 0.
-        """
+        """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
+        views out, whose score is 0."""
         check_pixels(query.crops, "of the box")
         first = [t for t in self.terms if not isinstance(t, RerankingTerm)]
         terms = {t.name: self._terms[t.name](query) for t in first}

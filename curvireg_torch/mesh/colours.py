@@ -87,18 +87,14 @@ def has_colours(mesh: Any) -> bool:
 
 
 def surface_colours(mesh: Any) -> SurfaceColours | None:
-    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white.
-
-    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``.
-    """
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white. They come from
+    ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``."""
     return _surface_colours(mesh, _Textures())
 
 
 def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[SurfaceColours | None]:
-    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used.
-
-    A texture is decoded once, however many meshes share it. ``close`` frees its picture then.
-    """
+    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used. A texture is decoded once,
+    however many meshes share it. ``close`` frees its picture then."""
     textures, found = _Textures(close=close), []
     for mesh in meshes:
         try:

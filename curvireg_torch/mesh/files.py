@@ -50,10 +50,8 @@ _UNUSUAL_OBJ = re.compile(
 
 
 def mesh_files(path: Path) -> list[Path]:
-    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures.
-
-    They are found by reading the mesh; if that fails, those requested before are listed. Other files stand alone.
-    """
+    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures. They
+    are found by reading the mesh; if that fails, those requested before are listed. Other files stand alone."""
     folder = _Folder(path)
     if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
         with contextlib.suppress(MeshError):  # reported where the mesh is loaded
@@ -67,11 +65,8 @@ def mesh_digest(path: Path) -> str:
 
 
 def read_mesh(path: Path) -> Any:
-    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails.
-
-    Colours are in ``metadata["colours"]`` of each part. Missing material files and textures are a
-    :class:`CurviregWarning`.
-    """
+    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails. Colours are in
+    ``metadata["colours"]`` of each part. Missing material files and textures are a :class:`CurviregWarning`."""
     folder = _Folder(path)
     content = _read(path, folder)
     if missing := sorted(file.name for file in folder.requested if not file.is_file()):

@@ -168,11 +168,9 @@ def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColour
 
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
-    """(P, 3) float64 vertices of the convex hull, which determine projected boxes.
-
-    Of more than 4096 of them, those that are outermost in one of 2562 directions of the object scaled to equal extents:
-    sides of boxes move by about 0.1 % of their length at most.
-    """
+    """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than 4096 of them, those
+    that are outermost in one of 2562 directions of the object scaled to equal extents: sides of boxes move by about 0.1
+    % of their length at most."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.array(mesh.vertices, dtype=np.float64)

@@ -151,11 +151,8 @@ class Candidate:
 def _register_candidates(
     registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int
 ) -> list[Registration]:
-    """The most certain objects, at most ``instances``, whose boxes do not overlap.
-
-    Raises:
-        CurviregError: of the best candidate, if none can be registered.
-    """
+    """The most certain objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
+    none."""
     count = max(registrar.pipeline.detection.candidates, instances + 1)
     candidates, failed = [], None
     for box, response in zip(proposals.boxes[:count], proposals.responses[:count].tolist(), strict=True):
@@ -397,11 +394,9 @@ def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def representative_views(bank: ViewBank, count: int) -> Tensor:
-    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``.
-
-    The distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their
-    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before.
-    """
+    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``. The
+    distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their boxes'
+    aspect ratios. The first medoid is the most central view, each further one the farthest from those before."""
     views = torch.arange(len(bank))
     if len(views) > MAX_COMPARED_VIEWS:
         views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS

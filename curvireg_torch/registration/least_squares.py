@@ -78,9 +78,7 @@ def _geman_mcclure(residual: Tensor, scale: float) -> Tensor:
 
 def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scales: Sequence[float]) -> Tensor:
     """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4); ``T`` if there are few.
-
-    ``scales`` of the robust weights in px are one a step: at first all matches count, in the end those that agree.
-    """
+    ``scales`` of the robust weights in px are one a step: at first all matches count, in the end those that agree."""
     if int((matches.weight > 0).sum()) < MIN_MATCHES:
         return T
     for scale in scales:

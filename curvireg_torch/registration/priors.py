@@ -39,11 +39,7 @@ class Limits:
 
     def allowed(self, *, off_centre: float = 0.0) -> Tensor:
         """(N,) bool: views of the bank within the limits; the object may lie ``off_centre`` degrees from the ray
-        through its box.
-
-        Raises:
-            InvalidInputError: no view lies within the limits, or all distances are inside the object.
-        """
+        through its box. Refuses limits that leave no view, or only distances inside the object."""
         radius, distance = mesh_radius(self._bank.mesh), self.prior.distance
         if distance is not None and distance[1] < radius:
             raise InvalidInputError(

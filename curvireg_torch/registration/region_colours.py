@@ -48,9 +48,7 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
 
 class RegionModel:
     """Colour histograms of the object and of the background, a pair for each direction from the object's centre.
-
-    Directions are angles in rad of the image's x, y axes; between the middles of two sectors both count.
-    """
+    Directions are angles in rad of the image's x, y axes; between the middles of two sectors both count."""
 
     def __init__(self) -> None:
         self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)

@@ -99,10 +99,8 @@ class Hypothesis:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance.
-
-        ``inf`` marks what the contours do not determine: deviations from a radian, or from half the distance.
-        """
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance. ``inf`` marks
+        what the contours do not determine: deviations from a radian, or from half the distance."""
         if self.covariance is None:
             return None
         rotation, translation = self.covariance.diagonal().sqrt().split(3)
@@ -440,12 +438,8 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
-    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else "unsure".
-
-    Example:
-        >>> verdict(0.95, 0.03, True), verdict(0.6, 0.1, False), verdict(None, None, False)
-        ('likely', 'unsure', 'unsure')
-    """
+    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else
+    "unsure"."""
     if reliable:
         return "likely"
     return "no match" if probability is not None and none is not None and none > probability else "unsure"

@@ -334,10 +334,8 @@ class Rig:
         return T, C
 
     def fitted(self, problem: RigProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
-        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state.
-
-        If the fit does not improve the support of all photographs together, the initial pose is kept.
-        """
+        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If the fit does not
+        improve the support of all photographs together, the initial pose is kept."""
         (each, cams), V = self.tied(problem, T), len(self.photographs)
         start = each.state(cams)
         found = each.descend(start, radii)
@@ -376,11 +374,9 @@ class Rig:
         return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
-        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone.
-
-        They are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
-        cameras' poses have errors.
-        """
+        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone. They
+        are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
+        cameras' poses have errors."""
         each, cams = self.tied(self.problems[0], T)
         measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
         seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)

@@ -27,12 +27,7 @@ if TYPE_CHECKING:
 
 
 def _contradicted(confidence: float, others: Sequence[float | None]) -> float:
-    """A confidence after photographs that were left out, in so far as they alone are confident of another pose.
-
-    Example:
-        >>> round(_contradicted(0.9, [0.3, 0.5]), 2), round(_contradicted(0.9, [0.8]), 2)
-        (0.9, 0.69)
-    """
+    """A confidence after photographs that were left out, in so far as they alone are confident of another pose."""
     odds = confidence / max(1.0 - confidence, 1e-9)
     for other in others:
         odds *= min(1.0, (1.0 - (other or 0.0)) / max(other or 0.0, 1e-9))

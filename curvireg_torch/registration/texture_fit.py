@@ -43,11 +43,8 @@ def surface_corners(
     grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
 ) -> tuple[np.ndarray, Tensor]:
     """uv (C, 2) px, whole numbers in float32, of corners of ``grey`` (S, S) uint8, and the points (1, C, 3) of the
-    model there.
-
-    They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4, 4) with
-    camera ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest.
-    """
+    model there. They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4,
+    4) with camera ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest."""
     side = 2 * inside + 1
     mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
     found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, quality, CORNER_SPACING, mask=mask)

@@ -104,10 +104,8 @@ class Frame:
 
 
 def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W).
-
-    And (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing.
-    """
+    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W). And
+    (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing."""
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
     boxes = projected_boxes(hull, T, K)
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
@@ -127,11 +125,9 @@ class Keyframe:
 
 
 def track_points(keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
-    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them.
-
-    Matches from which the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets
-    the search reach further.
-    """
+    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them. Matches from which
+    the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets the search reach
+    further."""
     if len(keyframe.uv) == 0:
         return PointMatches(keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double())
     guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
@@ -159,14 +155,10 @@ def _optical_flow(
 
 @dataclass(frozen=True)
 class TrackedPose:
-    """A pose in a frame.
-
-    Attributes:
-        features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
-            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fraction
-            of the corners of the last frame, and of a keyframe, that are found where the pose has them.
-        frame, state: the frame, and the pose (1, 4, 4) with its contours.
-    """
+    """A pose (1, 4, 4) in a frame, with its contours, as ``state``. Its ``features``, all in [0, 1]: ``edge_support``
+    as of a contour fit; ``region``, how clearly and how near to the outline the object's colours end; ``flow`` and
+    ``keyframe``, the fraction of the corners of the last frame, and of a keyframe, that are found where the pose has
+    them."""
 
     features: Mapping[str, float]
     frame: Frame
@@ -203,10 +195,7 @@ class Tracker:
 
     def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
         """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
-
-        Raises:
-            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
-        """
+        Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
         first = self.measure(image, K, T)
         self._poses, self._keyframes, self._regions = [], [], RegionModel()
         self.accept(first)
@@ -219,11 +208,8 @@ class Tracker:
         return self._tracked(frame, frame.problem.state(start), [])
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
-        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
-
-        Raises:
-            LostObjectError: the object has left the image.
-        """
+        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3); :class:`LostObjectError` if it left the
+        image."""
         found: list[TrackedPose] = []
         for T in self.predictions():
             try:

@@ -23,10 +23,8 @@ class DepthRenderer(Protocol):
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth.
-
-        The depth is on the renderer's device, which is the CPU except for "torch".
-        """
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth. The depth is
+        on the renderer's device, which is the CPU except for "torch"."""
         ...
 
 

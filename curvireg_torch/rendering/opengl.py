@@ -59,12 +59,10 @@ def _release() -> None:
 
 
 class PyrenderRenderer:
-    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it thread-safe.
-
-    It works around a defect of pyrender 0.1.45: the framebuffer takes four samples per pixel and resolves depth to one
-    that is off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both
-    orientations. Depth has 24 bits: for a camera inside the object's box, the far end is less exact than elsewhere.
-    """
+    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it thread-safe. It works
+    around a defect of pyrender 0.1.45: the framebuffer takes four samples per pixel and resolves depth to one that is
+    off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both orientations.
+    Depth has 24 bits: for a camera inside the object's box, the far end is less exact than elsewhere."""
 
     name = "pyrender"
 

@@ -52,9 +52,7 @@ class QueryFeatures:
 
 def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
     """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``.
-
-    Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there.
-    """
+    Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there."""
     if crops.shape[1] not in (1, 3):
         raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
@@ -66,13 +64,7 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
-
-    ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0.
-
-    Example:
-        >>> jittered_boxes(torch.tensor([[0.0, 0.0, 100.0, 50.0]]), 0.1)[0, 1].tolist()
-        [-7.5, 0.0, 92.5, 50.0]
-    """
+    ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
     boxes = as_numbers(boxes, "boxes")
     check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= box_jitter <= 0.45:

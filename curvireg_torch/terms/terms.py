@@ -110,9 +110,7 @@ def log_unit_score(similarity: Tensor) -> Tensor:
 
 class Whitening(nn.Module):
     r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`.
-
-    ``mean`` is (D,), ``covariance`` (D, D), symmetric, positive definite.
-    """
+    ``mean`` is (D,), ``covariance`` (D, D), symmetric, positive definite."""
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
@@ -134,11 +132,9 @@ class Whitening(nn.Module):
 
 
 def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32.
-
-    The covariance is (1 - a) S + a tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's
-    covariance best from the sample's covariance S.
-    """
+    """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32. The covariance is (1 - a) S + a
+    tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's covariance best from the sample's
+    covariance S."""
     check_tensor(descriptors, "descriptors", (None, None))
     count = len(descriptors)
     if count < 2:
@@ -279,10 +275,8 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
 
 
 def cell_counts(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which may be cut.
-
-    The integers have 8 bits if that suffices for a cell, else 16.
-    """
+    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which may be cut. The
+    integers have 8 bits if that suffices for a cell, else 16."""
     over = -points.shape[-1] % cell
     count = F.pad(points.view(torch.uint8), (0, over, 0, over))
     count = count if cell**2 < 256 else count.short()
