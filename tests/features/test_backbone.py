@@ -84,12 +84,6 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
     torch.testing.assert_close(similarity(d[:, None], d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
 
 
-def test_similarity_takes_the_best_crop(network):
-    d = describe(images(4), network)
-    both = similarity(d[:2][None], d[2:])
-    assert torch.equal(both[0], similarity(d[:2, None], d[2:]).amax(dim=0))
-
-
 def test_describe_is_bit_identical_in_any_batch_on_any_threads(network):
     before = torch.get_num_threads()
     grey = torch.rand(18, 1, 64, 64, generator=torch.Generator().manual_seed(0)).requires_grad_()

@@ -54,14 +54,6 @@ def test_box_is_around_its_undistorted_outline(camera):
     assert float(beyond[0]) == pytest.approx(float(border[0]) - 39.5, abs=0.1)
 
 
-def test_mask_moves_with_the_photograph():
-    mask = torch.zeros(SIZE)
-    mask[20:90, 5:60] = 1.0
-    seen = undistorted(mask[None], RADIAL, mask=mask)
-    torch.testing.assert_close(seen.mask, seen.image[0])
-    assert bool((seen.mask != mask).any())
-
-
 def test_pixels_beyond_the_valid_radius_repeat_its_border():
     # r - 0.5 r^3 grows up to r = 0.816, and falls beyond: rays at the corners would show the centre again.
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (-0.5, 0.0, 0.0, 0.0))
@@ -74,13 +66,6 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
     assert float((seen.image[0][beyond] - largest).abs().max()) < 0.01
     folded = cv2.undistort(radius.numpy(), camera.matrix.numpy(), np.array(camera.distortion))
     assert float(folded[beyond.numpy()].min()) < 0.05  # the centre again
-
-
-def test_pixels_that_were_not_recorded_are_missing():
-    seen = undistorted(torch.rand(1, *SIZE), Camera(MATRIX, (0.4, 0.0, 0.0, 0.0)))
-    assert bool(seen.missing[0, 0])
-    assert not bool(seen.missing[60, 80])
-    assert bool(seen.image.isfinite().all())
 
 
 def test_box_outside_of_what_is_shown_is_refused():

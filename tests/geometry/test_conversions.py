@@ -76,17 +76,6 @@ def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
 
 
-def test_symmetry_transforms_applies_discrete_symmetries_first() -> None:
-    info = {"symmetries_discrete": [HALF_TURN], **CONTINUOUS}
-    both = g.symmetry_transforms(info, max_step_fraction=0.5)
-    rotations = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.5).numpy()
-    assert len(both) == 2 * len(rotations) == 14
-    flip = np.reshape(HALF_TURN, (4, 4))
-    products = [R @ s for R in rotations for s in (np.eye(4), flip)]
-    np.testing.assert_allclose(both, products, atol=1e-12)
-    assert torch.equal(both[0], torch.eye(4, dtype=torch.float64))
-
-
 @pytest.mark.parametrize(
     ("info", "step", "match"),
     [

@@ -14,12 +14,11 @@ from safetensors.torch import load_file, save_file
 from curvireg_torch.errors import BankError, MissingFileError
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.matching import bank as bank_module
-from curvireg_torch.pipeline import BankSettings, Pipeline, ViewPolicy
+from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_digest
 
-SETTINGS = BankSettings(image_size=64)
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 TENSORS = ("descriptors", "points", "silhouettes", "boxes", "rotations")
 
@@ -78,14 +77,6 @@ def test_check_compatible_refuses_another_view_policy(upright, change, message):
     for constructor in (ViewMatcher, Registrar):
         with pytest.raises(BankError, match=message):
             constructor(upright, pipeline=other)
-
-
-def test_check_compatible_ignores_what_decides_no_view(upright, small_bank):
-    other_pose = replace(upright.pipeline, views=replace(UPRIGHT, directions=9, theta_step=9.0))
-    assert ViewMatcher(upright, pipeline=other_pose).pipeline.views == UPRIGHT
-    for pose in ("any", "upright", "given"):  # the caller passed the views
-        pipeline = Pipeline(bank=SETTINGS).with_pose_prior(pose)
-        assert ViewMatcher(small_bank, pipeline=pipeline).pipeline.views.pose == "given"
 
 
 def test_save_and_load(small_bank, tmp_path):

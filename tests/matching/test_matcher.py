@@ -83,11 +83,6 @@ def test_matcher_refuses_unusable_input(matcher, image, boxes, message):
         matcher(image, torch.tensor(boxes))
 
 
-def test_matcher_takes_an_empty_batch(bank, matcher):
-    ranking = matcher([], torch.zeros(0, 4))
-    assert ranking.scores.shape == ranking.order.shape == ranking.hog.shape == (0, len(bank))
-
-
 @pytest.mark.parametrize("channels", [3, 1])
 def test_matcher_passes_colours_to_colour_fields(bank, channels):
     class Field(torch.nn.Module):

@@ -154,14 +154,6 @@ def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) ->
     refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
 
 
-def test_load_mesh_opens_files_of_the_folder_and_ignores_others(tmp_path: Path) -> None:
-    (tmp_path / "b c.bin").write_bytes(POINTS)
-    (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
-    assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
-    (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
-    assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
-
-
 AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
 PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
 PLY += b"property list uchar int vertex_indices\nend_header\n"

@@ -58,12 +58,6 @@ def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
         assert areas(polygon, divide(polygon)).sum() == pytest.approx(true_area(flat) * 1.18**0.5, rel=1e-9)
 
 
-def test_divide_faces_divides_convex_and_broken_polygons_into_fans() -> None:
-    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    for polygon in (square, square * np.nan, square * 0):
-        assert divide(polygon).tolist() == [[0, 1, 2], [0, 2, 3]]
-
-
 def test_divide_faces_takes_little_time_for_polygons_that_cross_themselves() -> None:
     rng = np.random.default_rng(0)
     angle = np.arange(1999) * 2 * np.pi * 998 / 1999

@@ -15,9 +15,8 @@ from curvireg_torch.registration.inputs import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
+# The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it
 OFF_CENTRE = camera_matrix(260.0, 260.0, 20.0, 30.0)
-"""The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it."""
-
 RADIAL = Camera(OFF_CENTRE, (-0.35, 0.12, 0.004, -0.003, 0.0), size=SIZE)
 FISHEYE = Camera(OFF_CENTRE, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 

@@ -54,12 +54,6 @@ def test_best_views_are_distinct_and_ranked_relative_to_the_best():
     assert rank.tolist() == pytest.approx([0.0, math.log(0.25)], abs=1e-6)
 
 
-def test_best_views_are_allowed_ones():
-    allowed = torch.arange(len(truck_bank()))[None] < 1
-    scores = torch.linspace(0.1, 0.9, len(truck_bank()))[None]
-    assert best_views(ranking(scores, allowed), truck_bank(), count=5)[0].tolist() == [0]
-
-
 def test_poses_fill_their_box():
     describer, (_, box, T) = truck_registrar().describer, scene(0)
     none = torch.zeros(1, dtype=torch.long)

@@ -86,8 +86,8 @@ def test_fitted_poses_up_to_three_degrees_outside_are_kept():
     assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
 
 
+# Limits of which one moves a rotation out of another
 COMBINED = PosePrior(azimuth=(20.0, 40.0), elevation=(50.0, 70.0), theta=(-5.0, 5.0))
-"""Limits of which one moves a rotation out of another."""
 
 
 @pytest.mark.parametrize(("degrees", "word"), [(8.9, None), (9.1, "at the limit"), (11.0, "at the limit")])

@@ -49,15 +49,6 @@ def test_poses_of_synthetic_scenes(registered):
         assert not is_right or float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
 
 
-def test_hypotheses_are_distinct(registered):
-    for result in [*registered[0], *registered[1]]:
-        R = torch.stack([h.rotation for h in result.hypotheses])
-        errors = rotation_error(R[:, None], R[None]) + 1000 * torch.eye(len(R))
-        assert float(errors.min()) > 15
-    first = registered[0][0]
-    assert first.hypotheses[0].view == int(first.ranking.order[0, 0])
-
-
 def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
     meshes = [trimesh.creation.box((0.1, 0.2, 0.1)), example_mesh()]
@@ -218,8 +209,7 @@ def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, 
         check_crop(crop)
 
 
-EDGES = torch.tensor([-0.1, 0.2, 0.1, 0.15])
-"""Errors of a box's edges, as fractions of its sides."""
+EDGES = torch.tensor([-0.1, 0.2, 0.1, 0.15])  # Errors of a box's edges, as fractions of its sides
 WRONG = BOX + EDGES * (BOX[2:] - BOX[:2]).repeat(2)
 
 
@@ -252,11 +242,6 @@ def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
     assert (result.corrected_box is None) != better
 
 
-def test_boxes_are_not_corrected_without_a_camera_or_contours():
-    assert truck_registrar()([IMAGE], WRONG[None])[0].corrected_box is None
-    assert ranking_registrar()([IMAGE], WRONG[None], CAMERA)[0].corrected_box is None
-
-
 @pytest.mark.parametrize(
     ("size", "given", "box", "expected"),
     [
@@ -271,8 +256,7 @@ def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
     assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
 
 
-AZIMUTHS = (15.0, 45.0, 75.0, 225.0)
-"""Half-way between two views of a coarse bank, so that both lead to the same pose."""
+AZIMUTHS = (15.0, 45.0, 75.0, 225.0)  # Half-way between two views of a coarse bank, so that both lead to the same pose
 
 
 @pytest.fixture(scope="module")

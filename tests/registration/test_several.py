@@ -14,13 +14,12 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, synthe
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
+# Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round
 IN_DOUBT = ((335.0, 100), (329.0, 105), (190.0, 107))
-"""Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round."""
-
+# True T_world_from_model
 WORLD = transform(
     rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.4]).double()
 )
-"""True ``T_world_from_model``."""
 
 
 @cache

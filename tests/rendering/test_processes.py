@@ -38,7 +38,6 @@ from curvireg_torch.rendering import make_renderer, opengl
 T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
 """
-
 _FORK = """
 for backend in sys.argv[1:]:
     renderer = make_renderer(trimesh.creation.box(), backend)
