@@ -141,7 +141,7 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
     assert sorted(path for path in tmp_path.rglob("*") if path.is_file()) == sorted(foreign)
 
 
-def test_cached_bank_warns_of_an_unwritable_folder(tmp_path, monkeypatch):
+def test_cached_bank_warns_of_an_unwritable_folder(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
     with pytest.warns(UserWarning, match=r"file/banks/bank-.*cannot be written \(.*by CURVIREG_CACHE=FOLDER"):
         assert len(cached_box(tmp_path / "file")) == len(VIEWS)
