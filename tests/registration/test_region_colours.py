@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from curvireg_torch.registration import region_colours
-from curvireg_torch.registration.region_colours import RegionModel, colour_bins, line_posterior
+from curvireg_torch.registration.tracker import HALF_RATE_COUNT, RegionModel, colour_bins, line_posterior
 
 
 def test_posterior_is_that_of_bayes():
@@ -48,6 +47,6 @@ def test_histograms_move_by_the_rate_towards_new_colours():
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten(), rate=0.2)
     assert float(model._histograms[0, 0, red]) == 1.0
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten(), rate=0.2)  # the colours swap
-    step = 0.2 * 64 / (64 + region_colours.HALF_RATE_COUNT)
+    step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
