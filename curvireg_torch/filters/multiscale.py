@@ -76,21 +76,17 @@ def multiscale_curvilinear_saliency(
     sigma: float | Tensor = 1.0,
     kappa: float | Tensor = 0.03,
     conductance: str = "rational",
-    diffusion_time: float | None = None,
-    threshold: float | None = None,
 ) -> Tensor:
     r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving smoothing.
 
     The image curvilinear saliency :math:`|\nabla I|^2` of every level is divided by its maximum over the image. The
-    result is the largest of these where *every* level exceeds T, and 0 elsewhere.
+    result is the largest of these where *every* level exceeds :math:`e^{-n}`, and 0 elsewhere.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
-        scales: number n of levels, the image included; each has twice the diffusion time t of the previous one.
+        scales: number n of levels, after 0, 5, 10, 20, ... steps of 0.2 of diffusion.
         sigma: smoothing in px before differentiation, >= 0.
         kappa, conductance: of :func:`anisotropic_diffusion`, which smooths the levels.
-        diffusion_time: t of the last level in px^2; None is 2^(n-2), that is 0, 5, 10, 20, ... steps of 0.2.
-        threshold: T in [0, 1); None is the paper's :math:`e^{-n}`.
 
     Returns:
         (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest value.
@@ -103,25 +99,19 @@ def multiscale_curvilinear_saliency(
     """
     check_option(conductance, CONDUCTANCES, "conductance")
     check_integer(scales, "scales")
-    limit = check_positive(math.exp(-scales) if threshold is None else threshold, "threshold", zero_ok=True)
-    if limit >= 1:
-        raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {threshold}")
-    last = check_positive(2.0 ** (scales - 2) if diffusion_time is None else diffusion_time, "diffusion_time")
     checked_sigma, contrast = ops.check_scalar(sigma, "sigma", zero_ok=True), ops.check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> ops.Planes:
-        level, steps_done = image, 0
+        level = image
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency
-        for k in range(2, scales + 1):
-            steps = max(round(last * 2.0 ** (k - scales) / DIFFUSION_STEP), 1)
-            level = diffuse(level, max(steps - steps_done, 0), contrast, DIFFUSION_STEP, conductance)
-            steps_done = max(steps, steps_done)
+        for k in range(scales - 1):
+            level = diffuse(level, 5 * 2 ** max(k - 1, 0), contrast, DIFFUSION_STEP, conductance)
             level_field, level_saliency = _normalised_saliency(level, checked_sigma)
             # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
             saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
-        return (field * (lowest > limit),)
+        return (field * (lowest > math.exp(-scales)),)
 
     return ops.apply_to_photograph(layer, image)
 
@@ -161,7 +151,5 @@ class MultiScaleCurvilinearSaliency(
         sigma: float = 1.0,
         kappa: float = 0.03,
         conductance: str = "rational",
-        diffusion_time: float | None = None,
-        threshold: float | None = None,
         learnable: bool = False,
     ) -> None: ...

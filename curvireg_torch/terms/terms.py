@@ -3,7 +3,7 @@
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from typing import Any, ClassVar, Protocol
 
@@ -23,7 +23,6 @@ from ..utils.threads import map_on_threads
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
-_BATCHED = ("regions", "field", "descriptors", "points", "shapes")
 
 
 @dataclass(frozen=True)
@@ -45,12 +44,6 @@ class QueryFeatures:
     points: Tensor
     shapes: Tensor
     reranking_features: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
-
-    def __len__(self) -> int:
-        return self.regions.shape[0]
-
-    def __getitem__(self, index: slice | Tensor) -> "QueryFeatures":
-        return replace(self, reranking_features={}, **{n: getattr(self, n)[index] for n in _BATCHED})
 
     @property
     def crops(self) -> Tensor:

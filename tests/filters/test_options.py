@@ -18,7 +18,6 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
     ("asg", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
     ("diffusion", {"iterations": 1, "step": 0.3}, "step: expected 0 < step <= 0.25"),
-    ("mcs", {"threshold": 1.0}, "threshold"),
     ("mcs", {"scales": 2.5}, "scales: expected an integer >= 1, got 2.5"),
     ("mcs", {"sigma": "1"}, "sigma: expected a number, got str"),
     ("blur", {"reblur_sigmas": 1.0}, "reblur_sigmas: expected a sequence"),

@@ -54,12 +54,11 @@ def test_anisotropic_diffusion_against_loops(conductance: str) -> None:
     np.testing.assert_allclose(got[0, 0], want, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("time", "steps"), [(None, (0, 5, 10)), (4.0, (0, 10, 20))])
-def test_multiscale_curvilinear_saliency_against_loops(time: float | None, steps: tuple[int, ...]) -> None:
+def test_multiscale_curvilinear_saliency_against_loops() -> None:
     image = photos(1, 17, dtype=torch.float64)
-    got = filters.multiscale_curvilinear_saliency(image, scales=3, sigma=0.8, kappa=0.05, diffusion_time=time)[0]
+    got = filters.multiscale_curvilinear_saliency(image, scales=3, sigma=0.8, kappa=0.05)[0]
     fields = []
-    for n in steps:
+    for n in (0, 5, 10):
         gx, gy = _gradient(_perona_malik(image[0, 0].numpy(), n, 0.05, 0.2, "rational"), 0.8)
         length = np.hypot(gx, gy)
         fields.append(np.stack([length * gx, length * gy]) / (length**2).max())
@@ -77,7 +76,7 @@ def test_multiscale_curvilinear_saliency_against_loops(time: float | None, steps
 @pytest.mark.parametrize("saliency_weight", [0.0, 0.5, 1.0])
 def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float) -> None:
     image = photos(1, 21, dtype=torch.float64)
-    options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight, "threshold": 0.2}
+    options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight}
     got = filters.multiscale_focus_curves(image, **options)[0]
     x = _smooth(image[0, 0].numpy(), 1.0)
     gx, gy = _gradient(image[0, 0].numpy(), 1.0)
@@ -91,7 +90,7 @@ def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float
         squared = np.where(ratio > 1, squared, np.inf)
         worst = np.maximum(worst, np.sqrt(np.clip(squared - 0.36, 0, 1000.0**2)))
     focus = 1 / np.maximum(worst, 0.6)
-    value = np.where((focus > 0.2) & (cs > 1e-3 * cs.max()), focus, 0)
+    value = np.where((focus > math.exp(-4)) & (cs > 1e-3 * cs.max()), focus, 0)
     value = value * cs**saliency_weight
     want = value * np.stack([gx, gy]) / np.maximum(np.sqrt(cs), 1e-300)
     assert 0.02 < (value > 0).mean() < 0.98

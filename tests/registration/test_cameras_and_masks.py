@@ -67,7 +67,7 @@ def test_camera_is_scaled_to_each_photograph():
     half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
     items = image_items([photo, half, ideal], [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]], RADIAL)
     point = torch.tensor([[0.4, 0.2, 1.0]]).double()
-    large, small = (project_points(point, torch.eye(4).double(), item.camera_matrix) for item in items[:2])
+    large, small = (project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1))
     torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
     torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
     (error,) = image_items([photo[:, :90]], None, RADIAL)
