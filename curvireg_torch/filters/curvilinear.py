@@ -208,10 +208,8 @@ def principal_curvature_image(
         the maximum, with arbitrary sign.
 
     Example:
-        >>> line = torch.ones(1, 1, 33, 33)
-        >>> line[..., 16] = 0.0                                                     # dark, along y
-        >>> field = principal_curvature_image(line)
-        >>> int(field[0, 0, 16].abs().argmax())
+        >>> line = (torch.arange(33.0) - 16).abs().clamp(max=1).expand(1, 1, 33, 33)         # dark, along y
+        >>> int(principal_curvature_image(line)[0, 0, 16].abs().argmax())
         16
     """
     check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")

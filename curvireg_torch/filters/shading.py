@@ -191,10 +191,8 @@ def apparent_ridges(
         (B, 2, H, W): length :math:`q_1` in 1/px (0 off the ridges), direction :math:`t_1` with arbitrary sign.
 
     Example:
-        >>> x = (torch.arange(33.0) - 16).expand(1, 1, 33, 33)
-        >>> roof = 10 + x.abs()
-        >>> field = apparent_ridges(roof, sigma=1.0, depth_scale=1.0)
-        >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
+        >>> roof = 10 + (torch.arange(33.0) - 16).abs().expand(1, 1, 33, 33)
+        >>> int(apparent_ridges(roof, depth_scale=1.0)[0, :, 16].norm(dim=0).argmax())       # its edge
         16
     """
 

@@ -88,9 +88,8 @@ def cached_bank(
 
     Example:
         >>> import tempfile
-        >>> from curvireg_torch.geometry import sample_views
-        >>> folder, views = Path(tempfile.mkdtemp()), sample_views(azimuth_step=90, elevations=[20])
-        >>> bank = cached_bank(trimesh.creation.box(), views, folder=folder, progress=False)
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2], folder=folder, progress=False)
         >>> len(list_cache(folder)), clear_cache(folder)
         (1, 1)
     """

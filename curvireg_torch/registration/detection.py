@@ -268,10 +268,9 @@ class Detector(nn.Module):
         distance: tuple[float, float] | None = None,
         allowed: Tensor | None = None,
     ) -> Proposals:
-        """Boxes of a photograph.
+        """Boxes of a photograph (1 or 3, H, W), floating in [0, 1] or uint8.
 
         Args:
-            image: (C, H, W), C = 1 or 3, floating in [0, 1] or uint8.
             focal: focal length in px, for ``distance``.
             distance: range of the distance of the object's centre, in the mesh's unit.
             allowed: (N,) bool; views that stand for none of these views of the bank are not compared.

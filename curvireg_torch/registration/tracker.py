@@ -275,7 +275,7 @@ class TrackedPose:
 
 
 class Tracker:
-    """Follows an object from a known pose.
+    """Follows an object from a known pose, by the ``contours`` of its mesh and the points ``hull`` (V, 3) around it.
 
     Each frame is searched around the pose that a constant velocity predicts, and if that is not convincing, around the
     last pose. Optical flow of corners on the surface gives a first pose; robust least squares then fits jointly edges
@@ -283,10 +283,6 @@ class Tracker:
     frame and of the keyframe that was seen from the most similar direction.
 
     A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
-
-    Args:
-        renderer, contours: of the mesh.
-        hull: (V, 3) points of the mesh that span its convex hull.
     """
 
     def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:

@@ -34,18 +34,13 @@ class DepthRenderer(Protocol):
 def make_renderer(
     mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, device: torch.device | str = "cpu"
 ) -> DepthRenderer:
-    """A renderer of ``mesh``. All backends agree, see ``docs/conventions.md``; all may be shared by threads.
+    """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be shared by threads:
 
     - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or needed.
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
       its first use cannot use it: start processes by "spawn".
-    - ``"torch"`` runs on any torch device. Forked processes must call ``torch.set_num_threads(1)`` first.
-
-    Args:
-        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
-        backend: a name, or a renderer, which is returned unchanged.
-        device: where "torch" renders.
+    - ``"torch"`` runs on ``device``. Forked processes must call ``torch.set_num_threads(1)`` first.
 
     Raises:
         RenderingError, MissingDependencyError: the backend does not work here.
