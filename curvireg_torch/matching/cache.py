@@ -24,7 +24,7 @@ from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 
-# Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
+#: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
 CACHE_LIMIT = 2_000_000_000
 ABANDONED_SECONDS = 3600.0  # Age from which an incomplete file counts as the remains of a killed process
 # Code that turns a mesh into described views: a bank that another version of it built is not found

@@ -82,15 +82,3 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
     assert d.shape == (3, 40 * 8 * 8 + 112 * 4 * 4)
     torch.testing.assert_close(similarity(d[:, None], d), expected, atol=2e-3, rtol=0)
     torch.testing.assert_close(similarity(d[:, None], d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
-
-
-def test_describe_is_bit_identical_in_any_batch_on_any_threads(network):
-    before = torch.get_num_threads()
-    grey = torch.rand(18, 1, 64, 64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    parts = []
-    for threads, count in ((1, 18), (1, 1), (1, 3), (3, 17), (3, 1)):
-        torch.set_num_threads(threads)
-        parts.append(describe(grey[:count], network))
-    torch.set_num_threads(before)
-    assert all(torch.equal(part, parts[0][: len(part)]) for part in parts)
-    assert not any(part.requires_grad for part in parts)

@@ -6,12 +6,10 @@ from dataclasses import fields
 import pytest
 import torch
 
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, symmetry_transforms
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration.poses import Poses, best_views, distinct_poses
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
-
-HALF_TURN = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
 
 
 def poses(degrees: list[float]) -> Poses:
@@ -32,14 +30,6 @@ def poses(degrees: list[float]) -> Poses:
 )
 def test_distinct_poses(degrees, score, expected):
     assert distinct_poses(poses(degrees), torch.tensor(score)).tolist() == expected
-
-
-def test_symmetric_poses_are_not_distinct():
-    turned = poses([0.0, 0.0])
-    turned.rotation[1] = turned.rotation[1] @ torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
-    score = torch.tensor([2.0, 1.0])
-    assert distinct_poses(turned, score).tolist() == [True, True]
-    assert distinct_poses(turned, score, symmetry_transforms(HALF_TURN)).tolist() == [True, False]
 
 
 def ranking(scores: torch.Tensor, allowed: torch.Tensor | None = None) -> Ranking:

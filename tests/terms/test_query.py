@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from curvireg_torch import ViewMatcher
-from curvireg_torch.geometry import crop_images
-from curvireg_torch.terms import crop_regions, jittered_boxes
+from curvireg_torch.terms import jittered_boxes
 
 
 def test_jittered_boxes_are_shifted_and_scaled():
@@ -22,18 +21,6 @@ def test_jittered_boxes_are_shifted_and_scaled():
     assert width.tolist() == pytest.approx([100] * 5 + [100 / 1.2, 120], rel=1e-5)
     assert jittered_boxes(box, 0.0).equal(box[None])
     assert jittered_boxes(box, 0.45).shape == (1, 7, 4)
-
-
-def test_crop_regions_equal_crops_of_whole_images():
-    generator = torch.Generator().manual_seed(0)
-    images = [torch.rand(3, 90, 120, generator=generator), torch.rand(3, 400, 300, generator=generator)]
-    boxes = torch.tensor([[-4.0, 30, 50, 110], [20, 20, 290, 380]])
-    jittered = jittered_boxes(boxes, 0.1)
-    crops = crop_regions(images, jittered, size=32, margin=0.1)
-    for i, image in enumerate(images):
-        for k in range(7):
-            whole = crop_images([image], jittered[i, k : k + 1], size=32, margin=0.1)[0][0]
-            torch.testing.assert_close(crops[i, k], whole, atol=1e-5, rtol=0)
 
 
 def test_box_jitter_recovers_a_shifted_view(bank):
