@@ -39,6 +39,7 @@ from .colours import colours_of_parts
 _WITH_COMPANIONS = (".glb", ".gltf", ".obj", ".ply")
 # Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or trimesh reads them
 _READ_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "EXT_texture_webp")
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it would print tracebacks of files that it cannot read
 Triangles = list[list[list[int]]]  # For each face its triangles, as positions among its corners
 # Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than
 # three corners, with indices that count back from the end, or with index 0
@@ -81,10 +82,7 @@ def read_mesh(path: Path) -> Any:
 
 def _read(path: Path, folder: "_Folder") -> Any:
     suffix = path.suffix.lower()
-    logger = logging.getLogger("trimesh")
-    level = logger.level
     try:
-        logger.setLevel(logging.CRITICAL)  # trimesh logs tracebacks of files that it cannot read
         if path.stat().st_size > MAX_MESH_BYTES:
             raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
         data = path.read_bytes()
@@ -108,8 +106,6 @@ def _read(path: Path, folder: "_Folder") -> Any:
         if "unexpected length" in reason:  # what trimesh says of both
             reason = "the file ends too early, or has binary faces with different numbers of corners: export triangles"
         raise MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path) from error
-    finally:
-        logger.setLevel(level)
 
 
 class _Folder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
