@@ -165,19 +165,18 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
     Returns:
         (N, D) float16 of unit length; D = 17 408 at S = 128.
     """
+
+    def describe_chunk(images: Tensor) -> Tensor:
+        levels = []
+        for features, spread in zip(backbone(images), backbone.spreads, strict=True):
+            centred = features - features.mean(dim=(2, 3), keepdim=True)
+            cells = F.normalize(centred / spread[:, None, None], dim=1)
+            levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
+        return torch.cat(levels, dim=1).half()
+
     # One image on a CPU, where larger batches are no faster and the rounding depends on the batch size.
     chunks = images.split(1 if images.device.type == "cpu" else IMAGES_AT_A_TIME)
-    parts = map_on_threads(lambda chunk: _describe_chunk(chunk, backbone), chunks, device=images.device)
-    return torch.cat(parts)
-
-
-def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
-    levels = []
-    for features, spread in zip(backbone(images), backbone.spreads, strict=True):
-        centred = features - features.mean(dim=(2, 3), keepdim=True)
-        cells = F.normalize(centred / spread[:, None, None], dim=1)
-        levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
-    return torch.cat(levels, dim=1).half()
+    return torch.cat(map_on_threads(describe_chunk, chunks, device=images.device))
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:

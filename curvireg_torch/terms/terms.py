@@ -230,7 +230,6 @@ class Whitening(nn.Module):
 
     def forward(self, descriptors: Tensor) -> Tensor:
         """(N, D) -> (N, D)."""
-        check_tensor(descriptors, "descriptors", (None, len(self.mean)))
         return (descriptors.to(self.mean) - self.mean) @ self.matrix.T
 
 
@@ -418,10 +417,6 @@ class _BoxShapeModule(nn.Module):
 
     def __init__(self, shapes: Tensor, sigma: float) -> None:
         super().__init__()
-        if bad := int((~shapes.isfinite()).sum()):
-            raise InvalidInputError(
-                f"views: expected finite shapes, got {bad} of {len(shapes)} NaN or infinite; their boxes have no area"
-            )
         self.sigma = sigma
         self.shapes: Tensor
         self.register_buffer("shapes", shapes, persistent=False)
