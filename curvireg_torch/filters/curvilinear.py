@@ -189,19 +189,15 @@ def image_curvilinear_saliency(image: Tensor, *, sigma: float | Tensor = 1.0) ->
     return ops.apply_to_photograph(layer, image)
 
 
-def principal_curvature_image(
-    image: Tensor, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest"
-) -> Tensor:
+def principal_curvature_image(image: Tensor, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0)) -> Tensor:
     r"""Principal curvature image (Deng et al. 2007): lines and the sides of edges, over scales.
 
-    :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` an eigenvalue of the Hessian of the image
-    smoothed by :math:`\sigma`: the largest one (``"largest"``: dark lines and the dark side of edges) or the negated
-    smallest one (``"smallest"``: bright lines and the bright side).
+    :math:`\max_\sigma \sigma^2 \max(\lambda, 0)` with :math:`\lambda` the largest eigenvalue of the Hessian of the
+    image smoothed by :math:`\sigma`: dark lines and the dark side of edges. Bright ones are those of the negated image.
 
     Args:
         image: (B, 1, H, W) grey levels, usually in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         sigmas: scales in px, > 0.
-        eigenvalue: ``"largest"`` or ``"smallest"``.
 
     Returns:
         (B, 2, H, W): the length is the curvature >= 0 in grey levels, the direction is across the line at the scale of
@@ -212,14 +208,12 @@ def principal_curvature_image(
         >>> int(principal_curvature_image(line)[0, 0, 16].abs().argmax())
         16
     """
-    check_option(eigenvalue, ("largest", "smallest"), "eigenvalue")
     scales = ops.check_sigmas(sigmas, "sigmas")
-    sign = 1.0 if eigenvalue == "largest" else -1.0
 
     def layer(image: Tensor) -> ops.Planes:
         best = vx = vy = torch.zeros_like(image)
         for sigma in scales:
-            xx, yy, xy = (sign * sigma**2 * h for h in ops.central_derivatives(ops.smooth(image, sigma))[2:])
+            xx, yy, xy = (sigma**2 * h for h in ops.central_derivatives(ops.smooth(image, sigma))[2:])
             x, y, half_gap = dominant_eigenvector(xx, xy, xy, yy, sign=1.0)
             curvature = 0.5 * (xx + yy) + half_gap
             better = (curvature > best).to(best.dtype)
@@ -257,4 +251,4 @@ class DepthCurvilinearSaliency(DepthModule, function=depth_curvilinear_saliency,
 class PrincipalCurvatureImage(FunctionModule, function=principal_curvature_image):
     """Module twin of :func:`principal_curvature_image`."""
 
-    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0), eigenvalue: str = "largest") -> None: ...
+    def __init__(self, *, sigmas: Sequence[float] = (1.0, 1.4, 2.0, 2.8, 4.0)) -> None: ...

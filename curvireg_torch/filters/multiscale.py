@@ -75,7 +75,6 @@ def multiscale_curvilinear_saliency(
     scales: int = 5,
     sigma: float | Tensor = 1.0,
     kappa: float | Tensor = 0.03,
-    conductance: str = "rational",
 ) -> Tensor:
     r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving smoothing.
 
@@ -86,7 +85,7 @@ def multiscale_curvilinear_saliency(
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: number n of levels, after 0, 5, 10, 20, ... steps of 0.2 of diffusion.
         sigma: smoothing in px before differentiation, >= 0.
-        kappa, conductance: of :func:`anisotropic_diffusion`, which smooths the levels.
+        kappa: of :func:`anisotropic_diffusion`, which smooths the levels.
 
     Returns:
         (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest value.
@@ -97,7 +96,6 @@ def multiscale_curvilinear_saliency(
         >>> round(float(field[0, :, 16, 16].norm()), 3)
         1.0
     """
-    check_option(conductance, CONDUCTANCES, "conductance")
     check_integer(scales, "scales")
     checked_sigma, contrast = ops.check_scalar(sigma, "sigma", zero_ok=True), ops.check_scalar(kappa, "kappa")
 
@@ -106,7 +104,7 @@ def multiscale_curvilinear_saliency(
         field, saliency = _normalised_saliency(level, checked_sigma)
         lowest = saliency
         for k in range(scales - 1):
-            level = diffuse(level, 5 * 2 ** max(k - 1, 0), contrast, DIFFUSION_STEP, conductance)
+            level = diffuse(level, 5 * 2 ** max(k - 1, 0), contrast, DIFFUSION_STEP, "rational")
             level_field, level_saliency = _normalised_saliency(level, checked_sigma)
             # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
@@ -150,6 +148,5 @@ class MultiScaleCurvilinearSaliency(
         scales: int = 5,
         sigma: float = 1.0,
         kappa: float = 0.03,
-        conductance: str = "rational",
         learnable: bool = False,
     ) -> None: ...
