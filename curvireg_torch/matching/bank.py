@@ -37,8 +37,6 @@ class ViewBank:
         views: the N viewpoints.
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool, unpacked on demand; of some views by :meth:`points_at` and
-            :meth:`silhouettes_at`.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
         reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
             large bank. Meshes with colours have grey features followed by coloured ones.
@@ -78,16 +76,6 @@ class ViewBank:
     def distances(self) -> Tensor:
         """(N,) float64 distances of the object's centre, in the mesh's unit."""
         return self.views.distance.to(self.device, torch.float64) * mesh_radius(self.mesh)
-
-    @property
-    def points(self) -> Tensor:
-        """(N, S, S) bool feature points of the views."""
-        return self.points_at(slice(None))
-
-    @property
-    def silhouettes(self) -> Tensor:
-        """(N, S, S) bool: pixels that show the object."""
-        return self.silhouettes_at(slice(None))
 
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""

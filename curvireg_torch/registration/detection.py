@@ -140,17 +140,23 @@ class Candidate:
         similarity = float(ranking.hog[0, ranking.order[0, 0]])
         return cls(box, response, query, ranking, detection_probability(response, similarity))
 
-    def register(self, registrar: "Registrar", item: ImageItem) -> Registration:
-        """Register the box; the result's box is the one around its pose."""
+    def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
+        """Register the box."""
         result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
-        box = projected_box(registrar.describer, result.projection)
-        none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
-        return replace(result, detection=Detection(box, self.score, self.response, *none))
+        return Found(result, projected_box(registrar.describer, result.projection), self.response, self.score)
 
 
-def _register_candidates(
-    registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int
-) -> list[Registration]:
+@dataclass(frozen=True)
+class Found:
+    """A registration, the ``box`` (4,) around its pose, and ``response`` and ``score`` of the box that led to it."""
+
+    registration: Registration
+    box: Tensor
+    response: float
+    score: float
+
+
+def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int) -> list[Found]:
     """The most certain objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
     none."""
     count = max(registrar.pipeline.detection.candidates, instances + 1)
@@ -163,56 +169,44 @@ def _register_candidates(
     if not candidates and failed is not None:
         raise failed
     boxes, scores = torch.stack([c.box for c in candidates]), torch.tensor([c.score for c in candidates])
-    results: list[Registration] = []
+    found: list[Found] = []
     for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
-        if len(results) < instances:
-            _add(results, _refined(registrar, item, candidates[k].register(registrar, item)))
-    return sorted(results, key=_score, reverse=True)
+        if len(found) < instances:
+            _add(found, _refined(registrar, item, candidates[k].register(registrar, item)))
+    return sorted(found, key=lambda one: one.score, reverse=True)
 
 
-def _refined(registrar: "Registrar", item: ImageItem, result: Registration) -> Registration:
-    """The more certain one of a result and of the registration of the box around its pose."""
-    where = detection_of(result)
+def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
+    """The more certain one of a registration and of that of the box around its pose."""
     try:
-        candidate = Candidate.ranked(registrar, item, where.box, where.response)
+        candidate = Candidate.ranked(registrar, item, found.box, found.response)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
-        return replace(result, detection=replace(where, score=0.0))
-    return result if candidate.score <= where.score else candidate.register(registrar, item)
+        return replace(found, score=0.0)
+    return found if candidate.score <= found.score else candidate.register(registrar, item)
 
 
-def _add(results: list[Registration], new: Registration) -> None:
-    """Add a result. Of results whose boxes overlap the most certain is kept: proposals may lead to the same object."""
-    boxes = torch.stack([detection_of(new).box, *(detection_of(result).box for result in results)])
-    overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
-    same = [result for result, iou in zip(results, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
-    if all(_score(new) > _score(result) for result in same):
-        results[:] = [result for result in results if not any(result is other for other in same)]
-        results.append(new)
+def _add(found: list[Found], new: Found) -> None:
+    """Add ``new``. Of those whose boxes overlap the most certain is kept: proposals may lead to the same object."""
+    overlap = box_iou(new.box[None], torch.stack([new.box, *(one.box for one in found)]))[0, 1:].tolist()
+    same = [one for one, iou in zip(found, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
+    if all(new.score > one.score for one in same):
+        found[:] = [one for one in found if not any(one is other for other in same)]
+        found.append(new)
 
 
-def _with_proposals(results: list[Registration], proposals: Proposals) -> list[Registration]:
-    """Results with all proposals, their own boxes first, and the score as a factor of their probabilities."""
-    boxes = torch.cat([torch.stack([detection_of(r).box for r in results]), proposals.boxes.double()])
-    responses = torch.cat([torch.tensor([detection_of(r).response for r in results]), proposals.responses])
+def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registration]:
+    """Registrations with all proposals, their own boxes first, and the score as a factor of their probabilities."""
+    boxes = torch.cat([torch.stack([one.box for one in found]), proposals.boxes.double()])
+    responses = torch.cat([torch.tensor([one.response for one in found]), proposals.responses])
     kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
     return [
         replace(
-            result,
-            detection=replace(detection_of(result), boxes=boxes[kept], responses=responses[kept]),
-            probabilities=tuple(p * _score(result) for p in result.probabilities),
+            one.registration,
+            detection=Detection(one.box, one.score, one.response, boxes[kept], responses[kept]),
+            probabilities=tuple(p * one.score for p in one.registration.probabilities),
         )
-        for result in results
+        for one in found
     ]
-
-
-def detection_of(result: Registration) -> Detection:
-    """``detection`` of a result that has one."""
-    assert result.detection is not None
-    return result.detection
-
-
-def _score(result: Registration) -> float:
-    return detection_of(result).score
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,7 @@ class Hypothesis:
         """``rotation``, ``translation`` and ``viewpoint`` as JSON values."""
         return {
             "rotation": self.rotation.tolist(),
-            "translation": None if self.translation is None else self.translation.tolist(),
+            "translation": _plain(self.translation),
             "viewpoint": dict(zip(("azimuth", "elevation", "theta"), self.viewpoint, strict=True)),
         }
 
@@ -163,7 +163,7 @@ class PhotographPose:
         rest = dict(vars(self))
         T, box = rest.pop("T_cam_from_model"), rest.pop("box")
         pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
-        return {**pose, "box": None if box is None else box.tolist(), **rest}
+        return {**pose, "box": _plain(box), **rest}
 
 
 class _OfBest(Generic[Value]):
@@ -300,12 +300,12 @@ class Registration:
 
     def to_dict(self) -> dict[str, Any]:
         """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
-        deviations, covariance = self.standard_deviations, self.covariance
+        deviations = self.standard_deviations
         prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
         return {
             **self.hypotheses[0].pose_dict(),
             "quaternion": self.quaternion.tolist(),
-            "T_cam_from_model": None if self.T_cam_from_model is None else self.T_cam_from_model.tolist(),
+            "T_cam_from_model": _plain(self.T_cam_from_model),
             "score": self.score,
             "confidence": self.confidence,
             "reliable": self.reliable,
@@ -318,8 +318,8 @@ class Registration:
             "standard_deviations": None
             if deviations is None
             else {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
-            "covariance": None if covariance is None else covariance.tolist(),
-            "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
+            "covariance": _plain(self.covariance),
+            "corrected_box": _plain(self.corrected_box),
             **({} if prior is None else {"prior": prior}),
             "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
             **({"views": [view.to_dict() for view in self.views]} if self.views else {}),
@@ -334,6 +334,10 @@ class Registration:
             "view": hypothesis.view,
             "terms": {name: value for name, value in terms.items() if math.isfinite(value)},
         }
+
+
+def _plain(values: Tensor | None) -> list[Any] | None:
+    return None if values is None else values.tolist()
 
 
 def _finite(deviations: Tensor) -> list[float | None]:

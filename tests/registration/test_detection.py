@@ -145,28 +145,31 @@ def test_detect_follows_one_proposal_more_than_instances():
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
+def as_found(result, **changes):
+    where = result.detection
+    return replace(detection_module.Found(result, where.box, where.response, where.score), **changes)
+
+
 def test_probabilities_are_those_of_a_right_box_times_its_score(found):
-    result = replace(found[2], probabilities=(0.8, 0.1))
+    one = as_found(replace(found[2], probabilities=(0.8, 0.1)))
     none = Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
-    (found_there,) = detection_module._with_proposals([result], none)
-    assert found_there.probabilities == pytest.approx((0.8 * result.detection.score, 0.1 * result.detection.score))
+    (found_there,) = detection_module._with_proposals([one], none)
+    assert found_there.probabilities == pytest.approx((0.8 * one.score, 0.1 * one.score))
 
 
 @pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
 def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
-    result, other = found[2], replace(found[2])
-    again = SimpleNamespace(score=result.detection.score + gain, register=lambda *_: other)
+    one, other = as_found(found[2]), as_found(found[2])
+    again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
     monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
-    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), result)
-    assert best is (result if kept else other)
+    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
+    assert best is (one if kept else other)
 
 
 @pytest.mark.parametrize("sure_first", [True, False])
 def test_add_keeps_the_most_certain_of_overlapping_results(found, sure_first):
-    sure = found[2]
-    where = sure.detection
-    beside = replace(sure, detection=replace(where, box=where.box + 500.0, score=0.1))
-    less = replace(sure, detection=replace(where, score=0.5 * where.score))
+    sure = as_found(found[2])
+    beside, less = replace(sure, box=sure.box + 500.0, score=0.1), replace(sure, score=0.5 * sure.score)
     results = [beside, sure if sure_first else less]
     detection_module._add(results, less if sure_first else sure)
     assert len(results) == 2
