@@ -63,7 +63,8 @@ def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, cond
 
 
 def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
-    scaled = difference * ops.safe_reciprocal(kappa)
+    # The range of a tensor cannot be checked while tracing.
+    scaled = difference * (1.0 / (kappa.clamp(min=1e-6, max=1e6) if isinstance(kappa, Tensor) else kappa))
     if conductance == "rational":
         return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
     return difference * torch.exp(-scaled.square())

@@ -72,7 +72,8 @@ def detect(
 
     def detect_in(item: ImageItem, _: int) -> list[Registration]:
         registrar.report_progress("detection")
-        check_crop(_extremes(item.image))
+        extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
+        check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
         limits: dict[str, Any] = {}
         if item.prior is not None:
             limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
@@ -95,12 +96,6 @@ def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
     return Limits(item, registrar.bank).allowed(off_centre=off_centre)
-
-
-def _extremes(image: Tensor) -> Tensor:
-    """(C, 2) smallest and largest value of each channel, NaN where one is missing; as :func:`check_crop` takes them."""
-    pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
-    return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
 
 
 @dataclass(frozen=True)

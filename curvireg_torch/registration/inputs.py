@@ -192,8 +192,11 @@ def image_item(
     pixels, notes = _pixels(image), []
     box = None if box is None else box.detach().float().cpu()
     mask = None if mask is None else _object_mask(mask, pixels)
-    if mask is not None and _looks_inverted(mask):
-        notes.append("the mask covers most of the photograph and of its border; the object must be white, not black")
+    if mask is not None:
+        white = mask >= 0.5
+        border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
+        if min(float(border.float().mean()), float(white.float().mean())) > 0.5:
+            notes.append("the mask covers most of the photograph and its border; the object must be white, not black")
     missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
     if isinstance(camera, Camera):
         camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
@@ -223,12 +226,6 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
     if float(x.min()) < 0 or float(x.max()) > 1:
         raise InvalidInputError("mask: expected values from 0 to 1, the object white; divide by the largest")
     return x
-
-
-def _looks_inverted(mask: Tensor) -> bool:
-    white = mask >= 0.5
-    border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
-    return bool(border.float().mean() > 0.5 and white.float().mean() > 0.5)
 
 
 def _box_of_mask(mask: Tensor, box: Tensor | None) -> Tensor:

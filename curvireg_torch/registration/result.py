@@ -247,17 +247,14 @@ class Registration:
         """Whether the confidence is at least ``RELIABLE``, without ``warnings``, the photograph does not contradict the
         prior by a better pose outside, and the contours determine at least one axis of rotation; if False, the pose is
         a guess."""
+        best = self.hypotheses[0]
         if self.confidence is None or self.confidence < RELIABLE or self.warnings:
             return False
-        return self.prior_contradiction != "better outside" and self._is_determined
-
-    @property
-    def _is_determined(self) -> bool:
-        """Whether a pose with a camera has a covariance, in which not all rotations are unknown."""
-        best = self.hypotheses[0]
-        deviations = best.standard_deviations
-        if best.translation is None or best.edge_support is None:
+        if self.prior_contradiction == "better outside":
+            return False
+        if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
+        deviations = best.standard_deviations
         return deviations is not None and bool(deviations[0].isfinite().any())
 
     @property
