@@ -159,37 +159,34 @@ class _Poses:
     def _matrix(self, image: "Tensor") -> "Tensor":
         """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
         from ..data import read_photo
+        from ..evaluation.lists import find_photographs
         from ..geometry import Camera, camera_matrix
         from ..geometry.cameras import camera_of_view
 
+        source = self.options.photos[0]
         size, camera, guess = (image.shape[-2], image.shape[-1]), self.options.camera, self.options.guess
         if camera is not None:
             return camera.at(size).matrix if isinstance(camera, Camera) else camera_matrix(*camera)
         if guess != "exif":
             return camera_of_view(float(guess or 0.0), size)
-        first = _photographs(self.options.photos[0])[0] if self.options.photos[0].is_dir() else None
+        first = next(find_photographs(source, 1, source)) if source.is_dir() else None
         K = None if first is None else read_photo(first).guessed_camera_matrix()
         if K is None:
             message = "no focal length in EXIF, which only photographs have; give --camera FX FY CX CY, or --fov DEG"
-            raise InvalidInputError(message, subject=first or self.options.photos[0])
+            raise InvalidInputError(message, subject=first or source)
         return K
-
-
-def _photographs(folder: Path) -> list[Path]:
-    from ..evaluation.lists import list_photographs
-
-    return [entry.photo for entry in list_photographs([folder], [folder], frames=folder).entries]
 
 
 def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
     """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
     from ..data import Video, read_photo
+    from ..evaluation.lists import find_photographs
 
     if path.suffix.lower() in VIDEOS and path.is_file():
         video = Video(path)
         fps = video.fps if 0 < video.fps < 1000 else FOLDER_FPS
         return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, fps
-    photos = _photographs(path)
+    photos = list(find_photographs(path, 1, path))
 
     def read() -> Iterator[tuple[str, "Tensor | ImageError"]]:
         for photo in photos:

@@ -18,8 +18,8 @@ from ..utils.files import check_writable
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
 
 if TYPE_CHECKING:
-    from ..evaluation.lists import PhotoList
     from ..evaluation.opening import RegisterOptions
+    from ..evaluation.runner import Entry
 
 MAX_FAILURES = 10
 """Photographs of a list that could not be registered, of which the command prints the reason."""
@@ -75,7 +75,7 @@ def add_register(commands: Any) -> None:
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
-        "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
+        "camera, MESH, what the options say. Or the same as JSON",
     )
     add(
         "--views",
@@ -103,8 +103,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
     rig, listed = arguments.views, arguments.list is not None or arguments.views is not None
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
-    scene = arguments.list or (rig / "scene_camera.json" if rig and (rig / "scene_camera.json").is_file() else None)
-    if arguments.unit is None and scene is not None and (scene.is_dir() or rig):
+    if arguments.unit is None and rig is not None and (rig / "scene_camera.json").is_file():
         arguments.unit = "mm"  # of the models in a BOP set
     if numbers := numbers_among(arguments.paths):
         return f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take four, --distance two"
@@ -138,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
     from ..evaluation.opening import check_camera, prior_from_limits
     from ..evaluation.runner import CAMERA_OPTIONS
-    from ..evaluation.workers import run_processes
+    from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
@@ -164,7 +163,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
-        photos = _photo_list(options, arguments.list, out, every=arguments.every)
+        photos = _photographs(options, arguments.list, out, every=arguments.every)
         counts = _register_several(options, field, photos, out)
         if counts is None:  # another process writes the tables
             return 0
@@ -274,7 +273,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     return result.reliable
 
 
-def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList", out: Path) -> Any:
+def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> Any:
     from ..evaluation.lists import register_list
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
@@ -289,22 +288,22 @@ def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList
     return register_list(photos, out, open_meshes, settings=settings, progress=options.progress)
 
 
-def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "PhotoList":
+def _photographs(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "list[Entry]":
     """The photographs that are named one by one or by the list at ``path``."""
     from ..evaluation.lists import list_photographs, read_list
 
     if path is not None:
-        photos = read_list(path, options.meshes, options.limits)
+        listed = read_list(path, options.meshes, options.limits)
+        photos = [replace(entry, guess=options.guess, instances=options.instances) for entry in listed]
         check_writable(out, "--out")
     else:
         check_writable(out, "--out")
-        same = {name: getattr(options, name) for name in ("box", "camera", "limits")}
-        photos = list_photographs(options.photos, options.meshes, **same, every=every, frames=out / "frames")
-        if given := [f"--{name}" for name in ("box", "camera") if same[name] is not None]:
-            print(f"{' and '.join(given)}: used for all {len(photos.entries)} photographs", file=sys.stderr)
+        photos = list_photographs(options, every=every, frames=out / "frames")
+        if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
+            print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    return replace(photos, entries=tuple(map(options.complete, photos.entries)))
+    return photos
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:

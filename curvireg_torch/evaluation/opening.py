@@ -202,17 +202,13 @@ class RegisterOptions:
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
     def entry(self, photo: Path) -> "Entry":
-        """A photograph with the box, camera and meshes of these options."""
+        """A photograph with the box, camera, meshes and other inputs of these options."""
         from .runner import Entry
 
-        prior = prior_from_limits(self.limits or {})
-        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, self.mask, prior=prior))
-
-    def complete(self, entry: "Entry") -> "Entry":
-        """A photograph of a list with the options that a list does not hold."""
         start, confidence = (None, None) if self.start is None else read_start(self.start)
-        own = replace(entry, guess=self.guess, instances=self.instances)
-        return replace(own, start=start, start_confidence=confidence)
+        named: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "camera", "mask")}
+        named |= {"guess": self.guess, "instances": self.instances, "prior": prior_from_limits(self.limits or {})}
+        return Entry(name=str(photo), photo=photo, start=start, start_confidence=confidence, **named)
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from curvireg_torch import PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.runner import Entry, run_entries
-from curvireg_torch.evaluation.workers import Workers, run_processes, workers
+from curvireg_torch.evaluation.store import Workers, run_processes, workers
 
 
 @pytest.fixture

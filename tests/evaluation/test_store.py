@@ -4,7 +4,7 @@ import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
 from curvireg_torch.evaluation.store import ResultStore, to_json
-from curvireg_torch.evaluation.workers import Workers
+from curvireg_torch.evaluation.store import Workers
 
 DIGESTS = {"request": "a", "photo": "b"}
 
