@@ -97,36 +97,43 @@ def _entry(
         meshes = (folder / values["mesh"],) if values.get("mesh") else meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = _four_numbers(values, BOX), _four_numbers(values, CAMERA)
-        if camera is not None:
-            camera_matrix(*camera)  # raises if it is invalid
+        box, camera = numbers_of(values, BOX), camera_of(values, folder)
         mask = folder / values["mask"] if values.get("mask") else None
-        calibration = load_camera(folder / values["camera"]) if values.get("camera") else None
-        if camera is not None and calibration is not None:
-            raise InvalidInputError("camera: give it or fx, fy, cx, cy")
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**limits, **own})
     except (InvalidInputError, MissingFileError) as error:
         return Entry(shown, values["photo"], error=str(error))
     photo = folder / values["photo"]
-    return Entry(shown, values["photo"], photo, meshes, box, camera or calibration, mask, prior=prior)
+    return Entry(shown, values["photo"], photo, meshes, box, camera, mask, prior=prior)
 
 
-def _four_numbers(values: Mapping[str, str], names: tuple[str, ...]) -> tuple[float, ...] | None:
+def camera_of(values: Mapping[str, str], folder: Path) -> tuple[float, ...] | Camera | None:
+    """The camera of a row: numbers, a calibration in ``folder``, or None."""
+    camera = numbers_of(values, CAMERA)
+    if camera is not None:
+        camera_matrix(*camera)  # raises if it is invalid
+    if not values.get("camera"):
+        return camera
+    if camera is not None:
+        raise InvalidInputError("camera: give it or fx, fy, cx, cy")
+    return load_camera(folder / values["camera"])
+
+
+def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, ...] | None:
+    """The numbers in some columns of a row; None if all are empty."""
     texts = [values.get(name, "") for name in names]
     empty = [name for name, text in zip(names, texts, strict=True) if not text]
     if len(empty) == len(names):
         return None
     if empty:
         present = f"{', '.join(filter(None, texts))} and nothing for {', '.join(empty)}"
-        raise InvalidInputError(f"{', '.join(names)}: expected all four or none, got {present}")
-    numbers = []
+        raise InvalidInputError(f"{', '.join(names)}: expected all or none, got {present}")
     for name, text in zip(names, texts, strict=True):
         try:
-            numbers.append(float(text))
+            float(text)
         except ValueError:
             raise InvalidInputError(f"{name}: expected a number, got {text[:40]!r}") from None
-    return tuple(numbers)
+    return tuple(map(float, texts))
 
 
 def list_photographs(options: RegisterOptions, *, every: int = 1, frames: Path) -> list[Entry]:
@@ -193,17 +200,23 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
     """
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
-    check_table_size(path)
     if path.suffix.lower() == ".json":
         rows = _json_rows(path)
         columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
-        return _entries(path, columns, [[_text(row.get(c)) for c in columns] for row in rows], meshes, limits or {})
+        lines = [[_text(row.get(name)) for name in columns] for row in rows]
+    else:
+        columns, *lines = csv_cells(path) or [[]]
+    return _entries(path, columns, lines, meshes, limits or {})
+
+
+def csv_cells(path: Path) -> list[list[str]]:
+    """The rows of a CSV file that are not blank."""
+    check_table_size(path)
     try:
         table = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
-        columns, *lines = [cells for cells in table if any(map(str.strip, cells))] or [[]]
+        return [cells for cells in table if any(map(str.strip, cells))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"{path}: not CSV in UTF-8 ({error}); save it as CSV in UTF-8") from error
-    return _entries(path, columns, lines, meshes, limits or {})
 
 
 def _text(value: Any) -> str:
@@ -211,6 +224,7 @@ def _text(value: Any) -> str:
 
 
 def _json_rows(path: Path) -> list[Row]:
+    check_table_size(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:

@@ -283,26 +283,19 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
     Raises:
         CurviregError: the file is missing, damaged or does not hold a rigid pose.
     """
-    import torch
-
     from ..geometry.cameras import transform
-    from ..utils.checks import check_rotation
+    from ..utils.checks import check_numbers, check_pose
 
     content = read_json(path, dict, "docs/guides/known-pose.md")
-    rows = content.get("rotation")
-    rotation = [finite_numbers(row, 3) for row in rows] if isinstance(rows, list) else []
-    translation = finite_numbers(content.get("translation"), 3)
-    if len(rotation) == 3 and None not in rotation and content.get("translation", ...) is None:
+    if "rotation" in content and content.get("translation", ...) is None:
         message = "a result without a translation, as of a photograph without a camera; register with --camera first"
         raise InvalidInputError(message, subject=path)
-    if len(rotation) != 3 or None in rotation or translation is None:
-        raise InvalidInputError("expected rotation (3 x 3 numbers) and translation (3 numbers)", subject=path)
-    R = torch.tensor([list(row or ()) for row in rotation], dtype=torch.float64)
     try:
-        check_rotation(R, "rotation")
+        numbers = [check_numbers(content.get(name), name, n) for name, n in (("rotation", 9), ("translation", 3))]
+        T = transform(numbers[0].view(3, 3), numbers[1])
+        check_pose(T, "rotation, translation")
     except InvalidInputError as error:
-        raise error.with_subject(str(path)) from error
-    T = transform(R, torch.tensor(translation, dtype=torch.float64))
+        raise error.with_subject(path) from error
     confidence = finite_numbers([content.get("confidence")], 1)
     return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
 

@@ -1,10 +1,8 @@
 """Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
 
-import csv
-import io
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,12 @@ from ..registration import Registrar, Registration
 from ..registration.result import result_document
 from ..utils.checks import check_pose
 from ..utils.files import check_table_size, finite_numbers, read_json
+from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, csv_cells, numbers_of
 from .runner import View, register_views
 
 __all__ = ["read_rig", "register_rig"]
 
-BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
-ROTATION, QUATERNION = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), ("qw", "qx", "qy", "qz")
-TRANSLATION = ("tx", "ty", "tz")
+ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
 COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
 
 
@@ -49,7 +46,6 @@ def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
         raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
-    check_table_size(path)
     return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path))
 
 
@@ -65,56 +61,40 @@ def _checked(path: Path, rows: Iterator[View]) -> list[View]:
 
 
 def _view(name: str, photo: Path, box: Any, camera: Any, rotation: Any, translation: Any) -> View:
-    """A row from plain values: ``camera`` a path or 4 numbers, ``rotation`` 9 numbers or 4 of a quaternion."""
+    """A row from plain values: ``camera`` a camera or its 4 numbers, ``rotation`` 9 numbers or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
         t = finite_numbers(translation, 3)
         if numbers is None or t is None:
             raise InvalidInputError(f"a rotation and a translation are needed; expected columns {COLUMNS}")
+        if camera is None:
+            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
         R = torch.tensor(numbers, dtype=torch.float64)
         if len(numbers) == 4 and abs(float(R.norm()) - 1.0) > 1e-2:
             raise InvalidInputError(f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order")
         R = R.view(3, 3) if len(numbers) == 9 else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
-        if isinstance(camera, Path | str):
-            return View(name, photo, box, load_camera(camera), T)
-        return View(name, photo, box, Camera(camera_matrix(*camera)), T)
+        return View(name, photo, box, camera if isinstance(camera, Camera) else Camera(camera_matrix(*camera)), T)
     except CurviregError as error:
         raise InvalidInputError(str(error), subject=name) from error
 
 
 def _table(path: Path) -> Iterator[View]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"not CSV in UTF-8 ({error}); expected columns {COLUMNS}") from error
-    for number, row in enumerate(rows, start=1):
-        photo = (row.get("photo") or "").strip()
-        name = f"row {number}: {photo}"
-        if not photo:
+    header, *rows = csv_cells(path) or [[]]
+    names = [name.strip().lower() for name in header]
+    for number, cells in enumerate(rows, start=1):
+        row = dict(zip(names, map(str.strip, cells), strict=False))
+        name = f"row {number}: {row.get('photo', '')}"
+        if not row.get("photo"):
             raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
-        camera, file = _cells(row, CAMERA, name), (row.get("camera") or "").strip()
-        if (camera is None) == (not file):
-            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)", subject=name)
-        rotation = _cells(row, ROTATION, name) or _cells(row, QUATERNION, name)
-        where = path.parent / photo, _cells(row, BOX, name), camera or str(path.parent / file)
-        yield _view(name, *where, rotation, _cells(row, TRANSLATION, name))
-
-
-def _cells(row: Mapping[str, Any], names: tuple[str, ...], where: str) -> tuple[float, ...] | None:
-    """The numbers in some columns; None if all are empty."""
-    texts = [(row.get(name) or "").strip() for name in names]
-    if not any(texts):
-        return None
-    try:
-        numbers = finite_numbers(list(map(float, texts)), len(names))
-    except ValueError:
-        numbers = None
-    if numbers is None:
-        raise InvalidInputError(f"expected numbers in {' '.join(names)}, got {' '.join(texts)!r}", subject=where)
-    return numbers
+        try:
+            box, camera = numbers_of(row, BOX), camera_of(row, path.parent)
+            rotation = numbers_of(row, ROTATION) or numbers_of(row, QUATERNION)
+            translation = numbers_of(row, TRANSLATION)
+        except CurviregError as error:
+            raise error.with_subject(": ".join(filter(None, (name, error.subject)))) from error
+        yield _view(name, path.parent / row["photo"], box, camera, rotation, translation)
 
 
 def _colmap(folder: Path) -> Iterator[View]:
@@ -142,7 +122,7 @@ def _colmap(folder: Path) -> Iterator[View]:
             *(place / "images" / match[3] for place in (folder, *folder.resolve().parents[:3])),
         ]
         photo = next((place for place in places if place.is_file()), places[0])
-        camera = f"{folder / 'cameras.txt'}:{match[2]}"
+        camera = load_camera(f"{folder / 'cameras.txt'}:{match[2]}")
         yield _view(f"image {match[3]}", photo, None, camera, pose[:4], pose[4:])
 
 

@@ -230,8 +230,6 @@ def test_list_names_what_failed(register_list, capsys, monkeypatch):
         ("json", b"{", ["not JSON"]),
         ("json", b"[" * 100_000, ["not JSON"]),
         ("json", b"[]", ["no photographs"]),
-        ("json", b'{"images": [], "annotations": [{"image_id": 3, "bbox": [1, 2, 3, 4]}]}', ["COCO", "3"]),
-        ("json", b'{"images": 3, "annotations": []}', ["COCO"]),
     ],
 )
 def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, name, content, messages):

@@ -14,7 +14,8 @@ from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, runner
-from curvireg_torch.evaluation.lists import PhotoList, list_photographs, read_list
+from curvireg_torch.evaluation.lists import list_photographs, read_list
+from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.runner import Entry
 from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
@@ -39,12 +40,11 @@ def entry(tmp_path):
     picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), picture)
     (tmp_path / "mesh.ply").write_text("a mesh")
-    return Entry((), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
+    return Entry({}, "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
 
 
 def register_rows(rows, out, registrar, settings=None):
-    photos = PhotoList((), tuple(rows))
-    return lists.register_list(photos, out, lambda _: registrar, settings=settings or {}, progress=False)
+    return lists.register_list(rows, out, lambda _: registrar, settings=settings or {}, progress=False)
 
 
 def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
@@ -130,7 +130,7 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     folder.mkdir()
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
-    photos = list_photographs([folder], entry.meshes, box=entry.box, frames=tmp_path)
+    photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box), frames=tmp_path)
     counts = lists.register_list(photos, tmp_path / "out", lambda _: registrar, settings={}, progress=False)
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
@@ -148,8 +148,8 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
         "photo,x0,y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     )
     found = read_list(path, [tmp_path / "part.stl"])
-    assert found.columns == ("photo", "x0", "y0", "x1", "y1", "note")
-    assert [entry.cells[-1] for entry in found.entries] == ["", "new", "x"]
-    assert [entry.error for entry in found.entries] == ["", "", "7 cells, the header has 6; quote texts with commas"]
+    assert list(found[0].cells) == ["photo", "x0", "y0", "x1", "y1", "note"]
+    assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
+    assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
-    assert read_list(path, [tmp_path / "part.stl"]).entries[0].box == (1.0, 2.0, 30.0, 40.0)
+    assert read_list(path, [tmp_path / "part.stl"])[0].box == (1.0, 2.0, 30.0, 40.0)
