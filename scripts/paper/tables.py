@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -201,7 +201,7 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
 
 def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability of each depth filter's points in each photograph filter's points."""
-    detectors = _photo_detectors(settings, [*PHOTO_FIELDS])
+    detectors = _photo_detectors(settings, PHOTO_FIELDS)
     depths = ("CS", "ASG", "HFN")
     scores = _no_scores()
     for category, depth, crop in _views(cases, settings, "repeatability", progress):
@@ -264,26 +264,16 @@ def _views(
 def _view_points(depth: Tensor, settings: BankSettings) -> Tensor:
     """(N, S, S) bool."""
     with torch.no_grad():
-        return _field_points(depth_filter(settings), settings.point_fraction, depth)
+        return field_points(depth_filter(settings)(depth), fraction=settings.point_fraction)[:, 0]
 
 
-def _photo_detectors(settings: BankSettings, names: Any = ()) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Detectors (B, 1, H, W) -> bool (B, H, W) of the paper's filters and the classical ones; ``names`` selects."""
-    fraction = settings.point_fraction
-    found = {name: partial(_field_points, make(), fraction) for name, make in PHOTO_FIELDS.items()}
-    known = {name.lower() for name in found}
-    classical = {n: partial(_detected_points, d, fraction) for n, d in DETECTORS.items() if n.lower() not in known}
-    wanted = {name.lower() for name in names}
-    return {name: detect for name, detect in (found | classical).items() if not wanted or name.lower() in wanted}
+def _photo_detectors(settings: BankSettings, names: Iterable[str] = DETECTORS) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Detectors (B, 1, H, W) -> bool (B, H, W) of the paper's filters and the classical ones, by name in capitals."""
 
+    def points(detect: Callable[..., Tensor], image: Tensor) -> Tensor:
+        return detect(image, fraction=settings.point_fraction)[:, 0]
 
-def _field_points(field: nn.Module, fraction: float, x: Tensor) -> Tensor:
-    return field_points(field(x), fraction=fraction)[:, 0]
-
-
-def _detected_points(detect: Callable[..., Any], fraction: float, image: Tensor) -> Tensor:
-    points: Tensor = detect(image, fraction=fraction)
-    return points[:, 0]
+    return {name.upper(): partial(points, DETECTORS[name.lower()]) for name in names}
 
 
 def _table(name: str, title: str, text: str, scores: Scores, columns: list[str]) -> Table:
