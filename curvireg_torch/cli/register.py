@@ -20,6 +20,7 @@ from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_a
 if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
     from ..evaluation.runner import Entry
+    from ..registration import Registrar
 
 MAX_FAILURES = 10
 """Photographs of a list that could not be registered, of which the command prints the reason."""
@@ -189,14 +190,12 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     import torch
 
     from ..data import read_photo
-    from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_pose_stamped, write_result
     from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
     from ..evaluation.store import to_json
     from ..registration.result import used_box
 
-    start, out, as_json = time.perf_counter(), arguments.out, arguments.json
-    path = options.photos[0]
+    out, as_json, path = arguments.out, arguments.json, options.photos[0]
     photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
     check_entry(entry, photo)
     if arguments.format and options.camera is options.guess is None:
@@ -205,14 +204,9 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
         print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with show_stages(enabled=options.progress) as progress:
-        if progress is not None:
-            progress("reading the mesh", 0, 1)
-        registrar = open_registrar(options, options.meshes, field, progress=progress)
-        registrar.progress = progress or False
-        ready = time.perf_counter() - start
+    with opened_registrar(options, field) as (registrar, seconds):
         try:
-            result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+            result, document = register_entry(entry, photo, registrar, bank_seconds=seconds)
         except LostObjectError as error:
             if out is not None:
                 write_lost(out, str(error))
@@ -243,20 +237,15 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
 
 def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
-    from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_pose_stamped, write_views
     from ..evaluation.rigs import read_rig, register_rig
     from ..evaluation.store import to_json
 
-    start, out = time.perf_counter(), arguments.out
-    rig = read_rig(arguments.views, options.meshes[0])
+    out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
         check_writable(out, "--out")
-    with show_stages(enabled=options.progress) as progress:
-        registrar = open_registrar(options, options.meshes, field, progress=progress)
-        registrar.progress = progress or False
-        ready = time.perf_counter() - start
-        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=ready)
+    with opened_registrar(options, field) as (registrar, seconds):
+        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
     document["mesh"] = str(options.meshes[result.model])
     if out is not None:
         write_views(out, document, registrar, result, photographs)
@@ -370,6 +359,20 @@ def _advice(document: Mapping[str, Any]) -> str:
     if support is not None and support < WEAK_CONTOURS:
         return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
     return f"check that the box is tight and {mesh}"
+
+
+@contextmanager
+def opened_registrar(options: "RegisterOptions", field: Any = None) -> "Iterator[tuple[Registrar, float]]":
+    """The registrar of the options' meshes, which shows its stages, and the seconds that it took to open."""
+    from ..evaluation.opening import open_registrar
+
+    start = time.perf_counter()
+    with show_stages(enabled=options.progress) as progress:
+        if progress is not None:
+            progress("reading the mesh", 0, 1)
+        registrar = open_registrar(options, options.meshes, field, progress=progress)
+        registrar.progress = progress or False
+        yield registrar, time.perf_counter() - start
 
 
 @contextmanager

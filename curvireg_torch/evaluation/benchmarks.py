@@ -25,7 +25,6 @@ from .metrics import (
     ADD_THRESHOLDS,
     MSPD_THRESHOLDS,
     MSSD_THRESHOLDS,
-    accuracy,
     add_error,
     adds_error,
     average_recall,
@@ -137,7 +136,7 @@ class Benchmark(ABC):
 
     def _rotation_scores(self, errors: Tensor) -> Row:
         """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
-        accuracies = {name: accuracy(errors, degrees) for name, degrees in self.thresholds.items()}
+        accuracies = {name: average_recall(errors, (degrees,)) for name, degrees in self.thresholds.items()}
         return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
 
 

@@ -20,7 +20,7 @@ from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
-from curvireg_torch.evaluation.metrics import accuracy
+from curvireg_torch.evaluation.metrics import average_recall
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
 from curvireg_torch.geometry import (
@@ -346,7 +346,7 @@ def precision_table(rankings: Rankings) -> Table:
     for category in [*sorted(set(rankings.categories)), "all"]:
         mask = torch.tensor([category in (c, "all") for c in rankings.categories])
         best = [rankings.errors.gather(1, order[:, :1])[mask, 0] for order in rankings.orders.values()]
-        rows.append([category, *(accuracy(errors, THRESHOLD_DEG) for errors in best)])
+        rows.append([category, *(average_recall(errors, (THRESHOLD_DEG,)) for errors in best)])
     text = (
         f"Precision: fraction of the photographs whose best view is within {THRESHOLD_DEG:g} degrees of the true one. "
         f"{rankings.definition}"

@@ -1,4 +1,4 @@
-"""Other files of ``curvireg register``: the page of a list, GLB and BOP CSV; and pipes that nobody reads."""
+"""Other files of ``curvireg register``: the page of a list, GLB and pipes that nobody reads."""
 
 import base64
 import html
@@ -16,11 +16,10 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
-from tests._support.lists import CAMERA, bop_poses, box_of, lines, table, written
+from tests._support.lists import CAMERA, box_of, table, written
 
 
 def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
@@ -85,26 +84,6 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, 
     torch.set_num_threads(before)
     assert status == 2
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
-
-
-def test_list_writes_bop_csv(folder, register, tmp_path):
-    header = "photo,x0,y0,x1,y1,fx,fy,cx,cy,scene_id,im_id,obj_id"
-    rows = [
-        ["photos/0.png", *box_of(0), *CAMERA, "1", "7", "3"],
-        ["photos/1.png", *box_of(1), *[""] * 4, "1", "8", "3"],
-        ["none.png", *box_of(1), *CAMERA, "1", "9", "3"],
-    ]
-    path = written(folder / "bop.csv", header, *rows)
-    assert register("--list", path, folder / "truck.safetensors", "--unit", "mm") == 0
-    (row,) = bop_poses(tmp_path / "out" / "bop.csv")
-    found = lines(tmp_path / "out")[0]
-    assert (row["scene_id"], row["im_id"], row["obj_id"], row["score"]) == (1, 7, 3, 0.0)
-    assert row["R"].tolist() == found["rotation"]
-    metres = torch.tensor(found["translation"], dtype=torch.float64)
-    assert found["unit"] == "m"  # of the bank
-    np.testing.assert_allclose(row["t"], metres * 1000)
-    K = camera_matrix(*map(float, CAMERA), dtype=torch.float64)
-    assert float((K @ metres)[2]) > 0
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

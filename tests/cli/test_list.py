@@ -139,41 +139,6 @@ def test_list_resumes_after_an_interruption(register_list, tmp_path, registered)
     assert [line["row"] for line in lines(out)] == [1, 2, 3, 4]
 
 
-def test_list_registers_again_what_has_changed(folder, register_list, tmp_path, registered, capsys):
-    names, _ = registered
-    photos = [f"photos/{seed}.png" for seed in range(3)]
-    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
-    assert register_list("changed.csv", HEADER, *rows) == 0
-    names.clear()
-    # The order of rows and columns, and other columns, do not matter.
-    reordered = [[*row[1:], row[0], "7"] for row in rows[::-1]]
-    assert register_list("changed.csv", "x0,y0,x1,y1,photo,id", *reordered) == 0
-    assert names == []
-    found = [(line["row"], line["columns"]["photo"]) for line in lines(tmp_path / "out")]
-    assert found == list(enumerate(photos[::-1], start=1))
-    # Another photograph of the same name, another box, other options.
-    original = (folder / "photos" / "2.png").read_bytes()
-    (folder / "photos" / "2.png").write_bytes((folder / "photos" / "1.png").read_bytes())
-    rows[0][1] = "1"
-    assert register_list("changed.csv", HEADER, *rows) == 0
-    (folder / "photos" / "2.png").write_bytes(original)
-    assert sorted(names) == ["photos/0.png", "photos/2.png"]
-    names.clear()
-    assert register_list("changed.csv", HEADER, *rows, words=["--top", "2"]) == 0
-    assert names == photos
-    assert "3 photographs: 3 ok" in capsys.readouterr().out
-
-
-def test_list_retries_a_missing_photograph(folder, register_list, tmp_path):
-    rows = [["photos/0.png", *box_of(0)], ["late.png", *box_of(1)]]
-    assert register_list("again.csv", HEADER, *rows) == 0
-    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "failed"]
-    (folder / "late.png").write_bytes((folder / "photos" / "1.png").read_bytes())
-    assert register_list("again.csv", HEADER, *rows) == 0
-    (folder / "late.png").unlink()
-    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "ok"]
-
-
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
     opened, load = [], ViewBank.load
@@ -244,6 +209,8 @@ def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, na
     ("words", "message"),
     [
         (["--list", "a.csv", "a.stl", "b.stl"], "at most one MESH"),
+        (["--views", "rig.csv", "a.stl", "--list", "a.csv"], "neither --list nor --start"),
+        (["--views", "rig.csv", "a.stl", "--fov", "50"], "the rig holds the cameras"),
         (["--list", "a.csv", "a.stl", "--box", "1", "2", "3", "4"], "leave --box"),
         (["a.jpg"], "expected PHOTO MESH"),
         (["--mesh", "a.stl"], "expected PHOTO MESH"),
@@ -256,25 +223,6 @@ def test_parse_refuses_options_that_exclude_each_other(register, words, message,
     with pytest.raises(SystemExit, match="2"):
         register(*words)
     assert message in capsys.readouterr().err
-
-
-def test_parse_needs_out_or_json(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(["register", "a.jpg", "b.stl"])
-    assert "expected --out DIR, or --json" in capsys.readouterr().err
-
-
-def test_parse_takes_options_between_photograph_and_mesh(folder, register):
-    assert register(folder / "photos/0.png", "--box", *box_of(0), folder / "truck.safetensors") == 0
-
-
-def test_list_refuses_unusable_options_and_foreign_results(register_list, refused, tmp_path):
-    row = ["photos/0.png", *box_of(0)]
-    refused(register_list("options.csv", HEADER, row, words=["--field", "none.safetensors"]), "none.safetensors")
-    assert not (tmp_path / "out" / "results.csv").exists()
-    (tmp_path / "out").mkdir(exist_ok=True)
-    (tmp_path / "out" / "results.jsonl").write_text('{"score": 1}\n')
-    refused(register_list("options.csv", HEADER, row), "results.jsonl")
 
 
 LIMITED = [
