@@ -119,13 +119,11 @@ def view(arguments: argparse.Namespace) -> None:
     except ImportError as error:
         message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
         raise MissingDependencyError(f"{message}'.[viewer]'") from error
-    from ..evaluation.opening import check_camera
     from ..geometry import Camera
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)
-    check_camera(options.camera, options.guess)
     if isinstance(options.camera, Camera):
         if options.camera.distorts:
             message = "has distortion, which the page does not remove; use curvireg register"
@@ -159,14 +157,13 @@ def draw(arguments: argparse.Namespace) -> None:
     import torch
 
     from ..data import read_photo
-    from ..evaluation.opening import check_camera, open_registrar
+    from ..evaluation.opening import open_registrar
     from ..evaluation.runner import register_entry, seen_image
     from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import contour_overlay, plots
 
     options = register_options(arguments, [arguments.photo], [arguments.mesh])
-    check_camera(options.camera, options.guess)
     photo = read_photo(options.photos[0], dtype=torch.uint8)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)

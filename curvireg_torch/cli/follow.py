@@ -59,14 +59,12 @@ def run(arguments: argparse.Namespace) -> None:
     check_given([] if live else [Path(source)], [arguments.mesh])
     if not live and not Path(source).exists():
         raise MissingFileError("no such folder or video; or give the number of a camera, or rtsp://...", subject=source)
-    from ..evaluation.opening import check_camera
     from ..evaluation.runner import CAMERA_OPTIONS
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
         raise InvalidInputError(f"follow: give {CAMERA_OPTIONS}")
-    check_camera(options.camera, options.guess)
     if out is None and not arguments.json:
         raise InvalidInputError("follow: give --out DIR, or --json")
     if out is not None:

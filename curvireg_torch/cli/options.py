@@ -12,6 +12,7 @@ from ..evaluation.opening import (
     PRIOR_OPTIONS,
     Numbers,
     RegisterOptions,
+    check_camera,
     limits_from_options,
     prior_from_limits,
 )
@@ -75,7 +76,7 @@ def register_options(
     """The options of a command; those that it lacks have their defaults.
 
     Raises:
-        InvalidInputError: limits that contradict each other, or no such device.
+        InvalidInputError: limits that contradict each other, an impossible camera, or no such device.
     """
     from ..utils.checks import check_device
 
@@ -91,6 +92,7 @@ def register_options(
         prior_from_limits(limits)
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
+    check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
 

@@ -136,7 +136,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.opening import check_camera, prior_from_limits
+    from ..evaluation.opening import prior_from_limits
     from ..evaluation.runner import CAMERA_OPTIONS
     from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
@@ -144,7 +144,6 @@ def run(arguments: argparse.Namespace) -> int:
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
     field, limits = options.open_field(), options.limits or {}
-    check_camera(options.camera, options.guess)
     if limits and prior_from_limits(limits) is None and arguments.list is None:
         raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
     if "distance" in limits and arguments.list is None and not (options.camera or options.guess):

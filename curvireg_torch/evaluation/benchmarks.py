@@ -37,14 +37,6 @@ from .protocol import Protocol, hint_of_truth, perturbed_box, random_numbers
 from .runner import Entry, View
 from .store import Row
 
-__all__ = [
-    "BOPBenchmark",
-    "Benchmark",
-    "Pascal3DBenchmark",
-    "PoseFolderBenchmark",
-    "detection_recall",
-]
-
 MIN_IOU = 0.5
 """Intersection over union from which a box is right."""
 

@@ -22,8 +22,6 @@ from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_fr
 from .runner import Entry, OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
 
-__all__ = ["POSE_COLUMNS", "Counts", "find_photographs", "list_photographs", "read_list", "register_list"]
-
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
 _REQUIRED = ("photo", *BOX)
 _KNOWN = (*_REQUIRED, *CAMERA, "camera", "mask", "mesh", *PRIOR_OPTIONS)

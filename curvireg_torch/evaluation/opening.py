@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from ..registration import Registrar
     from .runner import Entry
 
-__all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "Numbers", "RegisterOptions", "check_camera", "open_registrar"]
-
 WITHIN = 45.0
 """Degrees of ``within`` beside ``near`` if none are given."""
 

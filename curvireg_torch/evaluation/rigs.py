@@ -22,8 +22,6 @@ from ..utils.files import check_table_size, finite_numbers, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, csv_cells, numbers_of
 from .runner import View, register_views
 
-__all__ = ["read_rig", "register_rig"]
-
 ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
 COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
 

@@ -33,19 +33,6 @@ from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
 from .store import ResultStore, Row, workers
 
-__all__ = [
-    "POSE_SOURCES",
-    "Entry",
-    "OpenRegistrar",
-    "View",
-    "check_entry",
-    "failed_row",
-    "register_entry",
-    "register_views",
-    "run_entries",
-    "seen_image",
-]
-
 POSE_SOURCES = (
     *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
     *("utils", "errors.py", "pipeline.py"),

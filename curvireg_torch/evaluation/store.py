@@ -17,8 +17,6 @@ import torch.distributed as dist
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
 
-__all__ = ["ResultStore", "Row", "Workers", "run_processes", "to_json", "workers"]
-
 Row = dict[str, Any]
 T = TypeVar("T")
 
