@@ -266,10 +266,7 @@ def register_list(
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
 
     A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose arguments and errors
-    are the same. Under ``torchrun``, each process registers a part of the rows.
-
-    Returns:
-        The counts; None in processes that do not write the tables.
+    are the same. Returns None in processes that do not write the tables.
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
     if (out / "summary.json").exists():

@@ -98,22 +98,10 @@ PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class RegisterOptions:
-    """What to register, and how; the names and defaults are those of ``curvireg register``.
+    """What to register, and how; names, defaults and help texts are those of ``curvireg register``."""
 
-    Attributes:
-        photos: photographs, folders, patterns or videos.
-        meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px, or a calibrated camera; None: detected, and unknown.
-        guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
-        limits: on the pose, arguments of :class:`PosePrior`.
-        preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
-        pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
-
-    The help texts of the other fields are those of the command line.
-    """
-
-    photos: tuple[Path, ...] = ()
-    meshes: tuple[Path, ...] = ()
+    photos: tuple[Path, ...] = ()  # photographs, folders, patterns or videos
+    meshes: tuple[Path, ...] = ()  # mesh files or banks; of several, each photograph is registered to the best
     box: Annotated[
         tuple[float, float, float, float] | None,
         _option("in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")),
@@ -137,7 +125,7 @@ class RegisterOptions:
         Path | None,
         _option("result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path),
     ] = None
-    limits: Mapping[str, Any] | None = None
+    limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
     unit: Annotated[
         str,
         _option("of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)),

@@ -152,9 +152,8 @@ def register_rig(
 ) -> tuple[Registration, dict[str, Any], list[tuple[Tensor, Tensor, Tensor, str] | None]]:
     """Register the photographs of a rig together, see :func:`.runner.register_views`.
 
-    Returns:
-        The registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph, or
-        None for one that could not be read.
+    Returns the registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph,
+    or None for one that could not be read.
     """
     start = time.perf_counter()
     try:

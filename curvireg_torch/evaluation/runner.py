@@ -51,60 +51,35 @@ OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 
 @dataclass(frozen=True)
 class View:
-    """One of several photographs of an object in one pose.
+    """One of several photographs of an object in one pose."""
 
-    Attributes:
-        name, photo: the photograph as the user names it, and its file.
-        box: x0, y0, x1, y1 in px, or None.
-        camera: the camera, with its distortion.
-        T_cam_from_world: (4, 4) float64, lengths in the mesh's unit.
-    """
-
-    name: str
+    name: str  # as the user calls the photograph
     photo: Path
-    box: Sequence[float] | None
+    box: Sequence[float] | None  # x0, y0, x1, y1 in px
     camera: Camera
-    T_cam_from_world: Tensor
+    T_cam_from_world: Tensor  # (4, 4) float64, lengths in the mesh's unit
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One object in one photograph, to register.
+    """One object in one photograph, to register."""
 
-    Attributes:
-        cells: of a list: the texts of the row by the names of the columns.
-        name, photo: the photograph as the user names it, and its file.
-        meshes: mesh files; of several the best is found.
-        box: x0, y0, x1, y1 in px; None: the object is detected.
-        camera: fx, fy, cx, cy in px, or a calibrated camera; None if unknown.
-        mask: file of a mask of the object, instead of a box or beside it.
-        guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
-            horizontal field of view in degrees; None: no camera.
-        instances: without a box, see :func:`curvireg_torch.registration.detect`.
-        prior: limits on the pose.
-        start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
-        views: other photographs, with which the pose in ``photo`` is found; its camera is their world.
-        as_stored: boxes refer to the pixels as the file holds them; else the EXIF orientation is applied first.
-        label: of a dataset's object: a name that no other object has.
-        error: why the object cannot be registered; "" if it can.
-    """
-
-    cells: Mapping[str, str] = field(default_factory=dict)
-    name: str = ""
+    cells: Mapping[str, str] = field(default_factory=dict)  # of a list: the texts of the row by column
+    name: str = ""  # as the user calls the photograph
     photo: Path = Path()
-    meshes: tuple[Path, ...] = ()
-    box: Sequence[float] | None = None
-    camera: Sequence[float] | Camera | None = None
-    mask: Path | None = None
-    guess: str | float | None = None
-    instances: int = 1
+    meshes: tuple[Path, ...] = ()  # of several the best is found
+    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
+    camera: Sequence[float] | Camera | None = None  # fx, fy, cx, cy in px, or calibrated
+    mask: Path | None = None  # of the object, instead of a box or beside it
+    guess: str | float | None = None  # of an unknown camera: "exif", or the horizontal field of view in degrees
+    instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
-    start: tuple[tuple[float, ...], ...] | None = None
+    start: tuple[tuple[float, ...], ...] | None = None  # (4, 4) pose that is refined; nothing is searched for
     start_confidence: float | None = None
-    views: tuple[View, ...] = ()
-    as_stored: bool = False
-    label: str = ""
-    error: str = ""
+    views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
+    as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    label: str = ""  # of a dataset's object: a name that no other object has
+    error: str = ""  # why the object cannot be registered
 
     def request(self) -> list[Any]:
         """All that the result depends on besides the content of files."""

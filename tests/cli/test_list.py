@@ -7,7 +7,6 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation import runner
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
@@ -26,23 +25,6 @@ def register_list(folder, register):
         return register("--list", path, *([folder / mesh] if mesh else []), *words, out=out)
 
     return run
-
-
-@pytest.fixture
-def registered(monkeypatch):
-    """Names of the photographs that are registered; ``stop_after`` of them, Ctrl-C is simulated."""
-    names = []
-    register_one = runner.register_entry
-
-    def register_entry(entry, *rest, **options):
-        if len(names) == register_entry.stop_after:
-            raise KeyboardInterrupt
-        names.append(entry.name)
-        return register_one(entry, *rest, **options)
-
-    register_entry.stop_after = None
-    monkeypatch.setattr(runner, "register_entry", register_entry)
-    return names, register_entry
 
 
 def rotation(row):
@@ -115,30 +97,6 @@ def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
         assert [line[name] for name in keys] == [alone[name] for name in keys]
 
 
-def test_list_resumes_after_an_interruption(register_list, tmp_path, registered):
-    names, spy = registered
-    photos = [f"photos/{seed}.png" for seed in range(3)]
-    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
-    rows.append(rows[0])
-    assert register_list("resumed.csv", HEADER, *rows, out="whole") == 0
-    out = tmp_path / "out"
-    for k in (1, 2):
-        names.clear()
-        spy.stop_after = 1
-        assert register_list("resumed.csv", HEADER, *rows) == 130
-        content = (out / "results.jsonl").read_bytes()
-        stored = [json.loads(line)["inputs"]["photo"] for line in content.splitlines()]
-        assert len(stored) == len(set(stored)) == k  # threads take them in any order
-        assert not (out / "results.csv").exists()
-        (out / "results.jsonl").write_bytes(content + content.splitlines()[0][:500])  # killed while it wrote
-    names.clear()
-    spy.stop_after = None
-    assert register_list("resumed.csv", HEADER, *rows) == 0
-    assert names == sorted(set(photos) - set(stored))
-    assert (out / "results.csv").read_bytes() == (tmp_path / "whole" / "results.csv").read_bytes()
-    assert [line["row"] for line in lines(out)] == [1, 2, 3, 4]
-
-
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
     opened, load = [], ViewBank.load
@@ -187,6 +145,7 @@ def test_list_names_what_failed(register_list, capsys, monkeypatch):
         ("csv", b"photo,x0,y0,x1\na.png,1,2,3\n", ["no column y1"]),
         ("csv", b"photo,x0,y0,x1,y1,x0\na.png,1,2,3,4,5\n", ["two columns x0"]),
         ("csv", b"photo,x0,y0,x1,y1,status\na.png,1,2,3,4,5\n", ["status", "rename"]),
+        ("csv", b"photo,x0,y0,x1,y1,found_mesh\na.png,1,2,3,4,5\n", ["found_mesh", "rename"]),
         ("csv", b"photo,x0,y0,x1,y1\n\xff.png,1,2,3,4\n", ["UTF-8"]),
         ("csv", b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["not CSV"]),
         ("csv", b"photo,x0,y0,x1,y1\n" + b"a" * 140_000 + b",1,2,3,4\n", ["not CSV", "field larger"]),

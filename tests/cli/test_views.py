@@ -105,13 +105,13 @@ def test_read_rig_reads_colmap_and_bop(rig, tmp_path):
     bop = tmp_path / "bop"
     bop.mkdir()
     (bop / "scene_camera.json").write_text(json.dumps(scene))
-    truth = {str(k): [{"obj_id": 7}, {"obj_id": 5}] for k in range(3)}
+    truth = {str(k): [{"obj_id": 7 if k < 2 else 5}, {"obj_id": 5}] for k in range(3)}  # twice in the last photograph
     (bop / "scene_gt.json").write_text(json.dumps(truth))
     info = {str(k): [{"bbox_obj": [1, 2, 3, 4]}, {"bbox_obj": [5, 6, 20, 30]}] for k in range(3)}
     (bop / "scene_gt_info.json").write_text(json.dumps(info))
     for path, mesh, box in ((tmp_path, None, None), (bop, Path("obj_000005.ply"), (5.0, 6.0, 25.0, 36.0))):
         views = read_rig(path, mesh)
-        assert [view.box for view in views] == [box] * 3
+        assert [view.box for view in views] == [box, box, None]
         for view, R, row in zip(views, expected, rows, strict=True):
             torch.testing.assert_close(view.T_cam_from_world[:3, :3], R, atol=1e-6, rtol=0)
             assert view.T_cam_from_world[:3, 3].tolist() == pytest.approx(row[18:], abs=1e-6)
@@ -147,12 +147,15 @@ def test_read_rig_names_the_row_that_is_wrong(rig, changes, message):
 def test_read_rig_refuses_other_files(tmp_path):
     (tmp_path / "empty.csv").write_text("photo\n")
     (tmp_path / "binary.csv").write_bytes(b"\xff\xfe\x00")
+    row = "a.png,,,,,9,9,4,4,2,0,0,0,0,0,1\n"
+    (tmp_path / "long.csv").write_text(f"{','.join(COLUMNS)},qw,qx,qy,qz,tx,ty,tz\n{row}")
     (tmp_path / "colmap").mkdir()
     (tmp_path / "colmap" / "images.txt").write_text("1 0 0 0\n")
     for name, message in (
         ("none.csv", "no such file"),
         ("empty.csv", "no photographs"),
         ("binary.csv", "not CSV in UTF-8"),
+        ("long.csv", "qw qx qy qz of length 1"),
         ("colmap", "expected IMAGE_ID QW"),
         ("", "without images.txt"),
     ):

@@ -145,10 +145,10 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
     path = tmp_path / "excel.csv"
     path.write_text(
-        "photo,x0,y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
+        "Photo ,x0,Y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     )
     found = read_list(path, [tmp_path / "part.stl"])
-    assert list(found[0].cells) == ["photo", "x0", "y0", "x1", "y1", "note"]
+    assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
     assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
     assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through

@@ -8,10 +8,10 @@ from unittest.mock import patch
 import pytest
 import torch
 
-from curvireg_torch import PosePrior
+from curvireg_torch import Camera, PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
-from curvireg_torch.evaluation.runner import Entry, run_entries
+from curvireg_torch.evaluation.runner import Entry, View, run_entries
 from curvireg_torch.evaluation.store import Workers, run_processes
 
 
@@ -114,6 +114,9 @@ ENTRY = Entry(
 )
 
 
+VIEWS = (View("z.png", Path("z.png"), None, Camera(torch.eye(3)), torch.eye(4)),)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -129,12 +132,20 @@ ENTRY = Entry(
         {"start": ((1.0, 0.0, 0.0, 0.0),)},
         {"start_confidence": 0.5},
         {"as_stored": True},
+        {"views": VIEWS},
     ],
 )
 def test_request_covers_every_option(changes):
     changed = replace(ENTRY, **changes)
     assert changed.request() != ENTRY.request() == replace(ENTRY).request()
     assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key
+
+
+@pytest.mark.parametrize("name", ["box", "camera", "T_cam_from_world"])
+def test_request_covers_other_views(name):
+    values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
+    other = replace(VIEWS[0], **{name: values.get(name, 2.0 * torch.eye(4))})
+    assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request()
 
 
 def test_run_processes(monkeypatch, capfd):

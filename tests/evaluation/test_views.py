@@ -115,7 +115,7 @@ def sample(image, place=None, instance=0):
 
 def test_instances_are_told_apart_by_their_place():
     near, far = (0.0, 0.0, 100.0), (30.0, 0.0, 100.0)
-    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1), sample(2, (5.0, 0.0, 100.0))]
+    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1), sample(2, (2.0, 0.0, 100.0))]
     assert same_instances(swapped) == [[0, 3], [1, 2], [4]]
     assert same_instances([sample(0), sample(1, instance=3)]) == [[0, 1]], "one in each photograph"
     listed = [sample(0), sample(0, instance=1), sample(1, instance=1), sample(1)]
