@@ -76,7 +76,7 @@ def add_register(commands: Any) -> None:
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
-        "camera, MESH, what the options say. Or the same as JSON",
+        "camera, MESH, what the options say",
     )
     add(
         "--views",

@@ -1,10 +1,9 @@
-"""Lists of photographs: CSV, JSON, folders and videos; and their results."""
+"""Lists of photographs: CSV files, folders and videos; and their results."""
 
 import csv
 import glob
 import io
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -36,57 +35,17 @@ BEST_MESH = "found_mesh"
 """A last column, if rows have several meshes: the best of them."""
 
 
-def _entries(
-    path: Path,
-    columns: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    meshes: Sequence[Path],
-    limits: Mapping[str, Any],
-) -> list[Entry]:
-    """The entries of a table of texts, see :func:`read_list`.
-
-    Empty cells beyond the last named column, as spreadsheets write them, do not count.
-    """
-    columns = _without_empty_end(columns, 0)
-    names = [column.strip().lower() for column in columns]
-    if missing := [required for required in _REQUIRED if required not in names]:
-        raise InvalidInputError(
-            f"{path}: no column {', '.join(missing)} in its header {','.join(columns)[:80]!r}; "
-            f"separate columns by commas and call them {','.join(_REQUIRED)}"
-        )
-    if twice := sorted({column for column in names if names.count(column) > 1}):
-        raise InvalidInputError(f"{path}: two columns {', '.join(twice) or 'without a name'}; keep one of each")
-    for column in set(names) - set(_KNOWN):
-        if meant := get_close_matches(column, PRIOR_OPTIONS, 1, 0.8):
-            raise InvalidInputError(f"{path}: unknown column {column!r}; rename it to {meant[0]}, or otherwise")
-    if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
-        raise InvalidInputError(f"{path}: {', '.join(reserved)}: names of result columns; rename those of the list")
-    indices = {known: names.index(known) for known in _KNOWN if known in names}
-    entries = [_entry(cells, columns, indices, path.parent, tuple(meshes), limits) for cells in rows]
-    if not entries:
-        raise InvalidInputError(f"{path}: no photographs; give one row for each")
-    return entries
-
-
-def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
-    """The cells without the empty ones at the end; the first ``least`` stay."""
-    kept = list(cells)
-    while len(kept) > least and not kept[-1].strip():
-        kept.pop()
-    return kept
-
-
 def _entry(
     cells: Sequence[str],
-    columns: Sequence[str],
-    indices: Mapping[str, int],
+    columns: Mapping[str, str],
     folder: Path,
     meshes: tuple[Path, ...],
     limits: Mapping[str, Any],
 ) -> Entry:
+    """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     cells, count = _without_empty_end(cells, len(columns)), len(columns)
-    shown = dict(zip(columns, cells + [""] * count, strict=False))
-    values = {name: shown[columns[index]].strip() for name, index in indices.items()}
+    shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
+    values = {name: shown[column].strip() for name, column in columns.items()}
     try:
         if len(cells) != count:
             raise InvalidInputError(f"{len(cells)} cells, the header has {count}; quote texts with commas")
@@ -168,22 +127,13 @@ def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
 
 
 def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any] | None = None) -> list[Entry]:
-    """Read a list of photographs.
+    """Read a list of photographs: a CSV file, whose paths are relative to its folder.
 
-    - ``.csv``: columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``,
-      ``cy`` or ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others
-      are passed through. Empty cells mean: detect the object, no camera, ``meshes``, ``limits``. Blank lines are
-      ignored.
-    - ``.json``: a list of objects ``{"photo": "a.jpg", "box": [x0, y0, x1, y1], "camera": [fx, fy, cx, cy], "mesh":
-      "part.stl", "azimuth": [300, 60]}``, all but ``photo`` optional; other keys are columns.
-
-    Args:
-        path: the file; paths in it are relative to its folder.
-        meshes: for rows that name none; of several the best is found.
-        limits: on the pose, arguments of :class:`PosePrior` for rows that do not give them.
-
-    Returns:
-        An entry for each row; of one that cannot be used, ``error`` is the reason.
+    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
+    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
+    through. Empty cells mean: detect the object, no camera, ``meshes`` (of several the best is found), ``limits`` (on
+    the pose, arguments of :class:`PosePrior`). Blank lines, and empty cells beyond the last named column, as
+    spreadsheets write them, do not count. The ``error`` of a row that cannot be used is the reason.
 
     Raises:
         MissingFileError: no such file.
@@ -191,20 +141,40 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
 
     Example:
         >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp(), "list.json")
-        >>> _ = file.write_text('[{"photo": "a.jpg", "box": [1, 2, 30, 40.5], "mesh": "part.stl"}]')
+        >>> file = Path(tempfile.mkdtemp(), "list.csv")
+        >>> _ = file.write_text("photo,x0,y0,x1,y1,mesh\\na.jpg,1,2,30,40.5,part.stl")
         >>> read_list(file)[0].box
         (1.0, 2.0, 30.0, 40.5)
     """
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
-    if path.suffix.lower() == ".json":
-        rows = _json_rows(path)
-        columns = list(dict.fromkeys(["photo", *BOX, *(key for row in rows for key in row)]))
-        lines = [[_text(row.get(name)) for name in columns] for row in rows]
-    else:
-        columns, *lines = csv_cells(path) or [[]]
-    return _entries(path, columns, lines, meshes, limits or {})
+    header, *rows = csv_cells(path) or [[]]
+    header = _without_empty_end(header, 0)
+    names = [column.strip().lower() for column in header]
+    if missing := [required for required in _REQUIRED if required not in names]:
+        raise InvalidInputError(
+            f"{path}: no column {', '.join(missing)} in its header {','.join(header)[:80]!r}; "
+            f"separate columns by commas and call them {','.join(_REQUIRED)}"
+        )
+    if twice := sorted({column for column in names if names.count(column) > 1}):
+        raise InvalidInputError(f"{path}: two columns {', '.join(twice) or 'without a name'}; keep one of each")
+    for column in set(names) - set(_KNOWN):
+        if meant := get_close_matches(column, PRIOR_OPTIONS, 1, 0.8):
+            raise InvalidInputError(f"{path}: unknown column {column!r}; rename it to {meant[0]}, or otherwise")
+    if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
+        raise InvalidInputError(f"{path}: {', '.join(reserved)}: names of result columns; rename those of the list")
+    if not rows:
+        raise InvalidInputError(f"{path}: no photographs; give one row for each")
+    columns = dict(zip(names, header, strict=True))
+    return [_entry(cells, columns, path.parent, tuple(meshes), limits or {}) for cells in rows]
+
+
+def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
+    """The cells without the empty ones at the end; the first ``least`` stay."""
+    kept = list(cells)
+    while len(kept) > least and not kept[-1].strip():
+        kept.pop()
+    return kept
 
 
 def csv_cells(path: Path) -> list[list[str]]:
@@ -215,31 +185,6 @@ def csv_cells(path: Path) -> list[list[str]]:
         return [cells for cells in table if any(map(str.strip, cells))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"{path}: not CSV in UTF-8 ({error}); save it as CSV in UTF-8") from error
-
-
-def _text(value: Any) -> str:
-    return "" if value is None else value if isinstance(value, str) else json.dumps(value)
-
-
-def _json_rows(path: Path) -> list[Row]:
-    check_table_size(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{path}: not JSON ({error}); a table of commas is named .csv") from error
-    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
-        raise InvalidInputError(f"{path}: expected a list of objects with photo, box, camera, mesh")
-    rows = []
-    for entry in content:  # values of box and camera that are not four numbers are refused later
-        row = {key: value for key, value in entry.items() if key not in ("box", "camera")}
-        for key, names in (("box", BOX), ("camera", CAMERA)):
-            if isinstance(values := entry.get(key), str):
-                row[key] = values  # a calibration file
-            elif values is not None:
-                four = values if isinstance(values, list) and len(values) == 4 else [f"{key} {values}"] * 4
-                row |= dict(zip(names, four, strict=True))
-        rows.append(row)
-    return rows
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,7 @@ class DatasetSpec:
     pose: str = "any"  # default of the protocol's pose
     category: str = "{category}"  # format of the name of a sample's group
     options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of the class, as add_argument takes them
-    whole: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # options for objects neither occluded nor truncated
+    whole: Mapping[str, Any] = field(default_factory=dict)  # options for objects neither occluded nor truncated
 
     def add_arguments(self, parser: Any) -> None:
         """Add ROOT and the options to a parser."""

@@ -59,26 +59,6 @@ def test_register_chooses_among_meshes(folder, register, document, tmp_path, cap
     assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [str(v) for v in document("one")["rotation"][0]]
 
 
-def test_register_list_in_json(folder, register, tmp_path):
-    box = [float(v) for v in box_of(1)]
-    camera = [260, 260.0, 119.5, 89.5]
-    content = [
-        {"photo": "photos/1.png", "box": box, "camera": camera, "mesh": "truck.safetensors", "id": 7},
-        {"photo": "photos/1.png", "box": [1, 2, 3]},
-        {"photo": "photos/0.png", "note": {"deep": None}},
-        {"box": box},
-    ]
-    (folder / "list.json").write_text(json.dumps(content))
-    assert register("--list", folder / "list.json", folder / "truck.safetensors") == 0
-    rows = table(tmp_path / "out")
-    assert [row["status"] for row in rows] == ["ok", "failed", "ok", "failed"]
-    assert "x0" in rows[1]["message"]
-    assert "photo: empty" in rows[3]["message"]
-    assert rows[0]["id"] == "7"
-    assert rows[0]["tx"] != "" == rows[2]["tx"]
-    assert lines(tmp_path / "out")[0]["inputs"]["box"] == box
-
-
 def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path):
     video = cv2.VideoWriter(str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (240, 180))
     frames = [cv2.imread(str(folder / "photos" / f"{seed}.png")) for seed in range(3)]
