@@ -59,8 +59,9 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     np.testing.assert_allclose([points.min(0), points.max(0)], [expected.min(0), expected.max(0)], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
+    (tmp_path / "out" / "pose.yaml").write_text("of an older result")
     assert register(*words) == 0
-    assert not (tmp_path / "out" / "pose.glb").exists()
+    assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
 @pytest.mark.parametrize("threads", [1, 2])

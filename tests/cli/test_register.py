@@ -53,6 +53,7 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert capsys.readouterr().err == ""
     keys = ("translation", "covariance", "standard_deviations")
     assert {document()[key] for key in keys} == {None}
+    assert document()["pipeline"]["contours"] is False
 
 
 @pytest.mark.parametrize(("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")])

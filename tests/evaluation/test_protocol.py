@@ -61,6 +61,7 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     assert float(missed.max()) <= 0.0
     assert float(missed.min()) >= -degrees
     assert float(missed.std()) > 0.15 * degrees
+    assert float(missed.max()) > -0.25 * degrees, "offsets fill the range"
     assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
     assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(R[0], frame, replace(protocol, seed=1), "a")
 

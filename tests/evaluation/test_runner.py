@@ -105,7 +105,10 @@ def test_missing_photographs_are_tried_again(entries, tmp_path):
 
 
 def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").write_text("of other results")
     assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
+    assert not (tmp_path / "out" / "summary.json").exists()
     assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
 

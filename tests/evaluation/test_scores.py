@@ -225,6 +225,13 @@ def test_pose_folders_score_known_poses(web):
     assert benchmark.errors(benchmark.samples[:1], [FAILED])["error_deg"].tolist() == [torch.inf]
 
 
+def test_detection_is_scored_in_single_photographs(bop, tmp_path):
+    for views in (1, 2):
+        benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None, views=views))
+        summary = scores_of(benchmark, tmp_path / str(views), [FAILED] * 4)
+        assert ("detection" in summary) == (views == 1)
+
+
 BOX = (10.0, 10.0, 30.0, 30.0)
 AWAY = (150, 50, 160, 60)
 
