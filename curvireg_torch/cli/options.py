@@ -4,6 +4,7 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,7 @@ from ..evaluation.opening import (
     prior_from_limits,
 )
 
-DECLARED: dict[str, dict[str, Any]] = {
-    name: how.__metadata__[0] for name, how in RegisterOptions.__annotations__.items() if hasattr(how, "__metadata__")
-}
+DECLARED = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)

@@ -8,9 +8,9 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
 from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
@@ -77,10 +77,10 @@ def camera_option(text: str) -> Any:
         raise argparse.ArgumentTypeError(f"{error}; or give FILE (a calibration), exif, or --fov DEG") from None
 
 
-def _option(text: str, **how: Any) -> dict[str, Any]:
-    """Annotation of a field that is an option: its help, and other arguments of ``ArgumentParser.add_argument``;
+def _option(default: Any, text: str, **how: Any) -> Any:
+    """A field that is an option: its default, its help, and other arguments of ``ArgumentParser.add_argument``;
     ``flag`` is its name where that is not the field's."""
-    return {"help": text, **how}
+    return field(default=default, metadata={"help": text, **how})
 
 
 PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
@@ -102,72 +102,56 @@ class RegisterOptions:
 
     photos: tuple[Path, ...] = ()  # photographs, folders, patterns or videos
     meshes: tuple[Path, ...] = ()  # mesh files or banks; of several, each photograph is registered to the best
-    box: Annotated[
-        tuple[float, float, float, float] | None,
-        _option("in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")),
-    ] = None
-    camera: Annotated[
-        Any,  # four numbers, a Camera, or None
-        _option(
-            "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
-            "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
-            "result then has no covariance",
-            type=camera_option,
-        ),
-    ] = None
-    mask: Annotated[
-        Path | None, _option("picture in which the object is white, instead of --box or beside it", type=Path)
-    ] = None
-    guess: Annotated[
-        str | float | None, _option("horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG"))
-    ] = None
-    start: Annotated[
-        Path | None,
-        _option("result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path),
-    ] = None
-    limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
-    unit: Annotated[
-        str,
-        _option("of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)),
-    ] = "m"
-    pose: Annotated[
-        str | None,
-        _option(
-            "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from "
-            "10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
-            choices=("any", "upright"),
-        ),
-    ] = None
-    up: Annotated[
-        str | None,
-        _option("axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES),
-    ] = None
-    mesh_is: Annotated[
-        str | None,
-        _option(
-            "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
-            "(default: exact with a camera, similar without)",
-            choices=MESH_KINDS,
-        ),
-    ] = None
-    preset: Annotated[
-        str | None,
-        _option(
-            "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
-            f"search and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
-            choices=PRESET_NAMES,
-        ),
-    ] = None
-    pipeline: Annotated[Path | None, _option("JSON of a pipeline, instead of --preset", type=Path)] = None
-    instances: Annotated[int, _option("without a box: up to so many objects (default: 1)", type=whole_number(1))] = 1
-    field: Annotated[Path | None, _option("weights of a learned field", type=Path)] = None
-    top: Annotated[int | None, _option("hypotheses to carry and report (default: 5)", type=whole_number(1))] = None
-    refine: Annotated[bool, _option("stop at the best view of the bank", flag="--no-refine", action="store_false")] = (
-        True
+    box: tuple[float, float, float, float] | None = _option(
+        None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
     )
-    renderer: Annotated[str, _option("default: auto", choices=RENDERER_NAMES)] = "auto"
-    device: Annotated[str, _option("device of modules, bank and search (default: cpu)")] = "cpu"
-    progress: Annotated[bool, _option("no progress bars", flag="--quiet", action="store_false")] = True
+    camera: Any = _option(  # four numbers, a Camera, or None
+        None,
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
+        "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the result then has no "
+        "covariance",
+        type=camera_option,
+    )
+    mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
+    guess: str | float | None = _option(
+        None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
+    )
+    start: Path | None = _option(
+        None, "result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path
+    )
+    limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
+    unit: str = _option(
+        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    )
+    pose: str | None = _option(
+        None,
+        "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
+        "degrees below to 60 above; faster, and right more often where it is true (default: any)",
+        choices=("any", "upright"),
+    )
+    up: str | None = _option(
+        None, "axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES
+    )
+    mesh_is: str | None = _option(
+        None,
+        "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
+        "(default: exact with a camera, similar without)",
+        choices=MESH_KINDS,
+    )
+    preset: str | None = _option(
+        None,
+        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search "
+        f"and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
+        choices=PRESET_NAMES,
+    )
+    pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)
+    instances: int = _option(1, "without a box: up to so many objects (default: 1)", type=whole_number(1))
+    field: Path | None = _option(None, "weights of a learned field", type=Path)
+    top: int | None = _option(None, "hypotheses to carry and report (default: 5)", type=whole_number(1))
+    refine: bool = _option(True, "stop at the best view of the bank", flag="--no-refine", action="store_false")
+    renderer: str = _option("auto", "default: auto", choices=RENDERER_NAMES)
+    device: str = _option("cpu", "device of modules, bank and search (default: cpu)")
+    progress: bool = _option(True, "no progress bars", flag="--quiet", action="store_false")
 
     @property
     def bank_decides(self) -> bool:
