@@ -108,8 +108,8 @@ class RegisterOptions:
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
         "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
-        "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the result then has no "
-        "covariance",
+        "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
+        "result then has no covariance",
         type=camera_option,
     )
     mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
