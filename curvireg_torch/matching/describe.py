@@ -90,15 +90,15 @@ class ViewDescriber:
         renderer: str | DepthRenderer = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
-        self._mesh = mesh
+        self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
         self.renderer = self.view_renderer = make_renderer(mesh, renderer, device=device)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
-            simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
-            self.view_renderer = make_renderer(simple, renderer, device=device)
+            self._simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
+            self.view_renderer = make_renderer(self._simple, renderer, device=device)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -108,7 +108,7 @@ class ViewDescriber:
     @cached_property
     def contours(self) -> MeshContours:
         """Occluding contours and creases at any pose."""
-        return MeshContours(self._mesh)
+        return MeshContours(self._simple)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
         """The same mesh and renderer with other settings; convex hulls of large meshes take seconds."""

@@ -53,8 +53,9 @@ class MeshEdges:
         directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         owner = np.tile(np.arange(len(faces)), 3)
         sign = np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0)
-        self.edges, edge = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
-        edge = edge.reshape(-1)
+        directed.sort(axis=1)
+        row, edge = trimesh.grouping.unique_rows(directed)
+        self.edges = directed[row]
         order = np.argsort(edge, kind="stable")
         first = np.searchsorted(edge[order], np.arange(len(self.edges)))
         count = np.bincount(edge, minlength=len(self.edges))
@@ -119,11 +120,9 @@ def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tup
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices at the same place joined, and each triangle once, without those of no area."""
     cell = np.ptp(vertices, axis=0).max() * WELD
-    _, index, inverse = np.unique(
-        np.round(vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    vertices, faces = vertices[index], inverse.reshape(-1)[faces]
+    index, inverse = trimesh.grouping.unique_rows(np.round(vertices / cell).astype(np.int64))
+    vertices, faces = vertices[index], inverse[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    first, _ = trimesh.grouping.unique_rows(np.sort(faces, axis=1))
     return vertices, faces[np.sort(first)]

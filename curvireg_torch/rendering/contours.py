@@ -122,7 +122,10 @@ class MeshContours:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.centre, self.radius = mesh_centre(mesh), mesh_radius(mesh)
-        self._levels = [(size, _Level(mesh, self.centre.numpy(), self.radius, faces)) for size, faces in LEVELS]
+        self._levels: dict[int, _Level] = {}
+        for size, faces in reversed(LEVELS):  # each is simplified from the next finer one
+            self._levels[size] = level = _Level(mesh, self.centre.numpy(), self.radius, faces)
+            mesh = trimesh.Trimesh(level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False)
 
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
@@ -133,7 +136,7 @@ class MeshContours:
         """
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         R = T[:, :3, :3]
-        level = next((level for limit, level in self._levels if size <= limit), self._levels[-1][1])
+        level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
         edges = level.edges
         position = R @ self.centre.numpy() + T[:, :3, 3]
         eye = -(position[:, None] @ R)[:, 0]

@@ -1,6 +1,6 @@
 """Fit the constants of confidence, rivals, covariance, detection, refinement and following on generated photographs.
 
-    python scripts/calibration/calibrate.py WORK --meshes FURNITURE [--count 400] [--jobs 2] [--write]
+    python scripts/calibration/calibrate.py WORK --meshes FURNITURE [--count 400] [--models instance] [--write]
 
 FURNITURE is the folder of scripts/benchmark/meshes.py. The script renders the sets that WORK lacks (make.py: the
 object's own mesh, a similar one, a wrong one, and sequences), registers, refines, follows and detects their objects
@@ -22,6 +22,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
+import trimesh
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
@@ -40,12 +41,16 @@ from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 Row: TypeAlias = dict[str, Any]
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
-SETS: dict[str, list[str]] = {
-    "exact": ["--cad", "exact", "--bare", "0.2"],
-    "similar": ["--cad", "similar", "--bare", "0.2"],
-    "wrong": ["--cad", "wrong"],
-    "sequences": ["--cad", "exact", "--frames", "30"],
+FURNITURE = ["--kind", "furniture", "--cad"]
+SETS: dict[str, tuple[float, list[str]]] = {
+    "exact": (1.0, [*FURNITURE, "exact", "--bare", "0.2"]),
+    "similar": (1.0, [*FURNITURE, "similar", "--bare", "0.2"]),
+    "wrong": (0.25, [*FURNITURE, "wrong"]),
+    "sequences": (0.1, [*FURNITURE, "exact", "--frames", "30"]),
+    "shelves": (0.2, ["--kind", "shelf", "--objects", "8", "20", "--seed", "7"]),
 }
+"""Of each set: scenes, as a fraction of --count, and options of make.py."""
+
 RIGHT = 30.0  # degrees within which a registration is right
 FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within which a refined or tracked pose is right
 
@@ -55,16 +60,26 @@ STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 
 WRONG_FRACTION = 0.1  # weight of the wrong meshes in the fit, as if one photograph in ten came with a wrong mesh
 
 FOLDS = 5
-FIELDS = {"instance": ("exact", "wrong"), "category": ("similar",)}
-"""Of each confidence model: the sets that it is fitted on."""
+MODELS = {
+    "instance": ("exact", "shelves", "wrong"),
+    "category": ("similar",),
+    "refinement": ("exact",),
+    "tracking": ("sequences",),
+    "detection": ("exact",),
+}
+"""Of each model: the sets that it is fitted on."""
+
+KINDS = {"refinement": "refined", "tracking": "sequences", "detection": "detected"}
+"""Of each model that is not of registrations: what is measured."""
 
 
-def render_sets(work: Path, meshes: Path, count: int, jobs: int) -> None:
-    """Render the sets that ``work`` lacks; finished scenes are kept."""
-    for name, options in SETS.items():
-        number = {"sequences": count // 10, "wrong": count // 4}.get(name, count)
-        words = ["--kind", "furniture", "--meshes", meshes, "--out", work / name, "--count", number, "--jobs", jobs]
-        command = [sys.executable, REPOSITORY / "scripts" / "benchmark" / "make.py", *words, *options]
+def render_sets(work: Path, meshes: Path, count: int, jobs: int, models: Sequence[str]) -> None:
+    """Render the sets of ``models`` that ``work`` lacks; finished scenes are kept."""
+    for name in dict.fromkeys(name for model in models for name in MODELS[model]):
+        fraction, options = SETS[name]
+        words = ["--out", work / name, "--count", round(fraction * count), "--jobs", jobs, *options]
+        words += ["--meshes", meshes] if "furniture" in options else []
+        command = [sys.executable, REPOSITORY / "scripts" / "benchmark" / "make.py", *words]
         subprocess.run([str(word) for word in command], check=True)
 
 
@@ -168,9 +183,13 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     data = BOPDataset(folder)
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
-    registrar = cr.Registrar(cr.load_mesh(samples[0]["model_path"], unit="mm"), pipeline=pipeline)
+    mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
+    registrar = cr.Registrar(mesh, pipeline=pipeline)
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
+    elif kind == "shelves":  # the package with its print, and in grey
+        grey = cr.Registrar(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), pipeline=pipeline)
+        found = [(s, row) for s in samples for each in (registrar, grey) for row in registered(each, s, "exact")]
     else:
         methods: dict[str, Callable[[Row], Iterator[Row]]] = {
             "refined": lambda s: refined(registrar, s, other),
@@ -192,7 +211,7 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     known = {tuple(row["task"]) for row in done}
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
-        return entry[1], entry[0] % 2  # make.py alternates upright and any pose
+        return entry[1], entry[0] % 2 or kind == "shelves"  # of furniture, make.py alternates upright and any pose
 
     tasks = []
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
@@ -266,13 +285,15 @@ def fit_rivals(rows: Sequence[Row]) -> Row:
     return {"slope": round(float(np.exp(found[0])), 4), "none": round(float(found[1]), 4)}
 
 
-def calibrate(work: Path, jobs: int, limit: int | None) -> tuple[Row, Row]:
-    """Constants, and their quality on held-out kinds of objects."""
-    old = json.loads(CONSTANTS.read_text())
-    constants: Row = {}
+def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str]) -> tuple[Row, Row]:
+    """Constants, those of other ``models`` as they were, and quality of the new ones on held-out kinds of objects."""
+    constants: Row = json.loads(CONSTANTS.read_text())
     quality: Row = {}
-    for name, sets in FIELDS.items():
-        rows = [row | {"set": s} for s in sets for row in rows_of(work, s, jobs, limit)]
+    for name in models:
+        if name in KINDS:
+            constants[name], quality[name] = fit_logistic(rows_of(work, KINDS[name], jobs, limit))
+            continue
+        rows = [row | {"set": s} for s in MODELS[name] for row in rows_of(work, s, jobs, limit)]
         rows = [row | {"right": row["set"] != "wrong" and row["errors"][0] < RIGHT} for row in rows]
         wrong = np.array([row["set"] == "wrong" for row in rows])
         weight = np.where(wrong, WRONG_FRACTION / (1 - WRONG_FRACTION) * (~wrong).sum() / max(1, wrong.sum()), 1.0)
@@ -280,10 +301,8 @@ def calibrate(work: Path, jobs: int, limit: int | None) -> tuple[Row, Row]:
         constants[name] = fitted | fit_rivals([row for row in rows if row["set"] != "wrong"])
         distances = [row["distance2"] for row in rows if "distance2" in row]
         if distances:
-            scale = old["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+            scale = constants["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
             constants["covariance_scale"] = round(scale, 3)
-    for name, kind in (("refinement", "refined"), ("tracking", "sequences"), ("detection", "detected")):
-        constants[name], quality[name] = fit_logistic(rows_of(work, kind, jobs, limit))
     return constants, quality
 
 
@@ -292,12 +311,13 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--meshes", type=Path, required=True, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
     parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    render_sets(options.work, options.meshes, options.count, options.jobs)
-    constants, quality = calibrate(options.work, options.jobs, options.limit)
+    render_sets(options.work, options.meshes, options.count, options.jobs, options.models)
+    constants, quality = calibrate(options.work, options.jobs, options.limit, options.models)
     record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
     if options.write:

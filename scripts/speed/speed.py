@@ -10,7 +10,7 @@ only on an idle one.
 
 - cold, warm: ``curvireg register`` from process start to its files, without and with a cached bank
 - bank: ``ViewBank.build`` of all views
-- rank: one photograph without contour fit; one: the whole registration
+- rank: a photograph without contour fit; one: the whole registration; both are means of four poses
 - many: each of many photographs in one call
 - follow: each frame of a video in which the photograph moves by 2 px
 """
@@ -26,15 +26,16 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow")
-FRAMES = 12
+FRAMES, POSES = 12, 4
+SUBDIVISIONS = 6  # of an icosphere: 81,920 faces
 CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
 
 HERE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed import measure, write_inputs"
 """Import of this file in a process that imports another checkout's package."""
 
 
-def write_inputs(folder: str, faces: int) -> None:
-    """Write a dented sphere, a photograph of it and its box; runs in this checkout."""
+def write_inputs(folder: str) -> None:
+    """Write a dented sphere, photographs of it in several poses and their boxes; runs in this checkout."""
     import cv2
     import numpy as np
     import torch
@@ -42,17 +43,19 @@ def write_inputs(folder: str, faces: int) -> None:
 
     from curvireg_torch.synthetic import random_pose, synthesize_photograph
 
-    rings = max(4, round((faces / 4) ** 0.5))
-    mesh = trimesh.creation.uv_sphere(count=(rings, 2 * rings))
+    mesh = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
     waves = np.random.default_rng(0).normal(size=(3, 6)) * 3
     bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
     mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
     mesh.export(Path(folder, "mesh.ply"))
-    generator, K, size = torch.Generator().manual_seed(0), camera(), (480, 640)
-    photograph, box = synthesize_photograph(mesh, random_pose(mesh, K, size, generator), K, size, generator)
-    pixels = (255 * photograph.permute(1, 2, 0).flip(2).numpy()).round().astype("uint8")
-    cv2.imwrite(str(Path(folder, "photo.png")), pixels)
-    Path(folder, "box.json").write_text(json.dumps(box.tolist()))
+    generator, K, size, boxes = torch.Generator().manual_seed(0), camera(), (480, 640), []
+    for k in range(POSES):
+        pose = random_pose(mesh, K, size, generator)
+        photograph, box = synthesize_photograph(mesh, pose, K, size, generator)
+        pixels = (255 * photograph.permute(1, 2, 0).flip(2).numpy()).round().astype("uint8")
+        cv2.imwrite(str(Path(folder, f"photo{k}.png")), pixels)
+        boxes.append(box.tolist())
+    Path(folder, "boxes.json").write_text(json.dumps(boxes))
 
 
 def camera() -> Any:
@@ -71,34 +74,38 @@ def measure(step: str, folder: str, photographs: int) -> float:
 
     import curvireg_torch as cr
 
-    mesh, photograph, K = cr.load_mesh(Path(folder, "mesh.ply")), str(Path(folder, "photo.png")), camera()
+    mesh, K = cr.load_mesh(Path(folder, "mesh.ply")), camera()
+    paths = [str(Path(folder, f"photo{k}.png")) for k in range(POSES)]
     if step == "bank":
         start = time.perf_counter()
         cr.ViewBank.build(mesh, progress=False)
         return time.perf_counter() - start
-    box = json.loads(Path(folder, "box.json").read_text())
+    boxes = torch.tensor(json.loads(Path(folder, "boxes.json").read_text()))
     pipeline = replace(cr.Pipeline(), contours=step != "rank")
     registrar = cr.Registrar(mesh, pipeline=pipeline, progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
         from curvireg_torch.registration import Follower
 
-        first, follower = read_image(photograph), Follower(registrar, K)
-        assert follower(first, box).ok
+        first, follower = read_image(paths[0]), Follower(registrar, K)
+        assert follower(first, boxes[0]).ok
         frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
         start = time.perf_counter()
         for frame in frames:
             follower(frame)
         return (time.perf_counter() - start) / len(frames)
 
-    def register(n: int) -> float:
+    def register(images: list[str], boxes: torch.Tensor) -> float:
         start = time.perf_counter()
-        results = registrar([photograph] * n, torch.tensor([box] * n), K)
+        results = registrar(images, boxes, K)
         assert all(result.ok for result in results)
-        return (time.perf_counter() - start) / n
+        return time.perf_counter() - start
 
-    register(1)
-    return register(photographs) if step == "many" else min(register(1) for _ in range(3))
+    register(paths[:1], boxes[:1])
+    if step == "many":
+        index = torch.arange(photographs) % POSES
+        return register([paths[k] for k in index.tolist()], boxes[index]) / photographs
+    return sum(min(register(paths[k : k + 1], boxes[k : k + 1]) for _ in range(3)) for k in range(POSES)) / POSES
 
 
 def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int) -> dict[str, float]:
@@ -107,8 +114,8 @@ def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: 
 
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
     if step in ("cold", "warm"):
-        box = json.loads((folder / "box.json").read_text())
-        words = ["-m", "curvireg_torch", "register", "photo.png", "mesh.ply", "--out", "out", "--box", *map(str, box)]
+        box = json.loads((folder / "boxes.json").read_text())[0]
+        words = ["-m", "curvireg_torch", "register", "photo0.png", "mesh.ply", "--out", "out", "--box", *map(str, box)]
         words += ["--camera", *map(str, CAMERA)]
         if step == "cold":
             environment["CURVIREG_CACHE"] = tempfile.mkdtemp(dir=folder)
@@ -120,16 +127,14 @@ def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: 
     return {"seconds": seconds, "megabytes": usage.ru_maxrss / 1024}
 
 
-def compare(checkouts: dict[str, Path], steps: Sequence[str], faces: int, photographs: int, rounds: int) -> Any:
+def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     from scripts._shared import run_process
 
     found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        run_process(
-            ["-c", f"{HERE}; write_inputs({temporary!r}, {faces})"], folder, {**os.environ, "PYTHONPATH": str(ROOT)}
-        )
+        run_process(["-c", f"{HERE}; write_inputs({temporary!r})"], folder, {**os.environ, "PYTHONPATH": str(ROOT)})
         for name, checkout in checkouts.items():  # the first registration caches the bank
             measured("one", checkout, folder, folder / name, photographs)
         for step in tuple(steps) * rounds:
@@ -154,7 +159,7 @@ def table(record: dict[str, Any]) -> str:
         ratio = [f"{both[-1]['seconds'] / both[0]['seconds']:.2f}"] if len(both) > 1 else []
         rows.append([f"`{step}`", *cells, *ratio])
     many = f"{record['photographs']} photographs in `many`"
-    stamp = f"{record['faces']} faces, {many}; {record['processor']}, {record['date']}."
+    stamp = f"{20 * 4**SUBDIVISIONS} faces, {many}; {record['processor']}, {record['date']}."
     return "\n".join([*table_lines(rows), "", stamp, ""])
 
 
@@ -164,7 +169,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
-    parser.add_argument("--faces", type=int, default=40_000)
     parser.add_argument("--photographs", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, help="another file than scripts/results/speed.json; no page is changed")
@@ -175,9 +179,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "date": today(),
         "commits": {name: commit(root) for name, root in checkouts.items()},
         "processor": processor(),
-        "faces": options.faces,
         "photographs": options.photographs,
-        "times": compare(checkouts, options.steps, options.faces, options.photographs, options.rounds),
+        "times": compare(checkouts, options.steps, options.photographs, options.rounds),
     }
     write_json(options.out or RESULTS / "speed.json", record)
     print(table(record))
