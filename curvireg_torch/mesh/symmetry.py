@@ -24,8 +24,8 @@ TOLERANCE, FRACTION = 0.03, 0.975
 a crop of 128 px, which hardly changes its contours. The pull tab of a can is less than the rest, a handle more."""
 
 NEAR_SYMMETRY = 0.04
-"""Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned meshes are tilted by a
-degree or two and do not pass through the centroid: 104 symmetries of 76 meshes begin below 0.014."""
+"""Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned meshes are tilted by
+a degree or two and do not pass through the centroid: 104 symmetries of 76 meshes begin below 0.014."""
 
 ALIGNMENT_STEPS, ALIGNED_POINTS, ALIGNED_FRACTION, MAX_TILT = 8, 500, 0.9, 5.0
 """Iterations of ICP, the points that it moves, the fraction of them that it trusts in each iteration, and the degrees

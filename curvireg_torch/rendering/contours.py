@@ -36,8 +36,8 @@ CREASE_BEND = 0.36
 """Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front."""
 
 LEVELS = ((128, 2500), (256, 8000))
-"""Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at most
-a fifth of a pixel of that crop."""
+"""Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at
+most a fifth of a pixel of that crop."""
 
 NEAR_PLANE = 1e-3
 """Depth in object radii below which points are not projected."""
