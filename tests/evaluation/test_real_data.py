@@ -14,5 +14,3 @@ def test_evaluate_pascal3d(tmp_path):
     summary = evaluate(Pascal3DBenchmark(dataset, Protocol()), tmp_path / "out", limit=8, progress=False)
     assert (summary["n"], summary["failed"], summary["skipped"]) == (8, 0, {})
     assert len(summary["per_class"]) > 4, "a limit is spread over the classes"
-
-
