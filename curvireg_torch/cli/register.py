@@ -192,6 +192,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     from ..evaluation.result_files import write_lost, write_pose_stamped, write_result
     from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
     from ..evaluation.store import to_json
+    from ..geometry import Camera
     from ..registration.result import used_box
 
     out, as_json, path = arguments.out, arguments.json, options.photos[0]
@@ -222,7 +223,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
         print(f"{path}: {note}", file=notes)
     remarks = list(photo.notes)
-    if document["inputs"]["camera_source"] == "file" and options.camera.distorts:
+    if isinstance(options.camera, Camera) and options.camera.distorts:
         remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
     if remarks:
         print(f"{path}: {'; '.join(remarks)}", file=notes)
@@ -282,7 +283,10 @@ def _photographs(options: "RegisterOptions", path: Path | None, out: Path, *, ev
 
     if path is not None:
         listed = read_list(path, options.meshes, options.limits)
-        photos = [replace(entry, guess=options.guess, instances=options.instances) for entry in listed]
+        photos = [
+            replace(entry, camera=options.guess if entry.camera is None else entry.camera, instances=options.instances)
+            for entry in listed
+        ]
         check_writable(out, "--out")
     else:
         check_writable(out, "--out")

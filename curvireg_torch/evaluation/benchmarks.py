@@ -100,14 +100,14 @@ class Benchmark(ABC):
 
     def _entry(self, sample: Row) -> Entry:
         label, meshes, photo = self.label.format_map(sample), self.meshes(sample), Path(sample["image_path"])
-        box, K, protocol = sample["box"], sample.get("camera_matrix"), self.protocol
+        box, protocol = sample["box"], self.protocol
         unknown = protocol.box is not None and not bool(box.isfinite().all())
         return Entry(
             name=str(photo.relative_to(self.dataset.root)),
             photo=photo,
             meshes=meshes,
             box=None if protocol.box is None else tuple(perturbed_box(box, protocol, label).tolist()),
-            camera=None if K is None or not self.gives_camera else tuple(K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()),
+            camera=Camera(sample["camera_matrix"]) if self.gives_camera else None,
             prior=hint_of_truth(sample["rotation"], object_frame(format_up(meshes[0].suffix)), protocol, label),
             as_stored=True,
             label=label,
@@ -305,8 +305,9 @@ class BOPBenchmark(Benchmark):
         T_one, T_two = one["T_cam_from_world"].double(), two["T_cam_from_world"].double()
         if not bool((T_one.isfinite() & T_two.isfinite()).all()):  # the object stands still: it is the world
             T_one, T_two = (transform(s["rotation"].double(), s["translation"].double()) for s in (one, two))
-        box, camera = None if entry.error else entry.box, Camera(two["camera_matrix"])
-        return View(entry.name, entry.photo, box, camera, T_two @ torch.linalg.inv(T_one))
+        assert isinstance(entry.camera, Camera)
+        box = None if entry.error else entry.box
+        return View(entry.name, entry.photo, box, entry.camera, T_two @ torch.linalg.inv(T_one))
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""

@@ -64,14 +64,12 @@ def _entry(
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, prior=prior)
 
 
-def camera_of(values: Mapping[str, str], folder: Path) -> tuple[float, ...] | Camera | None:
-    """The camera of a row: numbers, a calibration in ``folder``, or None."""
-    camera = numbers_of(values, CAMERA)
-    if camera is not None:
-        camera_matrix(*camera)  # raises if it is invalid
+def camera_of(values: Mapping[str, str], folder: Path) -> Camera | None:
+    """The camera of a row: of numbers, or a calibration in ``folder``."""
+    numbers = numbers_of(values, CAMERA)
     if not values.get("camera"):
-        return camera
-    if camera is not None:
+        return None if numbers is None else Camera(camera_matrix(*numbers))
+    if numbers is not None:
         raise InvalidInputError("camera: give it or fx, fy, cx, cy")
     return load_camera(folder / values["camera"])
 

@@ -173,12 +173,15 @@ class RegisterOptions:
 
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
+        from ..geometry import Camera, camera_matrix
         from .runner import Entry
 
+        camera = self.guess if self.camera is None else self.camera
+        camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
         start, confidence = (None, None) if self.start is None else read_start(self.start)
-        named: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "camera", "mask")}
-        named |= {"guess": self.guess, "instances": self.instances, "prior": prior_from_limits(self.limits or {})}
-        return Entry(name=str(photo), photo=photo, start=start, start_confidence=confidence, **named)
+        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
+        same |= {"start": start, "start_confidence": confidence, "prior": prior_from_limits(self.limits or {})}
+        return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -58,8 +58,8 @@ def _checked(path: Path, rows: Iterator[View]) -> list[View]:
     return views
 
 
-def _view(name: str, photo: Path, box: Any, camera: Any, rotation: Any, translation: Any) -> View:
-    """A row from plain values: ``camera`` a camera or its 4 numbers, ``rotation`` 9 numbers or 4 of a quaternion."""
+def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any) -> View:
+    """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
         t = finite_numbers(translation, 3)
@@ -73,7 +73,7 @@ def _view(name: str, photo: Path, box: Any, camera: Any, rotation: Any, translat
         R = R.view(3, 3) if len(numbers) == 9 else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
-        return View(name, photo, box, camera if isinstance(camera, Camera) else Camera(camera_matrix(*camera)), T)
+        return View(name, photo, box, camera, T)
     except CurviregError as error:
         raise InvalidInputError(str(error), subject=name) from error
 
@@ -144,7 +144,8 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
         mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
-        yield _view(f"image {key}", photo, box, (K[0], K[4], K[2], K[5]), *pose)
+        camera_of_image = Camera(camera_matrix(K[0], K[4], K[2], K[5]))
+        yield _view(f"image {key}", photo, box, camera_of_image, *pose)
 
 
 def register_rig(

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from ..data import Photo, read_photo
 from ..errors import BankError, CurviregError, InvalidInputError, MeshError, MissingFileError
-from ..geometry import Camera, camera_matrix, undistorted
+from ..geometry import Camera, undistorted
 from ..geometry.calibration import Undistorted
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
@@ -69,9 +69,8 @@ class Entry:
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()  # of several the best is found
     box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
-    camera: Sequence[float] | Camera | None = None  # fx, fy, cx, cy in px, or calibrated
+    camera: Camera | str | float | None = None  # "exif" and a horizontal field of view in degrees are guesses
     mask: Path | None = None  # of the object, instead of a box or beside it
-    guess: str | float | None = None  # of an unknown camera: "exif", or the horizontal field of view in degrees
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
     start: tuple[tuple[float, ...], ...] | None = None  # (4, 4) pose that is refined; nothing is searched for
@@ -85,7 +84,7 @@ class Entry:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
-        given = [self.name, self.box, camera, self.guess, self.instances, prior]
+        given = [self.name, self.box, camera, self.instances, prior]
         views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
         return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
@@ -106,7 +105,7 @@ def seen_image(entry: Entry, photo: Photo) -> Tensor:
     return undistorted(photo.image, entry.camera).image if isinstance(entry.camera, Camera) else photo.image
 
 
-def _item(entry: Entry, photo: Photo, camera: Tensor | Camera | None) -> ImageItem:
+def _item(entry: Entry, photo: Photo, camera: Camera | None) -> ImageItem:
     if entry.mask is not None and not entry.mask.is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     return image_item_of(photo.image, entry.box, camera, entry.prior, entry.mask, name=entry.name)
@@ -158,8 +157,8 @@ def register_entry(
     if entry.start is not None:
         results = refine(registrar, [photo.image], camera, [entry.start], start_confidences=[entry.start_confidence])
     elif entry.views:
-        assert item.camera_matrix is not None  # of datasets with cameras only
-        first = View(entry.name, entry.photo, entry.box, Camera(item.camera_matrix), torch.eye(4, dtype=torch.float64))
+        assert camera is not None  # of datasets with cameras only
+        first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))
         results = [register_views([first, *entry.views], registrar, as_stored=entry.as_stored)[0]]
     else:
         results = register_image(registrar, photo.image, entry.box, camera, entry.prior, entry.mask, entry.instances)
@@ -179,7 +178,7 @@ def register_entry(
             "camera_source": source,
             "picture": photo.facts(),
         },
-        "camera": None if K is None else (camera if isinstance(camera, Camera) else Camera(K)).at(item.size).describe(),
+        "camera": None if camera is None else camera.at(item.size).describe(),
     }
     if result.detection is not None:
         document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
@@ -229,23 +228,22 @@ def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tenso
     return (result.views[0].T_cam_from_model, K) if result.views and K is not None else result.projection
 
 
-def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | Camera | None, str | None]:
-    """Camera or camera matrix, and its source."""
-    if isinstance(entry.camera, Camera):
-        return entry.camera, "file"
-    if entry.camera is not None:
-        return camera_matrix(*entry.camera, dtype=torch.float64), "given"
-    if entry.guess is None:
+def _camera(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
+    """The camera, and its source; that of a calibration has a size or distortion."""
+    given = entry.camera
+    if isinstance(given, Camera):
+        return given, "file" if given.size or given.distorts else "given"
+    if given is None:
         if entry.start is not None:
             raise InvalidInputError(f"--start: needs the camera; give {CAMERA_OPTIONS}", subject=entry.name)
         return None, None
-    if isinstance(entry.guess, float):
+    if given != "exif":
         H, W = photo.image.shape[-2:]
-        return camera_of_view(entry.guess, (H, W)), "fov"
+        return Camera(camera_of_view(float(given), (H, W))), "fov"
     K = photo.guessed_camera_matrix()
     if K is None:
         raise InvalidInputError(f"no focal length in its EXIF; give {CAMERA_OPTIONS}", subject=entry.name)
-    return K, "exif"
+    return Camera(K), "exif"
 
 
 def run_entries(
@@ -344,7 +342,7 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     except CurviregError as error:
         return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
     renderer = registrar.of_model(result.model).describer.renderer
-    K = camera_matrix(*entry.camera) if entry.views and isinstance(entry.camera, Sequence) else None
+    K = entry.camera.matrix if entry.views and isinstance(entry.camera, Camera) else None
     projection = projection_of(result, K)
     write_file(picture, thumbnail(renderer, projection, seen_image(entry, photo), used_box(document)))
     return {"status": "ok", "message": "", **document}

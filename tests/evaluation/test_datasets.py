@@ -8,6 +8,7 @@ import pytest
 import torch
 import trimesh
 
+from curvireg_torch import Camera
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
@@ -64,7 +65,7 @@ def test_evaluate_bop(bop, tmp_path):
 def test_objects_fail_alone(bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
     first, second, third = benchmark.entries[:3]
-    benchmark.entries[0] = replace(first, camera=(400.0, *first.camera[1:]))
+    benchmark.entries[0] = replace(first, camera=Camera(torch.diag(torch.tensor([400.0, 300.0, 1.0]))))
     benchmark.entries[1] = replace(second, box=tuple(v + 5000.0 for v in second.box))
     summary = run(benchmark, tmp_path / "out")
     rows = rows_of(benchmark, tmp_path / "out")

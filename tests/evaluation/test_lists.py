@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, runner
@@ -23,7 +23,7 @@ from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import SIZE, scene, unrefined
 
-CAMERA = (260.0, 260.0, 119.5, 89.5)
+CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def register_rows(rows, out, registrar, settings=None):
 
 def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
     unknown_box = replace(entry, box=None, camera=CAMERA)
-    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, guess=50.0), entry]
+    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, camera=50.0), entry]
     done = []
 
     def register_entry(one, photo, registrar, **_):
@@ -72,10 +72,10 @@ def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp
 
 
 @pytest.mark.parametrize(
-    ("camera", "guess", "source"),
-    [(CAMERA, None, "given"), (None, 50.0, "fov"), (None, "exif", "exif"), (None, None, None)],
+    ("camera", "source"),
+    [(CAMERA, "given"), (replace(CAMERA, size=SIZE), "file"), (50.0, "fov"), ("exif", "exif"), (None, None)],
 )
-def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, guess, source):
+def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
     def with_covariance(image, box, K, **_):
         (result,) = registrar(image, box, K)
         assert isinstance(result, Registration)
@@ -91,10 +91,10 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
 
     photo = read_photo(entry.photo)
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
-    one = replace(entry, camera=camera, guess=guess)
+    one = replace(entry, camera=camera)
     result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
     assert document["inputs"]["camera_source"] == source
-    known = source == "given"
+    known = source in ("given", "file")
     assert document["covariance"] == (torch.eye(6).tolist() if known else None)
     assert (document["standard_deviations"] is not None) == known
     assert (result.translation is not None) == (source is not None)

@@ -113,7 +113,7 @@ def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
 
 
 ENTRY = Entry(
-    {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=(5.0, 5.0, 6.0, 7.0)
+    {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=Camera(torch.eye(3))
 )
 
 
@@ -126,10 +126,10 @@ VIEWS = (View("z.png", Path("z.png"), None, Camera(torch.eye(3)), torch.eye(4)),
         {"name": "y.png"},
         {"box": (1.0, 2.0, 3.0, 4.25)},
         {"box": None},
-        {"camera": (5.0, 5.0, 6.25, 7.0)},
+        {"camera": replace(Camera(torch.eye(3)), size=(5, 6))},
         {"camera": None},
-        {"guess": "exif"},
-        {"guess": 50.0},
+        {"camera": "exif"},
+        {"camera": 50.0},
         {"instances": 2},
         {"prior": PosePrior(distance=(1.0, 2.0))},
         {"start": ((1.0, 0.0, 0.0, 0.0),)},
