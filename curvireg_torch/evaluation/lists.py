@@ -36,11 +36,7 @@ BEST_MESH = "found_mesh"
 
 
 def _entry(
-    cells: Sequence[str],
-    columns: Mapping[str, str],
-    folder: Path,
-    meshes: tuple[Path, ...],
-    limits: Mapping[str, Any],
+    cells: Sequence[str], columns: Mapping[str, str], folder: Path, meshes: tuple[Path, ...], limits: Mapping[str, Any]
 ) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     cells, count = _without_empty_end(cells, len(columns)), len(columns)

@@ -19,14 +19,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import rotation_error
-from ..utils.checks import (
-    check_camera_matrix,
-    check_finite,
-    check_pose,
-    check_rotation,
-    check_symmetries,
-    check_tensor,
-)
+from ..utils.checks import check_camera_matrix, check_finite, check_pose, check_rotation, check_symmetries, check_tensor
 
 __all__ = [
     "ADD_THRESHOLDS",

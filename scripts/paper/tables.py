@@ -23,13 +23,7 @@ from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
 from curvireg_torch.evaluation.metrics import average_recall
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
-from curvireg_torch.geometry import (
-    ViewSphere,
-    crop_images,
-    rotation_error,
-    rotation_towards,
-    viewpoint_from_rotation,
-)
+from curvireg_torch.geometry import ViewSphere, crop_images, rotation_error, rotation_towards, viewpoint_from_rotation
 from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.describe import depth_filter

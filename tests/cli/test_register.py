@@ -120,10 +120,7 @@ def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, ref
         (["register", "a.jpg", "b.stl", "--json", "--every", "0"], "--every: expected a whole number of at least 1"),
         (["evaluate", "bop", "a", "--out", "b", "--limit", "0"], "--limit: expected a whole number of at least 1"),
         (["view", "--port", "65536"], "--port: expected a whole number from 0 to 65535, got '65536'"),
-        (
-            ["register", "a.jpg", "b.stl", "--json", "--near", "10"],
-            "--near: expected AZIMUTH ELEVATION [THETA]",
-        ),
+        (["register", "a.jpg", "b.stl", "--json", "--near", "10"], "--near: expected AZIMUTH ELEVATION [THETA]"),
         (["register", "a.jpg", "b.stl", "--json", "--dist", "1", "2"], "unrecognized arguments: --dist"),
         (["register", "a.jpg", "b.stl", "--json", "--box", "1,2", "3"], "--box: expected X0 Y0 X1 Y1, finite numbers"),
         (["register", "a.jpg", "b.stl", "--json", "--camera", "1", "2", "3"], "or give FILE"),

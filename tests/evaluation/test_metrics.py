@@ -147,8 +147,7 @@ PoseError = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @pytest.mark.parametrize(
-    "error",
-    [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)],
+    "error", [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)]
 )
 def test_pose_errors_contract(error: PoseError) -> None:
     whole = error(EST, GT, POINTS)
