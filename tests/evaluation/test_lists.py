@@ -24,6 +24,7 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import SIZE, scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
+LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,14 @@ def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp
 
 @pytest.mark.parametrize(
     ("camera", "source"),
-    [(CAMERA, "given"), (replace(CAMERA, size=SIZE), "file"), (50.0, "fov"), ("exif", "exif"), (None, None)],
+    [
+        (CAMERA, "given"),
+        (replace(CAMERA, size=SIZE), "file"),
+        (LENS, "file"),
+        (50.0, "fov"),
+        ("exif", "exif"),
+        (None, None),
+    ],
 )
 def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
     def with_covariance(image, box, K, **_):
