@@ -214,10 +214,9 @@ def register_views(
         cameras.append(camera)
     images = [view.photo if one is None else one.image for view, one in zip(views, seen, strict=True)]
     boxes = [None if one is None else one.box for one in seen]
-    given = boxes if any(box is not None for box in boxes) else None
     matrices, poses = (torch.stack(each) for each in ([c.matrix for c in cameras], [v.T_cam_from_world for v in views]))
     try:
-        return registrar.register_views(images, given, matrices, poses), seen, cameras
+        return registrar.register_views(images, boxes, matrices, poses), seen, cameras
     except CurviregError as error:
         named = re.sub(r"\bimage (\d+)\b", lambda number: views[int(number[1])].name, f"{error}")
         raise InvalidInputError(named) from error
