@@ -66,6 +66,14 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
         assert done == rows[:4], "equal rows are registered once"
 
 
+def test_rows_follow_the_order_of_the_list(registrar, entry, tmp_path):
+    rows = [replace(entry, cells={"id": "a"}), replace(entry, camera=50.0, cells={"id": "b"})]
+    for some in (rows, rows[::-1]):
+        register_rows(some, tmp_path / "out", registrar)
+        found = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
+        assert [(row["row"], row["columns"]) for row in found] == list(enumerate((one.cells for one in some), start=1))
+
+
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):

@@ -110,13 +110,14 @@ def sample(image, place=None, instance=0):
     t = torch.tensor(place or (0.0, 0.0, 0.0)) + T[:3, 3]
     known = {"translation": t, "T_cam_from_world": T * torch.nan if place is None else T}
     ids = {"scene_id": 1, "image_id": image, "obj_id": 1, "instance_index": instance}
-    return {**ids, **known, "model_info": {"diameter": 10.0}}
+    return {**ids, **known, "model_info": {"diameter": 20.0}}
 
 
 def test_instances_are_told_apart_by_their_place():
     near, far = (0.0, 0.0, 100.0), (30.0, 0.0, 100.0)
-    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1), sample(2, (2.0, 0.0, 100.0))]
-    assert same_instances(swapped) == [[0, 3], [1, 2], [4]]
+    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1)]
+    swapped += [sample(2, (3.0, 0.0, 100.0)), sample(3, (1.5, 0.0, 100.0))]
+    assert same_instances(swapped) == [[0, 3, 5], [1, 2], [4]]
     assert same_instances([sample(0), sample(1, instance=3)]) == [[0, 1]], "one in each photograph"
     listed = [sample(0), sample(0, instance=1), sample(1, instance=1), sample(1)]
     assert same_instances(listed) == [[0, 3], [1, 2]]
