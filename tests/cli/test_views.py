@@ -116,7 +116,12 @@ def test_read_rig_reads_colmap_and_bop(rig, tmp_path):
             torch.testing.assert_close(view.T_cam_from_world[:3, :3], R, atol=1e-6, rtol=0)
             assert view.T_cam_from_world[:3, 3].tolist() == pytest.approx(row[18:], abs=1e-6)
             assert view.camera.matrix[:2].flatten().tolist() == [260.0, 0.0, 119.5, 0.0, 260.0, 89.5]
-    assert [view.photo.is_file() for view in read_rig(tmp_path)] == [True] * 3
+    model = tmp_path / "sparse" / "0"  # where COLMAP writes it
+    model.mkdir(parents=True)
+    for name in ("images.txt", "cameras.txt"):
+        (model / name).write_text((tmp_path / name).read_text())
+    for path in (tmp_path, model, model / "images.txt"):
+        assert [view.photo.is_file() for view in read_rig(path)] == [True] * 3
 
 
 @pytest.mark.parametrize(
