@@ -17,6 +17,7 @@ import torch
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation.result_files import write_pose_stamped
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
@@ -78,6 +79,15 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, 
     torch.set_num_threads(before)
     assert status == 2
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
+
+
+def test_pose_for_ros_is_in_metres(tmp_path):
+    document = {"translation": [1000.0, -2000.0, 500.0], "quaternion": [0.5, 0.1, 0.2, 0.3], "unit": "mm", "views": 9}
+    write_pose_stamped(tmp_path / "pose.yaml", document)
+    text = (tmp_path / "pose.yaml").read_text()
+    assert "position: {x: 1, y: -2, z: 0.5}" in text
+    assert "orientation: {x: 0.1, y: 0.2, z: 0.3, w: 0.5}" in text
+    assert "frame_id: camera_optical_frame" in text
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

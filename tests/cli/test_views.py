@@ -77,7 +77,7 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
 
 def test_views_of_quaternions_and_calibration_files(rig, folder, tmp_path):
     place, rows = rig
-    (place / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
+    (place / "cameras.txt").write_text("1 PINHOLE 480 360 520 520 240 180\n")  # of twice the size
     some = []
     for row in rows:
         x, y, z, w = Rotation.from_matrix(torch.tensor(row[9:18]).view(3, 3).numpy()).as_quat()
