@@ -150,6 +150,9 @@ def test_read_photo_notes_changes_of_channels(tmp_path):
         for count in channels:
             assert cv2.imwrite(str(tmp_path / f"a.{name}"), np.full((4, 4, count), 9, np.uint8))
             assert read_photo(tmp_path / f"a.{name}").notes == notes[count], name
+    colour = Image.new("RGB", (8, 8))  # phones add previews to photographs
+    colour.save(tmp_path / "phone.jpg", format="MPO", save_all=True, append_images=[colour])
+    assert read_photo(tmp_path / "phone.jpg").notes == ()
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
