@@ -102,9 +102,6 @@ MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
 MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
 #: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice
 MAX_VIEWER_FACES = 300_000
-#: Pages of the viewer, open or left, each with a photograph, a mesh and a bank in memory; a new one replaces the page
-#: that was left first
-MAX_VIEWER_PAGES = 8
-MAX_VIEWER_BYTES = 1 << 30  #: Bytes of the files of a page of the viewer, those on their way included
-MAX_VIEWER_UPLOADS = 8  #: Files that a page of the viewer receives at a time
+MAX_VIEWER_PHOTOGRAPHS = 20  #: Photographs that the viewer holds in memory
+MAX_VIEWER_BYTES = 1 << 30  #: Bytes of the uploaded files of the viewer, those on their way included
 MAX_ARCHIVE_FILES = 1000  #: Files in a zip archive with a mesh and its parts

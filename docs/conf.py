@@ -11,7 +11,9 @@ from sphinx.ext.napoleon.docstring import GoogleDocstring
 import curvireg_torch
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))  # the gallery imports scripts
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]  # the gallery imports scripts
+
+import messages  # noqa: E402
 
 project = "curvireg_torch"
 copyright = "2026, the curvireg_torch authors; Apache-2.0"
@@ -84,9 +86,10 @@ def site_links(text: str, file: Path) -> str:
     return re.sub(r"\]\(([\w./+-]+\.(?:md|py))(?=[#)])", site_link, text)
 
 
-def copy_pages(app: Any, *_: Any) -> None:
-    for path, page in COPIED_PAGES.items():
-        text = site_links((ROOT / path).read_text(encoding="utf-8"), ROOT / path)
+def write_pages(app: Any, *_: Any) -> None:
+    """Write the pages of ``docs/project``."""
+    pages = {page: site_links((ROOT / path).read_text("utf-8"), ROOT / path) for path, page in COPIED_PAGES.items()}
+    for page, text in {**pages, "project/messages.md": messages.page(ROOT / "curvireg_torch")}.items():
         copy = Path(app.srcdir) / page
         if not copy.is_file() or copy.read_text(encoding="utf-8") != text:
             copy.parent.mkdir(exist_ok=True)
@@ -114,6 +117,6 @@ def resolve_short_names(app: Any, env: Any, node: Any, text: Any) -> Any:
 
 
 def setup(app: Any) -> None:
-    app.connect("config-inited", copy_pages)
+    app.connect("config-inited", write_pages)
     app.connect("source-read", rewrite_links)
     app.connect("missing-reference", resolve_short_names)

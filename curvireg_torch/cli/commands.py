@@ -7,11 +7,20 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError, MissingDependencyError
+from ..errors import InvalidInputError
 from ..evaluation.opening import whole_number
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, register_options
+from .options import (
+    MESH,
+    METHOD,
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    check_viewer,
+    register_options,
+)
 
 LOCAL = "127.0.0.1"
 PICTURES = {
@@ -102,7 +111,7 @@ def add_view(commands: Any) -> None:
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
-    add_options(parser, *PHOTOGRAPH, box="in px; can be drawn")
+    add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
     add_limits(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
@@ -114,22 +123,11 @@ def view(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
     check_given(photos, meshes)
-    try:
-        import nicegui  # noqa: F401
-    except ImportError as error:
-        message = f"curvireg view: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
-        raise MissingDependencyError(f"{message}'.[viewer]'") from error
-    from ..geometry import Camera
+    check_viewer("view")
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)
-    if isinstance(options.camera, Camera):
-        if options.camera.distorts:
-            message = "has distortion, which the page does not remove; use curvireg register"
-            raise InvalidInputError(message, subject=arguments.camera)
-        K = options.camera.matrix
-        options = replace(options, camera=(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])))
     with one_torch_thread():
         serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
 from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
-from .options import PHOTOGRAPH, add_command, add_limits, add_options, register_options
+from .options import PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,6 +49,7 @@ def add_follow(commands: Any) -> None:
     add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is detected")
     add_limits(parser)
     parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
+    parser.add_argument("--show", action="store_true", help="open a page with the latest frame; --out is optional")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
 
 
@@ -65,12 +66,14 @@ def run(arguments: argparse.Namespace) -> None:
     options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
         raise InvalidInputError(f"follow: give {CAMERA_OPTIONS}")
-    if out is None and not arguments.json:
-        raise InvalidInputError("follow: give --out DIR, or --json")
+    if out is None and not (arguments.json or arguments.show):
+        raise InvalidInputError("follow: give --out DIR, --show or --json")
+    if arguments.show:
+        check_viewer("follow --show")
     if out is not None:
         check_writable(out, "--out")
     with one_torch_thread():
-        rows, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json)
+        rows, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
     counts = {status: sum(row[1] == status for row in rows) for status in STATUSES}
     summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
     after_first = seconds[1:]  # the first frame is registered
@@ -84,7 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _follow(
-    options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool
+    options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool, show: bool
 ) -> tuple[list[list[Any]], list[float], Path | None]:
     """Rows of ``out / "results.csv"``, which is also written after an interruption, seconds that the pose of each frame
     took, and path of the overlay."""
@@ -97,11 +100,15 @@ def _follow(
     registrar = open_registrar(options, options.meshes, options.open_field())
     rows: list[list[Any]] = []
     seconds: list[float] = []
-    start, video = time.monotonic(), None
+    start, video, page = time.monotonic(), None, None
     try:
         with ExitStack() as stack:
             if out is not None:
                 video = stack.enter_context(closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)))
+            if show:
+                from ..viewer.live import LivePage
+
+                page = stack.enter_context(LivePage(registrar))
             bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
             for name, shown, result, took in _poses(options, registrar, bar):
                 seconds.append(took)
@@ -110,6 +117,8 @@ def _follow(
                     print(_json_line(rows[-1], result, time.monotonic() - start), flush=True)
                 if video is not None:
                     video.add(shown, result)
+                if page is not None:
+                    page.show(shown, result)
     except KeyboardInterrupt:
         if not live:  # a file has an end
             raise

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError
+from ..errors import InvalidInputError, MissingDependencyError
 from ..evaluation.opening import (
     PRIOR_OPTIONS,
     Numbers,
@@ -94,6 +94,15 @@ def register_options(
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
+
+
+def check_viewer(command: str) -> None:
+    """Refuse a command that opens a page where NiceGUI is missing."""
+    try:
+        import nicegui  # noqa: F401
+    except ImportError as error:
+        message = f"curvireg {command}: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
+        raise MissingDependencyError(f"{message}'.[viewer]'") from error
 
 
 def _counts() -> dict[str, int]:

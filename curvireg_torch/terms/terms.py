@@ -74,7 +74,7 @@ class RerankingTerm(Term):
     """
 
     exhaustive_limit: int = 1000
-    top: int = 32
+    top: int = 64
     min_angle: float = 20.0
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Page", "Steps", "add_assets"]
+__all__ = ["Steps", "build_page"]
 
 TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
@@ -25,49 +25,36 @@ STAGES: Mapping[str, str] = {
 BOX_HINT = "Drag a rectangle around the object. Without one the whole photograph is searched: slower, less certain."
 
 
-def add_assets() -> None:
-    """Put styles and script into the page, before it is sent."""
+def build_page(workspace: Workspace) -> None:
+    """Lay out one browser window. It holds nothing: several times a second it shows what changed in the workspace."""
     static = Path(__file__).parent / "static"
     ui.add_css((static / "page.css").read_text())
     ui.add_body_html(f"<script>{(static / 'page.js').read_text()}</script>")
+    text("a", "To the photograph", "skip", href="#work")
+    ui.dark_mode(None)
+    with region("header", "top"):
+        with region("div"):
+            text("h1", "curvireg")
+            text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
+        button("Sample", workspace.load_sample, "sample-again", "quiet")
+    with region("div", "work", id="work"):
+        stage = Stage(workspace)
+        with region("div", "side"):
+            steps, answers, preview, inputs = (
+                Steps(workspace),
+                Answers(workspace),
+                Preview(workspace),
+                Inputs(workspace),
+            )
 
+    async def refresh() -> None:
+        steps.refresh()
+        inputs.refresh()
+        await stage.refresh()
+        await answers.refresh()
+        await preview.refresh()
 
-class Page:
-    """One browser window. It holds nothing: several times a second it shows what changed in its workspace."""
-
-    def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session, self._busy = workspace, workspace.session, False
-
-    def build(self) -> None:
-        """Lay out the page."""
-        text("a", "To the photograph", "skip", href="#work")
-        ui.dark_mode(None)
-        with region("header", "top"):
-            with region("div"):
-                text("h1", "curvireg")
-                text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
-            button("Sample", self.workspace.load_sample, "sample-again", "quiet")
-        with region("div", "work", id="work"):
-            self.stage = Stage(self.workspace)
-            with region("div", "side"):
-                self.steps = Steps(self.workspace)
-                self.answers = Answers(self.workspace)
-                self.preview = Preview(self.workspace)
-                self.inputs = Inputs(self.workspace)
-        ui.timer(TICK_SECONDS, self._refresh)
-
-    async def _refresh(self) -> None:
-        if self._busy:  # still drawing
-            return
-        self._busy = True
-        try:
-            self.steps.refresh()
-            self.inputs.refresh()
-            await self.stage.refresh()
-            await self.answers.refresh()
-            await self.preview.refresh()
-        finally:
-            self._busy = False
+    ui.timer(TICK_SECONDS, refresh)
 
 
 class Steps:
@@ -75,21 +62,25 @@ class Steps:
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
-        self.cards: dict[str, Any] = {}
-        self.facts: dict[str, Any] = {}
-        self.messages: dict[str, Any] = {}
+        self.cards, self.facts, self.messages = dict[str, Any](), dict[str, Any](), dict[str, Any]()
         with region("ol", "steps"):
             for number, name in enumerate(("photograph", "mesh", "box"), start=1):
                 with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
                     text("h2", name.capitalize(), data_number=str(number))
                     self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
                     if name == "box":
-                        self.no_box = button("Remove the box", self._remove_box, "no-box", "quiet")
+                        self.no_box = button(
+                            "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
+                        )
                     else:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
+                    if name == "photograph":
+                        self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet below")
                     if name == "mesh":
-                        self.use_mm = button("Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet")
+                        self.use_mm = button(
+                            "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
+                        )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
@@ -105,46 +96,42 @@ class Steps:
     def _find(self) -> None:
         self.workspace.start_search()  # the task outlives the page
 
-    def _remove_box(self) -> None:
-        self.session.box = None
-
     def refresh(self) -> None:
         """Show the state of the workspace."""
-        session, workspace = self.session, self.workspace
+        session, workspace, shot = self.session, self.workspace, self.session.shot
         for part, element in self.messages.items():
             set_text(element, workspace.messages.get(part, ""))
-        done = {"photograph": session.photo, "mesh": session.mesh_path, "box": session.box or session.result}
+        done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        set_text(self.facts["box"], BOX_HINT if session.box is None else " ".join(f"{v:g}" for v in session.box))
-        self.no_box.set_visibility(session.box is not None)
+        set_text(self.facts["box"], BOX_HINT if shot.box is None else " ".join(f"{v:g}" for v in shot.box))
+        self.no_box.set_visibility(shot.box is not None)
+        self.no_photo.set_visibility(len(session.shots) > 1)
         self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
-        set_text(self.find, "Find the pose" if session.box or session.photo is None else "Find the object and its pose")
+        set_text(self.find, "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
         self._show_progress()
 
     def _describe_photo(self) -> str:
-        photo, path = self.session.photo, self.session.photo_path
-        if photo is None or path is None:
-            return "A picture with the whole object in it."
-        H, W = photo.image.shape[-2:]
-        return "; ".join([f"{self.session.names[path]}: {W} x {H} px", *photo.notes])
+        shot = self.session.shot
+        if shot.photo is None:
+            return "A picture with the whole object in it, or several of the same object."
+        H, W = shot.size
+        return "; ".join([f"{self.session.name(shot.path)}: {W} x {H} px", *shot.photo.notes])
 
     def _describe_mesh(self) -> str:
         path = self.session.mesh_path
         if path is None:
             return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
-        return f"{self.session.names[path]}: {self.workspace.mesh_facts}"
+        return f"{self.session.name(path)}: {self.workspace.mesh_facts}"
 
     def _show_progress(self) -> None:
         session, workspace = self.session, self.workspace
         stage, done, total = session.progress
         share, words = 0.0, ""
-        if workspace.waiting:
-            words = "waiting for another search"
-        elif workspace.searching and session.cancelled:
+        if workspace.searching and session.cancelled:
             words = "stopping"
         elif workspace.searching and stage:
             share = (list(STAGES).index(stage) + done / total) / len(STAGES)
@@ -153,8 +140,8 @@ class Steps:
             words = "starting"
         elif workspace.receiving:
             words = f"receiving {', '.join(workspace.receiving.values())}"
-        elif session.result is not None:
-            changed = session.result.request != session.request()
+        elif session.shot.result is not None:
+            changed = session.shot.result.request != session.request()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)

@@ -1,7 +1,6 @@
-"""The server of the viewer: its secret address, what it refuses, its pages, their files and uploads."""
+"""The server of the viewer: its secret address, what it refuses, the page, its files and uploads."""
 
 import errno
-import re
 import secrets
 import socket
 import sys
@@ -10,28 +9,25 @@ import threading
 import warnings
 import webbrowser
 from pathlib import Path
+from typing import TextIO
 from urllib.parse import unquote, urlsplit
 
 import uvicorn
 from fastapi import FastAPI
 from nicegui import app, ui
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import MAX_MESH_BYTES, MAX_VIEWER_PAGES, InvalidInputError
+from ..errors import MAX_MESH_BYTES, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.threads import one_torch_thread
-from .page import Page, add_assets
-from .session import Session
-from .workspace import Workspaces, file_name, show_warning
+from .page import build_page
+from .workspace import Workspace, file_name, show_warning
 
-__all__ = ["SECURITY_HEADERS", "guarded", "listen", "serve"]
-
-RECONNECT_SECONDS = 5.0  # that a page may be away; a reload takes less. The work is kept longer
-CONNECT_SECONDS = 20.0  # that a request may take to become a page
+__all__ = ["SECURITY_HEADERS", "guarded", "listen", "make_server", "serve"]
 
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
@@ -48,45 +44,47 @@ SECURITY_HEADERS = {
 
 _LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 _EVERYONE = ("0.0.0.0", "::")
-_PAGE_NAME = re.compile(r"[-\w]{16}")  # of token_urlsafe
-_NAME_BYTES = 12
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
-    """Serve pages with these inputs until Ctrl-C; the printed address contains a random token.
-
-    Raises:
-        CurviregError: a file of the options cannot be used.
-        InvalidInputError: nothing can listen on that host and port.
-    """
-    listener = listen(host, port)
-    with listener:
-        Session(options).load()  # errors come before anything opens
-        prefix = f"/{secrets.token_urlsafe(16)}"
-        site = FastAPI(openapi_url=None)
-        add_pages(Workspaces(options, Path(tempfile.mkdtemp(prefix="curvireg-view-"))))
-        ui.run_with(
-            site,
-            mount_path=prefix,
-            title="curvireg",
-            favicon="📐",
-            language="en-US",
-            dark=None,
-            tailwind=False,
-            show_welcome_message=False,
-        )
-        # h11 refuses requests with two hosts.
-        config = uvicorn.Config(guarded(site, host), log_level="warning", server_header=False, ws="wsproto", http="h11")
-        addresses = [f"http://{name}{prefix}/" for name in public_addresses(host, listener.getsockname()[1])]
-        print(f"curvireg: {addresses[0]}   (Ctrl-C ends it)", flush=True)
-        if host not in _LOOPBACK:
-            print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
-        if browser:
-            threading.Timer(0.5, webbrowser.open, (addresses[-1],)).start()
+    """Serve the page with these inputs until Ctrl-C; the printed address contains a random token."""
+    with listen(host, port) as listener, tempfile.TemporaryDirectory(prefix="curvireg-view-") as folder:
+        workspace = Workspace(options, Path(folder))
+        workspace.load()  # errors come before anything opens
+        add_page(workspace)
+        server = make_server(listener, host, browser=browser)
         with one_torch_thread(), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show_warning
-            uvicorn.Server(config).run(sockets=[listener])
+            server.run(sockets=[listener])
+
+
+def make_server(
+    listener: socket.socket, host: str, *, browser: bool, printed_to: TextIO | None = None
+) -> uvicorn.Server:
+    """A guarded server of the application of NiceGUI, whose secret address is printed, and perhaps opened."""
+    prefix = f"/{secrets.token_urlsafe(16)}"
+    site = FastAPI(openapi_url=None)
+    ui.run_with(
+        site,
+        mount_path=prefix,
+        title="curvireg",
+        favicon="📐",
+        language="en-US",
+        dark=None,
+        tailwind=False,
+        show_welcome_message=False,
+    )
+    # h11 refuses requests with two hosts.
+    config = uvicorn.Config(guarded(site, host), log_level="warning", server_header=False, ws="wsproto", http="h11")
+    name = socket.gethostname() if host in _EVERYONE else f"[{host}]" if ":" in host else host
+    address = f"http://{name}:{listener.getsockname()[1]}{prefix}/"
+    print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
+    if host not in _LOOPBACK:
+        print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
+    if browser:
+        threading.Timer(0.5, webbrowser.open, (address,)).start()
+    return uvicorn.Server(config)
 
 
 def listen(host: str, port: int) -> socket.socket:
@@ -99,18 +97,6 @@ def listen(host: str, port: int) -> socket.socket:
         raise InvalidInputError(f"--host {host} --port {port}: {error.strerror}") from None
 
 
-def public_addresses(host: str, port: int) -> list[str]:
-    """Hosts with ports under which a server that listens on ``host`` is reached, the best first.
-
-    Example:
-        >>> public_addresses("::1", 8080)
-        ['[::1]:8080']
-    """
-    if host not in _EVERYONE:
-        return [f"[{host}]:{port}" if ":" in host else f"{host}:{port}"]
-    return [f"{socket.gethostname()}:{port}", f"127.0.0.1:{port}"]
-
-
 def guarded(site: ASGIApp, host: str) -> ASGIApp:
     """The site, without requests of other sites, and with :data:`SECURITY_HEADERS` on every answer.
 
@@ -119,22 +105,14 @@ def guarded(site: ASGIApp, host: str) -> ASGIApp:
     """
     names = ["*"] if host in _EVERYONE else list(_LOOPBACK) if host in _LOOPBACK else [host.lower()]
     trusted = TrustedHostMiddleware(site, names, www_redirect=False)
-    own_headers = [(name.encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
-    replaced = {b"server", *(name for name, _ in own_headers)}
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "lifespan":
-            await site(scope, receive, send)
-            return
-
         async def send_with_headers(message: Message) -> None:
             if message["type"].endswith("response.start"):
-                theirs = [(name.lower(), value) for name, value in message["headers"]]
-                kept = [(n, v) for n, v in theirs if n not in replaced and not n.startswith(b"access-control-")]
-                message = {**message, "headers": [*kept, *own_headers]}
+                MutableHeaders(scope=message).update(SECURITY_HEADERS)
             await send(message)
 
-        headers = Headers(scope=scope)
+        headers = Headers(scope=scope) if scope["type"] != "lifespan" else Headers()
         own = headers.get("host", "").lower()
         if any(urlsplit(origin).netloc.lower() != own for origin in headers.getlist("origin")):
             refusal = PlainTextResponse("requests of other sites are refused", status_code=403)
@@ -145,38 +123,16 @@ def guarded(site: ASGIApp, host: str) -> ASGIApp:
     return guard
 
 
-def add_pages(spaces: Workspaces) -> None:
+def add_page(workspace: Workspace) -> None:
     """Add the page, its files and its uploads to the application of NiceGUI."""
 
-    async def build(page: str) -> Response | None:
-        if _PAGE_NAME.fullmatch(page) is None:
-            return PlainTextResponse("not found", status_code=404)
-        add_assets()
-        client = ui.context.client
-        await client.connected(timeout=CONNECT_SECONDS)  # a request without a browser takes no place
-        workspace = spaces.join(page)
-        if workspace is None:
-            ui.label(f"{MAX_VIEWER_PAGES} pages are open already; close one and load this again").classes("full")
-            return None
-        client.on_delete(lambda: spaces.leave(page))
-        Page(workspace).build()
-        if not workspace.loaded:
-            await workspace.load()
-        return None
-
-    def new_page() -> Response:
-        return RedirectResponse(secrets.token_urlsafe(_NAME_BYTES))
-
-    def send_file(page: str, name: str) -> Response:
-        content, media_type = spaces.items[page].files.get(name, (b"", "")) if page in spaces.items else (b"", "")
+    def send_file(name: str) -> Response:
+        content, media_type = workspace.files.get(name, (b"", ""))
         if not media_type:
             return PlainTextResponse("no such file", status_code=404)
         return Response(content, media_type=media_type, headers={"Cache-Control": "no-store"})
 
-    async def receive_file(page: str, request: Request) -> Response:
-        workspace = spaces.items.get(page)
-        if workspace is None or workspace.pages == 0:
-            return PlainTextResponse("no such page", status_code=404)
+    async def receive_file(request: Request) -> Response:
         name = file_name(unquote(request.headers.get("x-file-name", "")))
         length = request.headers.get("content-length", "")
         try:
@@ -190,9 +146,8 @@ def add_pages(spaces: Workspaces) -> None:
             workspace.messages["file"] = f"{name}: it did not arrive; send it again"
         return Response(status_code=204)
 
-    app.get("/", include_in_schema=False)(new_page)
-    ui.page("/{page}", reconnect_timeout=RECONNECT_SECONDS)(build)
-    app.get("/{page}/file/{name}")(send_file)
-    app.post("/{page}/upload")(receive_file)
+    ui.page("/")(lambda: build_page(workspace))
+    app.get("/file/{name}")(send_file)
+    app.post("/upload")(receive_file)
     app.add_exception_handler(404, lambda *_: PlainTextResponse("not found", status_code=404))
-    app.on_shutdown(spaces.close)
+    app.on_shutdown(workspace.stop)

@@ -8,12 +8,11 @@ from nicegui import ui
 
 from ..errors import MAX_VIEWER_FACES
 from ..evaluation.store import to_json
-from ..geometry import rotation_error
-from ..mesh import mesh_radius, mesh_unit, mesh_up
+from ..geometry import Camera, rotation_error
+from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .session import PREVIEW_DEPTH
 from .widgets import button, fold, region, set_text, text
 from .workspace import Workspace
 
@@ -30,7 +29,9 @@ VERDICTS = {
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose another answer.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
+UNDISTORTED = "None: the command line takes the box in the photograph as it was taken, the page in the undistorted one."
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
+CAMERA_HINT = "With it the position is found. All photographs have the same: drop a calibration file, or type."
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
@@ -58,17 +59,15 @@ class Answers:
 
     async def _download(self, kind: str) -> None:
         name, media_type = DOWNLOADS[kind]
-        make = {
-            "picture": self.session.overlay,
-            "result.json": lambda: to_json(self.session.document()).encode(),
-            "pose.glb": self.session.glb,
-        }[kind]
+        session = self.session
+        document = {"result.json": lambda: to_json(session.document()).encode()}
+        make = {"picture": session.shot.overlay, "pose.glb": session.shot.glb, **document}[kind]
         if content := await self.workspace.run("pose", make):
             ui.download.from_url(self.workspace.serve(name, content, media_type), name)
 
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""
-        result, answer = self.session.result, self.session.answer
+        result, answer = self.session.shot.result, self.session.shot.answer
         self.section.set_visibility(answer is not None)
         if answer is not self.shown_answer:
             self.shown_answer = answer
@@ -82,7 +81,7 @@ class Answers:
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
-        result, answer = self.session.require_result()
+        result, answer = self.session.shot.require_result()
         document, pose = self.session.document(), answer.pose
         word = verdict(document["confidence"], document["none"], document["reliable"])
         word = "by hand" if answer.edits else word
@@ -110,25 +109,26 @@ class Answers:
     def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
         session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
+        shot, options = session.shot, session.options
 
-        def search_with(**inputs: Any) -> None:
-            for name, value in inputs.items():
-                setattr(session, name, value)
+        def search_with(**changes: Any) -> None:
+            shot.set_box(changes.pop("box", shot.box))
+            session.options = replace(session.options, **changes)
             self.workspace.start_search()
 
         if document.get("prior", {}).get("contradiction") is not None:
-            front = {name: value for name, value in (session.options.limits or {}).items() if name == "front"}
-            found["Search without the hint"] = lambda: search_with(options=replace(session.options, limits=front))
+            front = {name: value for name, value in (options.limits or {}).items() if name == "front"}
+            found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
-        if session.camera is None and session.guess is None and session.has_exif:
+        if options.camera is None and options.guess is None and session.has_exif:
             found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
         if word == "no match":
-            found["Draw the box again"] = lambda: setattr(session, "box", None)
+            found["Draw the box again"] = lambda: shot.set_box(None)
         return found
 
     async def _draw_cards(self) -> None:
-        result, _ = self.session.require_result()
+        result, _ = self.session.shot.require_result()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
@@ -141,13 +141,11 @@ class Answers:
         for number, (pose, picture) in enumerate(zip(hypotheses, pictures, strict=False)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
-            card = region("button", "card", type="button", data_testid=f"answer-{number + 1}")
-            card.move(self.cards)
-            card.on("click", lambda number=number: self.session.choose(number))
-            with card:
+            with self.cards, region("button", "card", type="button", data_testid=f"answer-{number + 1}") as card:
                 region("img", src=url, alt=f"contours of answer {number + 1}")
                 text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
                 text("span", "" if probabilities[number] is None else f"{probabilities[number]:.2f}", "facts")
+            card.on("click", lambda number=number: self.session.shot.choose(number))
 
 
 class Inputs:
@@ -156,7 +154,6 @@ class Inputs:
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
         self.shown: tuple[Any, ...] = ()
-        self._showing = False  # while fields are filled one after the other
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
             self._select("unit", "unit of the mesh", {unit: unit for unit in UNITS})
@@ -164,10 +161,9 @@ class Inputs:
             self._select("pose", "how it may stand", POSES)
             self._select("preset", "method", PRESETS)
         with fold("Camera", "camera"):
-            text("p", "With it the position is found, not only the rotation.", "facts")
-            with region("div", "numbers"):
-                self.camera = [self._number(f"camera-{n}", n, self._camera_typed) for n in ("fx", "fy", "cx", "cy")]
-            self.fov = self._number("fov", "or the horizontal field of view, degrees", self._fov_typed)
+            text("p", CAMERA_HINT, "facts")
+            self.camera = ui.input("fx fy cx cy in px, or the horizontal field of view in degrees")
+            self.camera.props("dense data-testid=camera").on_value_change(self._typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
             self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
         with fold("The same on the command line, and in Python", "command-line"):
@@ -181,63 +177,62 @@ class Inputs:
 
     def _select(self, name: str, label: str, choices: Mapping[Any, str]) -> None:
         async def changed(event: Any) -> None:
-            if not self._showing:
+            if event.value != getattr(self.session.options, name):  # not by another window
                 await self.workspace.set_option(name, event.value)
 
         value = getattr(self.session.options, name)
         select = ui.select(dict(choices), value=value, label=label, on_change=changed)
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
-    def _number(self, test_id: str, label: str, on_change: Callable[[], None]) -> Any:
-        def changed() -> None:
-            if not self._showing:
-                on_change()
+    async def _typed(self) -> None:
+        typed = _numbers(self.camera.value)
+        if typed is None or typed == self._camera():  # unfinished, or shown by refresh
+            return
+        await self._set_camera(typed if len(typed) == 4 else None, typed[0] if len(typed) == 1 else None)
 
-        return ui.number(label, on_change=changed).props(f"dense data-testid={test_id}")
+    async def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+        await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
 
-    def _camera_typed(self) -> None:
-        fx, fy, cx, cy = (number.value for number in self.camera)
-        if None not in (fx, fy, cx, cy):
-            self._set_camera((float(fx), float(fy), float(cx), float(cy)))
-        else:
-            self.session.camera = None
-
-    def _fov_typed(self) -> None:
-        if self.fov.value is not None:
-            self._set_camera(guess=float(self.fov.value))
-        elif self.session.guess != "exif":
-            self.session.guess = None
-
-    def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
-        self.session.camera, self.session.guess = camera, guess
+    def _camera(self) -> tuple[float, ...]:
+        """What the field shows: four numbers, the field of view, or nothing."""
+        guess = self.session.options.guess
+        return self.session.request().camera or ((guess,) if isinstance(guess, float) else ())
 
     def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
-        set_text(self.command, session.command())
-        set_text(self.python, "" if session.answer is None else session.python())
-        now = (session.camera, session.guess, session.photo_path, session.options)
+        set_text(self.command, session.command() or UNDISTORTED)
+        set_text(self.python, "" if session.shot.answer is None else session.python())
+        now = (session.shot.path, session.options)
         if now == self.shown:
             return
-        self.shown, self._showing = now, True
-        for number, value in zip(self.camera, session.camera or (None,) * 4, strict=True):
-            number.value = value
-        self.fov.value = session.guess if isinstance(session.guess, float) else None
+        self.shown, camera = now, self._camera()
+        if _numbers(self.camera.value) != camera:
+            self.camera.value = " ".join(repr(value).removesuffix(".0") for value in camera)
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
-        self._showing = False
         self.exif.set_visibility(session.has_exif)
         set_text(self.camera_facts, self._describe_camera())
 
     def _describe_camera(self) -> str:
-        session = self.session
-        if session.guess == "exif" and session.photo is not None:
-            focal = session.photo.focal_35mm
-            source = f"{focal:g} mm of a 35 mm camera: no covariance" if focal else "which has no focal length"
-            return f"guessed from the photograph's EXIF, {source}"
-        if session.guess is not None:
+        camera, guess, photo = self.session.options.camera, self.session.options.guess, self.session.shot.photo
+        if guess == "exif" and photo is not None:
+            focal = f"{photo.focal_35mm:g} mm of a 35 mm camera" if photo.focal_35mm else "has no focal length"
+            return f"guessed from the photograph's EXIF, {focal}: no covariance"
+        if guess is not None:
             return "guessed from the field of view: no covariance"
-        return "" if session.camera is not None else "unknown: the result is a rotation without translation"
+        if isinstance(camera, Camera):
+            return "from a calibration file" + (", without its distortion" if camera.distorts else "")
+        return "" if camera else "unknown: the result is a rotation without translation"
+
+
+def _numbers(text: str | None) -> tuple[float, ...] | None:
+    """fx, fy, cx, cy, a field of view, or nothing; None while they are being typed."""
+    try:
+        numbers = tuple(float(word) for word in (text or "").replace(",", " ").split())
+    except ValueError:
+        return None
+    return numbers if len(numbers) in (0, 4) or (len(numbers) == 1 and 1 < numbers[0] < 180) else None
 
 
 class Preview:
@@ -281,10 +276,8 @@ class Preview:
         self.no_hint.set_visibility(bool(hint))
         words = "Turn it with the mouse until it looks as in the photograph: that helps the search."
         if "viewpoint" in limits:
-            azimuth, elevation, _ = limits["viewpoint"]
-            words = (
-                f"Hint: seen from azimuth {azimuth:g}, elevation {elevation:g}, within {limits['within']:g} degrees."
-            )
+            at = "azimuth {:g}, elevation {:g}".format(*limits["viewpoint"])
+            words = f"Hint: seen from {at}, within {limits['within']:g} degrees."
         elif hint:
             words = "There are limits on the pose; the command line below has them."
         set_text(self.facts, f"Click on the side that is {self.mark}." if self.mark else words)
@@ -295,16 +288,15 @@ class Preview:
         if mesh is None or len(mesh.faces) > MAX_VIEWER_FACES:
             return
         if content := await self.workspace.run("page", self.session.preview):
-            self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"), mesh)
+            self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))
 
-    def _draw(self, url: str, mesh: Any) -> None:
-        camera = ui.scene.perspective_camera(fov=40)
-        with self.place:
-            scene = ui.scene(
-                width=340, height=240, grid=False, camera=camera, on_click=self._clicked, background_color="#c8ced3"
-            )
-        with scene:
-            scene.gltf(url).scale(1.0 / (mesh_radius(mesh) * UNITS[mesh_unit(mesh) or "m"])).move(0, 0, PREVIEW_DEPTH)
+    def _draw(self, url: str) -> None:
+        camera, grey = ui.scene.perspective_camera(fov=40), "#c8ced3"
+        with (
+            self.place,
+            ui.scene(340, 240, grid=False, camera=camera, on_click=self._clicked, background_color=grey) as scene,
+        ):
+            scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
                 scene.text(name, "font-weight: bold").move(*end)

@@ -10,23 +10,24 @@ from nicegui import ui
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..geometry import Camera
 from ..registration import Hypothesis, Registrar
 from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
-from ..visualization.overlay import to_uint8
-from .gestures import BoxDrawing, PoseDrag
+from ..visualization.overlay import LEGEND, to_uint8
+from .session import Numbers, Point, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 
 __all__ = ["Stage", "contour_paths", "pose_layers"]
 
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
+THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs
 LAYER_SIDE = 1400  # px of the longer side of the layers over it
 CONTOUR_SIDE = 256  # px of the crop in which contours are followed while a pose is moved
 DASH = 0.011  # half the length of a contour's dash, as a fraction of that crop
 COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
-LEGEND = {"outline": "outline of the mesh at this pose", "crease": "its inner edges", "box": "the box"}
 HELP = {
     "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
     "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: roll. Arrow keys move, "
@@ -35,20 +36,22 @@ HELP = {
 
 
 class Stage:
-    """The photograph, which can be zoomed; ``page.js`` sends what the mouse, the fingers and the keys do on it."""
+    """The photographs, one of which is large and can be zoomed; ``page.js`` sends what mouse, fingers and keys do."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
-        self.drawing = BoxDrawing(self.session.box)
-        self.shown_photo: Any = None
-        self.shown_result: Any = None
-        self.shown_answer: Any = None
+        self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
         self.mode, self.mask = "box", np.zeros((1, 1), bool)
-        self.drag: PoseDrag | None = None
+        self.pressed: tuple[Any, Point, bool] | None = (
+            None  # the box or the pose before the drag, where, whether it turns
+        )
+        self.drawn: Numbers | None = None  # the box, as it is dragged
+        self.moved: Tensor | None = None  # the pose that is being moved by hand
         self._last_gesture, self._following = 0.0, False
         with region("section", "stage", aria_label="photograph", data_testid="stage"):
             self._build_empty()
             with region("div", "photo-area") as self.area:
+                self.strip = region("div", "strip", role="group", aria_label="photographs", data_testid="strip")
                 self._build_toolbar()
                 with (
                     region("div", "viewport", tabindex="0", role="application") as self.viewport,
@@ -91,96 +94,85 @@ class Stage:
                 self.contours = region("input", type="checkbox", data_testid="contours", checked="checked")
                 text("span", "Contours")
             self.contours.on("change", lambda e: self.lines.set_visibility(bool(e.args)), args=["target.checked"])
-            with region("ul", "legend"):
-                for name, meaning in LEGEND.items():
-                    text("li", meaning, name)
+            text("p", LEGEND, "facts")
 
     def _set_mode(self, mode: str) -> None:
         self._commit()
         self.mode = mode
 
     def _undo(self) -> None:
+        shot = self.session.shot
         if self.mode == "pose":
             self._commit()
-            self.session.undo()
+            shot.undo()
         else:
-            self.drawing.undo()
-            self.session.box = self.drawing.box
+            shot.set_box(shot.box_before)
 
     async def _fit(self) -> None:
         self._commit()
-        await self.workspace.run("pose", self.session.fit)
+        await self.workspace.run("pose", self.session.shot.fit)
 
     async def _handle(self, event: Any) -> None:
         """Correct the box or the pose; coordinates come as fractions of the photograph."""
-        photo, what = self.session.photo, event.args
-        if photo is None:
+        shot, what = self.session.shot, event.args
+        if shot.photo is None:
             return
-        H, W = photo.image.shape[-2:]
-        x, y = float(what.get("x", 0.0)) * W - 0.5, float(what.get("y", 0.0)) * H - 0.5
+        H, W = shot.size
+        point = float(what.get("x", 0.0)) * W - 0.5, float(what.get("y", 0.0)) * H - 0.5
         if what["type"] == "undo":
             self._undo()
         elif self.mode == "box":
-            self._change_box(what, x, y, float(what.get("reach", 0.0)) * W)
+            self._change_box(what, point, float(what.get("reach", 0.0)) * W)
             self._draw_shapes()
-        elif self.session.answer is not None:
-            self._change_pose(what, x, y)
+        elif shot.answer is not None:
+            self._change_pose(what, point)
             await self._follow()
 
-    def _change_box(self, what: Any, x: float, y: float, reach: float) -> None:
-        drawing, kind = self.drawing, what["type"]
+    def _change_box(self, what: Any, point: Point, reach: float) -> None:
+        shot, kind = self.session.shot, what["type"]
         if kind == "press":
-            drawing.press(x, y, reach=reach)
-        elif kind == "move":
-            drawing.move(x, y)
-        elif kind == "cancel":
-            drawing.cancel()
-        elif kind == "release" and drawing.active:
-            drawing.release()
-            self.session.box = drawing.box
-        elif kind == "nudge":
-            step = 10.0 if what["shift"] else 1.0
-            drawing.nudge(step * what["dx"], step * what["dy"], resize=what["alt"])
-            self.session.box = drawing.box
+            self.pressed, self.drawn = (shot.box, point, False), shot.box
+        elif kind == "move" and self.pressed is not None:
+            self.drawn = dragged_box(shot.box, self.pressed[1], point, reach=reach)
+        elif kind in ("release", "cancel") and self.pressed is not None:
+            self.pressed = None
+            if kind == "release":
+                shot.set_box(self.drawn)
+        elif kind == "nudge" and shot.box is not None:
+            dx, dy = (what[name] * (10.0 if what["shift"] else 1.0) for name in ("dx", "dy"))
+            x0, y0, x1, y1 = shot.box
+            shot.set_box((x0 + dx, y0 + dy, x1 + dx, y1 + dy))
         elif kind == "remove":
-            drawing.set(None)
-            self.session.box = None
+            shot.set_box(None)
 
-    def _change_pose(self, what: Any, x: float, y: float) -> None:
-        kind, drag = what["type"], self.drag
-        if drag is None:
-            result, answer = self.session.require_result()
-            drag = self.drag = PoseDrag(result, *answer.pose.projection)
+    def _change_pose(self, what: Any, point: Point) -> None:
+        result, answer = self.session.shot.require_result()
+        kind, (T, K) = what["type"], answer.pose.projection
+        T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
         try:
             if kind == "press":
-                drag.press(x, y, turns=not self._on_mesh(x, y))
-            elif kind == "move":
-                drag.drag(x, y)
+                self.pressed = T, point, not self._on_mesh(*point)
+            elif kind == "move" and self.pressed is not None:
+                T, start, turns = self.pressed
+                self.moved = result.dragged(T, K, start, point, turns=turns)
             elif kind == "release":
-                drag.release()
                 self._commit()
             elif kind == "cancel":
-                self.drag = None
+                self.pressed = self.moved = None
             elif kind == "scale":  # wheel and pinch
-                drag.scale(float(what["factor"]))
-                drag.move(rotation=(0.0, 0.0, float(what["roll"])))
+                self.moved = result.scaled(T, float(what["factor"]), float(what["roll"]))
             elif kind == "nudge" and what["shift"]:
-                drag.move(rotation=(what["dy"], -what["dx"], 0.0))
-            elif kind == "nudge" and what["alt"]:
-                drag.move(rotation=(0.0, 0.0, what["dx"]))
-                drag.scale(1.01 ** -what["dy"])
+                self.moved = result.moved(T, rotation=(what["dy"], -what["dx"], 0.0))
             elif kind == "nudge":
-                drag.move(translation=(0.01 * what["dx"], 0.01 * what["dy"], 0.0))
+                self.moved = result.moved(T, translation=(0.01 * what["dx"], 0.01 * what["dy"], 0.0))
         except InvalidInputError:  # the object would touch the camera: it stays
             return
 
     def _on_mesh(self, x: float, y: float) -> bool:
         """Whether the mesh is drawn at a pixel."""
-        photo = self.session.photo
-        assert photo is not None
-        rows, columns = self.mask.shape
-        row, column = int((y + 0.5) / photo.image.shape[-2] * rows), int((x + 0.5) / photo.image.shape[-1] * columns)
+        (rows, columns), (H, W) = self.mask.shape, self.session.shot.size
+        row, column = int((y + 0.5) / H * rows), int((x + 0.5) / W * columns)
         return 0 <= row < rows and 0 <= column < columns and bool(self.mask[row, column])
 
     async def _follow(self) -> None:
@@ -189,10 +181,9 @@ class Stage:
             return
         self._following, drawn = True, None
         try:
-            while self.drag is not None and self.drag.T is not drawn:
-                drag, drawn = self.drag, self.drag.T
-                K = self.session.require_result()[1].pose.projection[1]
-                paths = await asyncio.to_thread(contour_paths, drag.result.registrar, drawn, K)
+            while self.moved is not None and self.moved is not drawn:
+                drawn, (result, answer) = self.moved, self.session.shot.require_result()
+                paths = await asyncio.to_thread(contour_paths, result.registrar, drawn, answer.pose.projection[1])
                 self._show_layers(shown=False)
                 self._draw_shapes(paths)
         finally:
@@ -200,65 +191,97 @@ class Stage:
 
     def _commit(self) -> None:
         """Make the pose that was moved the answer."""
-        drag, self.drag = self.drag, None
-        answer = self.session.answer
-        if drag is not None and answer is not None and drag.T is not answer.pose.projection[0]:
-            self.session.place(drag.T)
+        moved, self.moved, self.pressed = self.moved, None, None
+        answer = self.session.shot.answer
+        if moved is not None and answer is not None and moved is not answer.pose.projection[0]:
+            self.session.shot.place(moved)
+
+    def _changed(self, name: str, value: Any) -> bool:
+        """Whether something differs from what the page shows, which it does not afterwards."""
+        before, self.shown[name] = self.shown.get(name), value
+        return before is not value
 
     async def refresh(self) -> None:
-        """Show the photograph, the box and the answer of the workspace."""
-        session = self.session
-        self.empty.set_visibility(session.photo is None)
-        self.area.set_visibility(session.photo is not None)
-        if session.photo is None:
+        """Show the photographs, the box and the answer of the workspace."""
+        shot = self.session.shot
+        self.empty.set_visibility(shot.photo is None)
+        self.area.set_visibility(shot.photo is not None)
+        if shot.photo is None:
             return
-        if not self.drawing.active and self.drawing.box != session.box:  # changed elsewhere on the page
+        if (
+            self._changed("box", shot.box) and self.pressed is None and self.moved is None
+        ):  # changed elsewhere on the page
             self.mode = "box"
-            self.drawing.set(session.box)
-        if self.shown_photo != session.photo_path:
-            self.shown_photo, self.drawing, self.drag = session.photo_path, BoxDrawing(session.box), None
+        if self._changed("photo", shot.photo):
+            self.pressed = self.moved = None
             await self._show_photo()
-        if self.shown_result is not session.result:
-            self.shown_result, self.drag = session.result, None
-            self.mode = "box" if session.result is None else "pose"
-        if self.drag is not None and not self.drag.active and time.monotonic() - self._last_gesture > COMMIT_SECONDS:
+        if self._changed("result", shot.result):
+            self.pressed = self.moved = None
+            self.mode = "box" if shot.result is None else "pose"
+        if self.pressed is None and self.moved is not None and time.monotonic() - self._last_gesture > COMMIT_SECONDS:
             self._commit()
         self._show_mode()
-        if self.shown_answer is not session.answer:
-            self.drag, self.shown_answer = None, session.answer
+        if self._changed("answer", shot.answer):
+            self.pressed = self.moved = None
             await self._render_answer()
-        if self.drag is None:
-            self._show_layers(shown=session.answer is not None)
+        if self.moved is None:
+            self._show_layers(shown=shot.answer is not None)
             self._draw_shapes()
+        await self._show_strip()
+
+    async def _show_strip(self) -> None:
+        """Show small pictures of the photographs, if there are several, and mark the one that is shown."""
+        shots = self.session.shots
+        images = [shot.photo.image for shot in shots if shot.photo is not None]
+        if list(map(id, images)) != list(map(id, self.shown.get("strip", []))):
+            self.shown["strip"] = images
+
+            def make() -> list[bytes]:
+                return [jpeg(shrink(to_uint8(image), THUMBNAIL_SIDE), 80) for image in images if len(images) > 1]
+
+            pictures = await self.workspace.run("page", make) or ()
+            self.strip.clear()
+            for number, picture in enumerate(pictures):
+                url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
+                test_id = f"photograph-{number + 1}"
+                with self.strip, region("button", "thumbnail", type="button", data_testid=test_id) as thumbnail:
+                    region("img", src=url, alt=self.session.name(shots[number].path))
+                thumbnail.on("click", lambda number=number: self._select(number))
+        for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
+            thumbnail.props(f"aria-pressed={'true' if shot is self.session.shot else 'false'}")
+            thumbnail.classes(**{"add" if shot.answer is not None else "remove": "done"})
+
+    def _select(self, number: int) -> None:
+        self._commit()
+        self.session.shot = self.session.shots[number]
+        self.workspace.messages.pop("pose", None)
 
     def _show_mode(self) -> None:
-        is_pose = self.mode == "pose"
+        is_pose, shot = self.mode == "pose", self.session.shot
         self.canvas.props(f"data-mode={self.mode}")
         self.viewport.props(f'aria-label="Photograph. {HELP[self.mode]}"')
         self.hint.set_content(HELP[self.mode])
         for mode, element in self.modes.items():
             element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
-        set_enabled(self.modes["pose"], self.session.answer is not None)
+        set_enabled(self.modes["pose"], shot.answer is not None)
         self.fit.set_visibility(is_pose)
-        moved = self.session.answer_before is not None or self.drag is not None
-        set_enabled(self.undo, moved if is_pose else self.drawing.previous != self.drawing.box)
+        moved = shot.answer_before is not None or self.moved is not None
+        set_enabled(self.undo, moved if is_pose else shot.box_before != shot.box)
 
     async def _show_photo(self) -> None:
-        photo = self.session.photo
+        photo = self.session.shot.photo
         assert photo is not None
         content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
         if content:
-            H, W = photo.image.shape[-2:]
+            H, W = self.session.shot.size
             self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
             self.viewport.style(f"--ratio: {W / H:.5f}")
 
     async def _render_answer(self) -> None:
-        if self.shown_answer is None:
+        if self.session.shot.answer is None:
             return
-        result, answer = self.session.require_result()
-        size = (int(result.image.shape[-2]), int(result.image.shape[-1]))
-        layers = await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size))
-        if layers:
+        size, (result, answer) = self.session.shot.size, self.session.shot.require_result()
+        if layers := await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size)):
             self.mask = layers[2]
             for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):
                 element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
@@ -266,19 +289,20 @@ class Stage:
     def _show_layers(self, *, shown: bool) -> None:
         for element in (self.solid, self.lines):
             element.classes(**{"remove" if shown else "add": "absent"})
-        self.layers.set_visibility(self.session.answer is not None)
+        self.layers.set_visibility(self.session.shot.answer is not None)
 
     def _draw_shapes(self, contours: str = "") -> None:
         """Draw the box, with handles where it can be changed, and contours."""
-        photo, box, parts = self.session.photo, self.drawing.box, contours
-        if photo is None:
+        shot, is_box, parts = self.session.shot, self.mode == "box", contours
+        box = self.drawn if is_box and self.pressed is not None else shot.box
+        if shot.photo is None:
             return
-        H, W = photo.image.shape[-2:]
+        H, W = shot.size
         if box is not None:
             x0, y0, x1, y1 = box
             shape = f"x='{x0:g}' y='{y0:g}' width='{x1 - x0:g}' height='{y1 - y0:g}'"
             parts += f"<rect {shape} class='rim'/><rect {shape} class='line'/>"
-        if box is not None and self.mode == "box":  # squares of the same size at every zoom
+        if box is not None and is_box:  # squares of the same size at every zoom
             middle = ((x0 + x1) / 2, (y0 + y1) / 2)
             points = [(x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle]
             path = " ".join(f"M{x:g} {y:g}h0" for x, y in points)
@@ -287,10 +311,7 @@ class Stage:
 
 
 def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:
-    """SVG paths of the contours of a mesh at a pose (4, 4), in px of the photograph with the camera matrix (3, 3).
-
-    They are short dashes along the mesh's edges, which needs no rendered view.
-    """
+    """SVG paths of the contours of a mesh at (4, 4) ``T``, with (3, 3) camera matrix: short dashes along its edges."""
     describer = registrar.describer
     centre = T[:3, :3] @ describer.centre + T[:3, 3]
     u, v, _ = (K @ centre / centre[2]).tolist()
@@ -315,9 +336,7 @@ def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -
     T, K = pose.projection
     scale = min(1.0, LAYER_SIDE / max(size))
     small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
-    sy, sx = small[0] / size[0], small[1] / size[1]
-    to_layer = torch.tensor([[sx, 0.0, 0.5 * sx - 0.5], [0.0, sy, 0.5 * sy - 0.5], [0.0, 0.0, 1.0]])
-    K = to_layer.double() @ K
+    K = Camera(K, size=size).at(small).matrix
     depth = registrar.describer.renderer.render(T[None], K, small)[0, 0].cpu().float()
     mask: np.ndarray = (depth > 0).numpy()
     grey = shade(depth[None, None], K[None])[0, 0].numpy()

@@ -7,6 +7,7 @@ from typing import Any
 from nicegui import ui
 
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
+from .workspace import CALIBRATIONS
 
 __all__ = ["button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
 
@@ -51,5 +52,5 @@ def file_chooser(label: str, test_id: str) -> None:
     """A button that opens the dialogue for files; ``page.js`` sends them."""
     with region("label", "button file"):
         ui.label(label)
-        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, ".zip"))
+        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".zip"))
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")

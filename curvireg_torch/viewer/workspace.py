@@ -1,12 +1,13 @@
-"""What a page works on: it outlives the page, so that a reload finds everything again. It needs no NiceGUI."""
+"""The work that the windows of the page show, and the files that it receives. It needs no NiceGUI."""
 
 import asyncio
 import os
-import re
 import shutil
 import struct
+import tempfile
 import time
 import traceback
+import warnings
 import zipfile
 from collections.abc import AsyncIterator, Callable
 from contextvars import ContextVar
@@ -14,15 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import (
-    MAX_ARCHIVE_FILES,
-    MAX_MESH_BYTES,
-    MAX_VIEWER_BYTES,
-    MAX_VIEWER_PAGES,
-    MAX_VIEWER_UPLOADS,
-    CurviregError,
-    InvalidInputError,
-)
+from ..data import load_camera
+from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..synthetic import demo_scene
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
@@ -31,18 +25,12 @@ from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from .session import Session
 
-__all__ = ["Workspace", "Workspaces", "file_name", "identify", "show_warning", "unpack"]
+__all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
 
-GRACE_SECONDS = 30.0  # after which the search of a closed page is stopped; a reload takes less
-MAX_NAME = 120  # characters of the name of an uploaded file
-HEAD_BYTES = 16  # from the start of a file, which tell what it is
+CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
+MAX_NAME = 60  # characters of the name of an uploaded file
 
-_IMAGE_STARTS = (
-    *(b"\xff\xd8", b"\x89PNG", b"II*\0", b"MM\0*", b"RIFF", b"BM", b"P2", b"P3", b"P5", b"P6"),
-    *(b"GIF8", b"\xff\x0a", b"\0\0\0\x0cJXL", b"\0\0\0\x0cjP"),
-)
-_MESH_STARTS = {b"glTF": ".glb", b"ply": ".ply", b"OFF": ".off", b"COFF": ".off", b"solid": ".stl"}
 _caught: ContextVar[list[Any]] = ContextVar("caught")
 
 
@@ -52,43 +40,40 @@ def show_warning(message: Any, *_: Any, **__: Any) -> None:
 
 
 class Workspace:
-    """Photograph, mesh, box, answer and messages of a page.
+    """Photographs, mesh, boxes, answers and messages; a reload finds them again.
 
     Attributes:
         session: inputs and results.
-        messages: what is wrong with, or remarkable about, a part of the work: "file", "photograph", "mesh", "pose" or
-            the "page" itself.
+        messages: about a part of the work: "file", "photograph", "mesh", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
-        receiving: names of files that are being received.
-        mesh_facts: the mesh in words.
-        loaded: whether the files of the command line were opened.
-        started: when the search began or was put into the queue, in seconds of ``time.monotonic``.
-        waiting: whether a search waits for those of other pages.
-        pages: browser windows that show it.
-        left: when one of them was closed last, in seconds of ``time.monotonic``.
+        receiving, mesh_facts: folders and names of files that are being received; the mesh in words.
+        started: when the search began, in seconds of ``time.monotonic``.
     """
 
-    def __init__(self, session: Session, folder: Path, searches: asyncio.Semaphore) -> None:
-        self.session, self.folder = session, folder
+    def __init__(self, options: RegisterOptions, folder: Path) -> None:
+        self.session, self.folder = Session(options, folder), folder
         self.messages: dict[str, str] = {}
         self.files: dict[str, tuple[bytes, str]] = {}
-        self.receiving: dict[Path, str] = {}
-        self.mesh_facts, self.loaded, self.waiting, self.pages, self.left = "", False, False, 0, time.monotonic()
-        self._version, self.started = 0, 0.0
-        self._bytes: dict[Path, int] = {}
-        self._lock, self._searches = asyncio.Lock(), searches
+        self.receiving, self._sizes = dict[Path, str](), dict[Path, int]()
+        self.mesh_facts, self.started, self._version = "", 0.0, 0
+        self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
         self._before_sample: RegisterOptions | None = None
-        folder.mkdir(parents=True, exist_ok=True)
 
     @property
     def searching(self) -> bool:
-        """Whether a registration waits or runs."""
+        """Whether a registration runs."""
         return self._search is not None
 
-    async def run(self, part: str, job: Callable[[], Any]) -> Any:
-        """Run a short job in a thread; returns its result or True, and None after an error, which becomes a message."""
-        async with self._lock:
+    async def run(self, part: str, job: Callable[[], Any], *, stop: bool = False) -> Any:
+        """Run a short job in a thread, perhaps after the search has stopped.
+
+        Returns its result or True, and None after an error, which becomes a message.
+        """
+        async with self._lock:  # no search begins before it is done
+            if stop and self._search is not None:
+                self.stop()
+                await asyncio.wait({self._search})
             return await self._attempt(part, job)
 
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
@@ -100,7 +85,9 @@ class Workspace:
             if caught:
                 self.messages[part] = "; ".join(map(self.session.describe_warning, caught))
             return True if result is None else result
-        except (CurviregError, OSError) as error:
+        except CurviregError as error:
+            self.messages[part] = str(error.with_subject(self.session.name(error.subject)))
+        except OSError as error:
             self.messages[part] = str(error)
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
@@ -108,10 +95,9 @@ class Workspace:
         return None
 
     def start_search(self) -> asyncio.Task[None]:
-        """Find the pose as soon as files are open and no other page searches; one search of a page at a time."""
+        """Find the pose in the photograph that is shown, as soon as files are open; one search at a time."""
         if self._search is None:
-            self.session.progress, self.session.cancelled = ("", 0, 1), False
-            self.started, self.waiting = time.monotonic(), True
+            self.session.progress, self.session.cancelled, self.started = ("", 0, 1), False, time.monotonic()
             self._search = asyncio.create_task(self._find())
         return self._search
 
@@ -119,99 +105,81 @@ class Workspace:
         try:
             async with self._lock:  # a photograph or a mesh may be opening
                 pass
-            async with self._searches:
-                self.waiting = False
-                await self._attempt("pose", self.session.register)
-        except asyncio.CancelledError:
-            self.messages["pose"] = "stopped"
+            await self._attempt("pose", self.session.register)
         finally:
-            self._search, self.waiting = None, False
+            self._search = None
 
     def stop(self) -> None:
-        """End the search at its next step, or take it out of the queue."""
-        if self._search is not None and self.waiting:
-            self._search.cancel()
-        elif self._search is not None:
-            self.session.cancelled = True
-
-    def stop_if_left(self) -> None:
-        """End the search if no window shows the page any more."""
-        if self.pages == 0:
-            self.stop()
+        """End the search at its next step."""
+        self.session.cancelled = self.searching
 
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
-        """Store a file of ``size`` bytes and open it as a photograph or a mesh.
-
-        Raises:
-            InvalidInputError: the page has received too much.
-        """
-        if len(self.receiving) >= MAX_VIEWER_UPLOADS or sum(self._bytes.values()) + size > MAX_VIEWER_BYTES:
-            raise InvalidInputError(f"{name}: too many files at a time; wait for the others")
-        self._version += 1
-        folder = self.folder / f"upload-{self._version}"
-        folder.mkdir()
-        self.receiving[folder], self._bytes[folder] = name, size
+        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
+        stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
+        if stored + sum(self._sizes.values()) + size > MAX_VIEWER_BYTES:
+            raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
+        folder = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder))
+        self.receiving[folder], self._sizes[folder] = name, size
         try:
-            with (folder / "file").open("wb") as file:
+            with (folder / name).open("wb") as file:
                 async for block in blocks:
                     await asyncio.to_thread(file.write, block)
-            await self._open_upload(folder / "file", name)
+            await self._open_upload(folder / name)
         finally:
-            self.receiving.pop(folder)
+            del self.receiving[folder], self._sizes[folder]
             self._remove_unused()
 
-    async def _open_upload(self, path: Path, name: str) -> None:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-        try:
-            kind, suffix = identify(name, head)
-        except InvalidInputError as error:
-            self.messages["file"] = str(error)
-            return
+    async def _open_upload(self, path: Path) -> None:
+        suffix, session = path.suffix.lower(), self.session
+        kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".zip")
         self.messages.pop("file", None)
-        path = path.rename(path.with_suffix(suffix))
-        self._leave_sample()
-        if kind == "photograph":
-            await self.open_photo(path, name)
-        elif kind == "mesh":
-            await self.open_mesh(path, name)
-        elif mesh := await self.run("mesh", lambda: unpack(path, path.with_name("parts"), name)):
-            await self.open_mesh(mesh, str(mesh.relative_to(path.with_name("parts"))))
-            self._bytes[path.parent] = sum(p.stat().st_size for p in path.parent.rglob("*") if p.is_file())
+        if suffix in kinds:
+            self._leave_sample()
+        if suffix not in kinds:
+            self.messages["file"] = (
+                f"{path.name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
+                f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers) nor a "
+                f"calibration ({', '.join(CALIBRATIONS)})"
+            )
+        elif suffix in CALIBRATIONS:
+            await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
+        elif suffix == ".zip":
+            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / "parts")):
+                await self.open_mesh(mesh)
+        elif suffix in MESHES_AND_BANKS:
+            await self.open_mesh(path)
+        else:
+            await self.open_photo(path)
 
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
-        used = [path for path in (self.session.photo_path, self.session.mesh_path) if path is not None]
-        for folder in self._bytes.keys() - self.receiving.keys():
+        used = [path for path in (self.session.mesh_path, *(shot.path for shot in self.session.shots)) if path]
+        for folder in set(self.folder.glob("upload-*")) - self.receiving.keys():
             if not any(folder in path.parents for path in used):
                 shutil.rmtree(folder)
-                self._bytes.pop(folder)
-                names = self.session.names
-                self.session.names = {path: name for path, name in names.items() if folder not in path.parents}
 
-    async def open_photo(self, path: Path, name: str) -> None:
-        """Replace the photograph; a search in the former one is stopped."""
-        await self._open("photograph", lambda: self.session.open_photo(path, name))
+    async def open_photo(self, path: Path) -> None:
+        """Add a photograph, and show it."""
+        if await self.run("photograph", lambda: self.session.open_photo(path)):
+            self.messages.pop("pose", None)
 
-    async def open_mesh(self, path: Path, name: str) -> None:
+    async def open_mesh(self, path: Path) -> None:
         """Replace the mesh; a search for the former one is stopped."""
-        self.mesh_facts = await self._open("mesh", lambda: self.session.open_mesh(path, name)) or self.mesh_facts
+        if opened := await self.run("mesh", lambda: self.session.open_mesh(path), stop=True):
+            self.mesh_facts = opened
+            self.messages.pop("pose", None)
+
+    def remove_photo(self) -> None:
+        """Close the photograph that is shown."""
+        self.session.remove_photo()
+        self.messages.pop("pose", None)
+        self._remove_unused()
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
         self.session.options = replace(self.session.options, **{name: value})
-        path = self.session.mesh_path
-        if name in ("unit", "up") and path is not None:
-            await self.open_mesh(path, self.session.names[path])
-
-    async def _open(self, part: str, job: Callable[[], Any]) -> Any:
-        async with self._lock:  # no search begins before it is open
-            if self._search is not None and not self.waiting:
-                self.stop()
-                await asyncio.wait({self._search})
-            if opened := await self._attempt(part, job):
-                self.messages.pop("pose", None)
-            return opened
+        if name in ("unit", "up") and self.session.mesh_path is not None:
+            await self.open_mesh(self.session.mesh_path)
 
     def _leave_sample(self) -> None:
         """Close the sample and bring back the options of before it, as one's own files replace it."""
@@ -219,142 +187,63 @@ class Workspace:
             self.session.close()
             self.session.options, self._before_sample = self._before_sample, None
 
-    async def load(self) -> None:
-        """Open the files that the options name."""
-        self.loaded = True
-        self.mesh_facts = await self.run("file", self.session.load) or ""
+    def load(self) -> None:
+        """Open the files that the options name; their warnings become messages."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            self.mesh_facts = self.session.load()
+        if caught:
+            self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
     async def load_sample(self) -> None:
         """Open the scene of ``curvireg demo``, with its box and camera."""
-        photo, mesh = self.folder / "sample.png", self.folder / "sample.ply"
-
-        def write() -> Any:
-            scene = demo_scene()
-            write_file(photo, png(to_uint8(scene.image)))
-            write_file(mesh, scene.mesh.export(file_type="ply"))
-            return scene
-
         self.messages.clear()
-        if scene := await self.run("file", write):
-            self._before_sample = self._before_sample or self.session.options
-            self.session.options = replace(self.session.options, unit="m", up=None, pose="upright", limits=None)
-            await self.open_photo(photo, photo.name)
-            await self.open_mesh(mesh, mesh.name)
-            K = scene.camera_matrix
-            self.session.camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-            x0, y0, x1, y1 = (round(float(v), 1) for v in scene.box)
-            self.session.box, self.session.guess = (x0, y0, x1, y1), None
+        self._before_sample = self._before_sample or self.session.options
+        await self.run("file", self._open_sample, stop=True)
+
+    def _open_sample(self) -> None:
+        scene, session, photo, mesh = demo_scene(), self.session, self.folder / "sample.png", self.folder / "sample.ply"
+        write_file(photo, png(to_uint8(scene.image)))
+        write_file(mesh, scene.mesh.export(file_type="ply"))
+        K, (x0, y0, x1, y1) = scene.camera_matrix, (round(float(v), 1) for v in scene.box)
+        sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
+        sample["camera"] = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        session.close()
+        session.options = replace(session.options, **sample)
+        session.open_photo(photo).set_box((x0, y0, x1, y1))
+        self.mesh_facts = session.open_mesh(mesh)
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""
         self._version += 1
         self.files[name] = (content, media_type)
-        return f"{self.folder.name}/file/{name}?v={self._version}"
-
-
-class Workspaces:
-    """The workspaces of a server, at most :data:`~curvireg_torch.errors.MAX_VIEWER_PAGES`, and their folder."""
-
-    def __init__(self, options: RegisterOptions, folder: Path) -> None:
-        self.options, self.folder, self.items = options, folder, dict[str, Workspace]()
-        self.searches = asyncio.Semaphore(max(1, (os.cpu_count() or 1) // 4))
-
-    def join(self, name: str) -> Workspace | None:
-        """The workspace of a page that was opened or loaded again; None if there is no place for it."""
-        if name not in self.items:
-            left = [other for other, workspace in self.items.items() if workspace.pages == 0]
-            if len(self.items) >= MAX_VIEWER_PAGES and not left:
-                return None
-            if len(self.items) >= MAX_VIEWER_PAGES:
-                self._remove(min(left, key=lambda other: self.items[other].left))
-            self.items[name] = Workspace(Session(self.options), self.folder / name, self.searches)
-        self.items[name].pages += 1
-        return self.items[name]
-
-    def leave(self, name: str) -> None:
-        """A page was closed; its workspace waits for it, but gives up its place if another page needs it."""
-        workspace = self.items[name]
-        workspace.pages, workspace.left = workspace.pages - 1, time.monotonic()
-        asyncio.get_running_loop().call_later(GRACE_SECONDS, workspace.stop_if_left)
-
-    def close(self) -> None:
-        """Stop all searches and remove the folder."""
-        for name in list(self.items):
-            self._remove(name)
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _remove(self, name: str) -> None:
-        workspace = self.items.pop(name)
-        workspace.stop()
-        shutil.rmtree(workspace.folder, ignore_errors=True)
+        return f"file/{name}?v={self._version}"
 
 
 def file_name(text: str) -> str:
     """Return the name of an uploaded file without folders and control characters."""
-    name = "".join(c for c in re.split(r"[/\\]", text)[-1] if c.isprintable()).strip()
+    name = "".join(c for c in text.replace("\\", "/").rpartition("/")[2] if c.isprintable()).strip(" .")
     return name[-MAX_NAME:] or "file"
 
 
-def identify(name: str, head: bytes) -> tuple[str, str]:
-    """Return whether a file is a "photograph", a "mesh" or an "archive", and the suffix of its format.
-
-    Its first bytes decide, then its name: a part that is called ``wheel.jpg`` by mistake is still a mesh.
-
-    Raises:
-        InvalidInputError: it is none of them.
-    """
-    suffix = Path(name).suffix.lower()
-    if head.startswith(b"PK\3\4"):
-        return "archive", ".zip"
-    for start, format_suffix in _MESH_STARTS.items():
-        if head.startswith(start):
-            return "mesh", format_suffix
-    if head.startswith(_IMAGE_STARTS) or head[4:8] == b"ftyp":
-        return "photograph", ""
-    if suffix in MESHES_AND_BANKS:
-        return "mesh", suffix
-    if suffix in IMAGES:
-        return "photograph", ""
-    raise InvalidInputError(
-        f"{name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
-        f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers)"
-    )
-
-
-def unpack(archive: Path, folder: Path, name: str) -> Path:
-    """Unpack a zip archive into a new folder; returns the path of the only mesh in it.
-
-    Names that lead outside stay inside, as ``zipfile`` removes ``..`` and drives. Messages call the archive ``name``.
-
-    Raises:
-        InvalidInputError: it is damaged, too large, encrypted, or does not hold one mesh.
-    """
+def unpack(archive: Path, folder: Path) -> Path:
+    """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
+    name = archive.name
     try:
         with archive.open("rb") as file:
             file.seek(-min(archive.stat().st_size, 1 << 16), os.SEEK_END)
-            end = file.read()
-        at = end.rfind(b"PK\5\6")  # before zipfile reads the whole directory
-        if at >= 0 and struct.unpack_from("<I", end, at + 12)[0] > MAX_ARCHIVE_FILES * DIRECTORY_BYTES:
-            raise InvalidInputError(f"{name}: more than {MAX_ARCHIVE_FILES:,} files")
+            end = file.read()  # before zipfile reads the whole directory
+        if struct.unpack_from("<I", end, end.rindex(b"PK\5\6") + 12)[0] > MAX_ARCHIVE_FILES * DIRECTORY_BYTES:
+            raise InvalidInputError(f"{name}: more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts")
         with zipfile.ZipFile(archive) as content:
             members = content.infolist()
-            if len(members) > MAX_ARCHIVE_FILES:
-                raise InvalidInputError(f"{name}: {len(members):,} files, more than {MAX_ARCHIVE_FILES:,}")
-            total = sum(member.file_size for member in members)
-            if total > MAX_MESH_BYTES:
-                raise InvalidInputError(f"{name}: {total:,} bytes when unpacked, more than {MAX_MESH_BYTES:,}")
+            if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:
+                limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
+                raise InvalidInputError(f"{name}: more than {limits}; pack only the mesh and its parts")
             content.extractall(folder)  # at most the bytes that the headers claim
-    except (
-        zipfile.BadZipFile,
-        struct.error,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-        ValueError,
-        OSError,
-    ) as error:
-        if isinstance(error, InvalidInputError):
-            raise
+    except InvalidInputError:
+        raise
+    except Exception:  # zipfile raises many kinds
         raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
     meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
     if len(meshes) != 1:

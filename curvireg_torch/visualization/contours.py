@@ -10,7 +10,7 @@ from torch import Tensor
 from ..rendering import DepthRenderer
 from .encoding import to_uint8
 
-__all__ = ["contour_layer", "draw_box", "draw_window", "line_width"]
+__all__ = ["close_up", "contour_layer", "draw_box", "draw_window", "line_width"]
 
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
@@ -24,6 +24,15 @@ def line_width(size: Sequence[int]) -> float:
     return max(1.5, max(size) / 350)
 
 
+def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, int]:
+    """A square window around a box in px with a margin, moved into a photograph of ``size`` (H, W) and cut there."""
+    (H, W), (x0, y0, x1, y1) = size, box
+    side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
+    left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
+    top = max(0, min(round(0.5 * (y0 + y1 - side)), H - side))
+    return left, top, min(W, left + side), min(H, top + side)
+
+
 def draw_window(
     renderer: DepthRenderer,
     projection: tuple[Tensor, Tensor] | None,
@@ -32,17 +41,10 @@ def draw_window(
     scale: float,
     box: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """Part of a photograph with a mesh's contours, and a box below them.
+    """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box in px below them.
 
-    Args:
-        renderer: of the mesh.
-        projection: (4, 4) pose ``T_cam_from_model`` and (3, 3) camera matrix; None draws no mesh.
-        image: (1 or 3, H, W).
-        window, scale: columns x0 to x1 - 1 and rows y0 to y1 - 1, and the factor by which they are resized.
-        box: x0, y0, x1, y1 in px of the photograph.
-
-    Returns:
-        (H', W', 3) uint8 RGB.
+    ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh. ``window`` is x0,
+    y0, x1, y1 without the last column and row, and is resized by ``scale``.
     """
     x0, y0, x1, y1 = window
     picture = to_uint8(image[:, y0:y1, x0:x1])
@@ -76,20 +78,7 @@ def draw_box(picture: np.ndarray, box: Sequence[float]) -> None:
 def contour_layer(depth: Tensor, camera_matrix: Tensor) -> np.ndarray:
     """Outline (green), occluding edges and creases (orange) of a depth view, on a transparent layer.
 
-    Args:
-        depth: (H, W) z-depth, 0 = background.
-        camera_matrix: (3, 3) of the view, in px.
-
-    Returns:
-        (H, W, 4) uint8 RGBA.
-
-    Example:
-        >>> import torch
-        >>> depth = torch.zeros(40, 40)
-        >>> depth[10:30, 10:30] = 5.0
-        >>> layer = contour_layer(depth, torch.eye(3))
-        >>> layer[10, 20].tolist(), layer[20, 20].tolist()
-        ([0, 255, 80, 255], [0, 0, 0, 0])
+    ``depth`` (H, W) is 0 in the background; the result is (H, W, 4) uint8 RGBA.
     """
     z = depth.cpu().float().numpy()
     layer = np.zeros((*z.shape, 4), np.uint8)

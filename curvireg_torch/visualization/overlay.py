@@ -19,12 +19,11 @@ from ..registration.result import pose_in_words, verdict
 from ..rendering import DepthRenderer
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
-from .contours import draw_window
+from .contours import close_up, draw_window
 from .encoding import to_uint8
 
-__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "view_picture", "views_sheet"]
+__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "views_sheet"]
 
-Window = tuple[int, int, int, int]
 LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
 NARROWEST = 720  # px of width that the caption needs
 TILE = 180  # least side of a small picture in px
@@ -53,57 +52,53 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
 def views_sheet(
     renderer: DepthRenderer, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
 ) -> np.ndarray:
-    """Photographs beside each other, with a mesh's contours.
-
-    Args:
-        renderer: of the mesh.
-        views: of each photograph pose (4, 4) and camera matrix (3, 3), (1 or 3, H, W) pixels, box or None, and caption.
-
-    Returns:
-        (H', W', 3) uint8 RGB.
-    """
+    """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or None, caption."""
     columns = math.ceil(math.sqrt(len(views)))
-    side, line = MOST // columns - GAP, 16
-    pictures = []
-    for projection, image, box, _ in views:
+    side = MOST // columns - GAP
+    tiles = []
+    for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        pictures.append(draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box))
-    height = max(picture.shape[0] for picture in pictures) + 2 * line
-    sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * height), PAPER)
-    draw = ImageDraw.Draw(sheet)
-    for k, (picture, (*_, caption)) in enumerate(zip(pictures, views, strict=True)):
-        x, y = k % columns * (side + GAP), k // columns * height
-        sheet.paste(Image.fromarray(picture), (x, y + 2 * line))
-        draw.text((x, y + line // 3), caption, INK, ImageFont.load_default(line))
+        tiles.append((caption, draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box)))
+    height = max(picture.shape[0] for _, picture in tiles)
+    sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
+    _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
     return np.asarray(sheet).copy()
+
+
+def _paste_tiles(
+    sheet: Image.Image,
+    tiles: Sequence[tuple[str, np.ndarray]],
+    corner: tuple[int, int],
+    columns: int,
+    size: tuple[int, int],
+    line: int,
+) -> None:
+    """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line`` px high."""
+    draw, font, (W, H) = ImageDraw.Draw(sheet), ImageFont.load_default(line), size
+    for k, (caption, picture) in enumerate(tiles):
+        x, y = corner[0] + k % columns * (W + GAP), corner[1] + k // columns * (H + 2 * line + GAP)
+        h, w = picture.shape[:2]
+        sheet.paste(Image.fromarray(picture), (x + (W - w) // 2, y + (H - h) // 2))
+        draw.text((x, y + H + line // 3), caption, INK, font)
 
 
 @torch.no_grad()
 def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
-    """(S, S, 3) uint8 RGB each of "photograph", "photograph field", "pose" and "view field".
-
-    Arguments as for :func:`contour_overlay`.
-    """
+    """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see :func:`contour_overlay`."""
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
     field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))
-    rotation, distance = result.allocentric_rotation, result.distance
-    depth = registrar.describer.depth(rotation[None], torch.tensor([distance]))[0]
+    at = result.allocentric_rotation[None], torch.tensor([result.distance])
+    shaded = registrar.describer.shaded(*at)[0]  # grey, or grey and RGB
     return {
         "photograph": to_uint8(crop[0]),
         "photograph field": _field_picture(field[0]),
-        "pose": view_picture(registrar, rotation, distance),
-        "view field": _field_picture(depth_filter(settings)(depth)[0]),
+        "pose": to_uint8(shaded[-3:] if len(shaded) > 1 else shaded),
+        "view field": _field_picture(depth_filter(settings)(registrar.describer.depth(*at)[0])[0]),
     }
-
-
-def view_picture(registrar: Registrar, rotation: Tensor, distance: float) -> np.ndarray:
-    """(S, S, 3) uint8 RGB of the mesh as the bank's views show it, shaded before a white background."""
-    shaded = registrar.describer.shaded(rotation[None], torch.tensor([distance]))[0]
-    return to_uint8(shaded[-3:] if len(shaded) > 1 else shaded)  # grey, or grey and RGB
 
 
 def _field_picture(field: Tensor) -> np.ndarray:
@@ -139,13 +134,8 @@ def registration_sheet(
     top, step = height + 4 * text + GAP, side + 2 * line + GAP
     sheet = Image.new("RGB", (width, top + rows * step), PAPER)
     sheet.paste(Image.fromarray(photograph), ((width - photograph.shape[1]) // 2, 0))
-    draw = ImageDraw.Draw(sheet)
-    _draw_caption(draw, registrar, result, (GAP, height + text // 2), text, note)
-    for k, (name, picture) in enumerate(_small_pictures(registrar, result, item, side)):
-        x, y = GAP + k % columns * (side + GAP), top + k // columns * step
-        h, w = picture.shape[:2]
-        sheet.paste(Image.fromarray(picture), (x + (side - w) // 2, y + (side - h) // 2))
-        draw.text((x, y + side + line // 3), name, INK, ImageFont.load_default(line))
+    _draw_caption(ImageDraw.Draw(sheet), registrar, result, (GAP, height + text // 2), text, note)
+    _paste_tiles(sheet, _small_pictures(registrar, result, item, side), (GAP, top), columns, (side, side), line)
     return np.asarray(sheet).copy()
 
 
@@ -178,7 +168,7 @@ def _small_pictures(
     registrar: Registrar, result: Registration, item: ImageItem, side: int
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
-    window, renderer = _close_up(item), registrar.describer.renderer
+    window, renderer = close_up(item.size, item.box.tolist()), registrar.describer.renderer
     scale = side / max(window[2] - window[0], window[3] - window[1])
     close_ups = [draw_window(renderer, h.projection, item.image, window, scale) for h in result.hypotheses]
     sides = side_pictures(registrar, result, item.image, item.box)
@@ -194,13 +184,3 @@ def _small_pictures(
 def _rival(result: Registration, index: int) -> str:
     angle = f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° away"
     return f"{angle} ({result.probabilities[index]:.2f})" if result.probabilities else angle
-
-
-def _close_up(item: ImageItem) -> Window:
-    """A square around the box with a margin, moved into the photograph and cut at its borders."""
-    H, W = item.image.shape[-2:]
-    x0, y0, x1, y1 = item.box.tolist()
-    side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
-    left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
-    top = max(0, min(round(0.5 * (y0 + y1 - side)), H - side))
-    return left, top, min(W, left + side), min(H, top + side)

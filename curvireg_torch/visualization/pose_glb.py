@@ -19,16 +19,14 @@ from ..utils.choices import UNITS
 from .encoding import jpeg, shrink
 from .overlay import to_uint8
 
-__all__ = ["pose_glb", "scene_glb"]
+__all__ = ["mesh_glb", "pose_glb", "scene_glb"]
 
 _PHOTO_SIDE = 1024
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera to glTF's, which has y up and looks along -z
 _MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
 
 
-def pose_glb(
-    mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor, *, photograph: bool = True
-) -> bytes:
+def pose_glb(mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor) -> bytes:
     """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane behind the mesh.
 
     Lengths are metres and y points up, as glTF requires. A glTF camera has no principal point, so the exact camera and
@@ -38,7 +36,6 @@ def pose_glb(
         mesh: from :func:`curvireg_torch.load_mesh`, with its unit in ``mesh.units``.
         T_cam_from_model, camera_matrix: (4, 4), OpenCV camera, in the mesh's unit; (3, 3) px.
         image: (1 or 3, H, W) floating in [0, 1] or uint8.
-        photograph: False leaves the plane out.
 
     Raises:
         InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object behind the camera.
@@ -51,15 +48,18 @@ def pose_glb(
     """
     check_tensor(T_cam_from_model, "T_cam_from_model", (4, 4))
     check_pose(T_cam_from_model, "T_cam_from_model")
-    return scene_glb(mesh, T_cam_from_model, [(torch.eye(4), camera_matrix, image)], photographs=photograph)
+    return scene_glb(mesh, T_cam_from_model, [(torch.eye(4), camera_matrix, image)])
+
+
+def mesh_glb(mesh: trimesh.Trimesh, transform: Tensor) -> bytes:
+    """A GLB file of the mesh alone, moved by a (4, 4) transform to glTF's axes and metres."""
+    scene = trimesh.Scene()
+    scene.add_geometry(_coloured(mesh), transform=transform.numpy())
+    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_make_matt))
 
 
 def scene_glb(
-    mesh: trimesh.Trimesh,
-    T_world_from_model: Tensor,
-    cameras: Sequence[tuple[Tensor, Tensor, Tensor]],
-    *,
-    photographs: bool = True,
+    mesh: trimesh.Trimesh, T_world_from_model: Tensor, cameras: Sequence[tuple[Tensor, Tensor, Tensor]]
 ) -> bytes:
     """:func:`pose_glb` of a pose in the world and of cameras: ``T_cam_from_world``, camera matrix and photograph."""
     T = T_world_from_model.detach().cpu().double()
@@ -78,9 +78,8 @@ def scene_glb(
             raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
         H, W = (int(n) for n in image.shape[-2:])
         world_from_camera = scale @ _FLIP @ np.linalg.inv(P.numpy())
-        if photographs:
-            plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
-            scene.add_geometry(plane, node_name=f"picture {number}", transform=world_from_camera)
+        plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
+        scene.add_geometry(plane, node_name=f"picture {number}", transform=world_from_camera)
         yfov, aspect = 2 * math.atan(H / (2 * float(K[1, 1]))), W * float(K[1, 1]) / (H * float(K[0, 0]))
         lens = {"yfov": yfov, "aspectRatio": aspect, "znear": 0.01 * depth * metres}
         lenses.append({"type": "perspective", "perspective": lens})
@@ -93,16 +92,21 @@ def scene_glb(
         tree["cameras"] = lenses
         tree["scenes"][0]["nodes"] += range(len(tree["nodes"]), len(tree["nodes"]) + len(nodes))
         tree["nodes"] += nodes
-        tree.setdefault("materials", []).append(_MATT)
-        for mesh in tree["meshes"]:
-            for part in mesh["primitives"]:
-                part.setdefault("material", len(tree["materials"]) - 1)
+        _make_matt(tree)
         for material in tree["materials"]:
             if material.get("name") == "picture":  # keeps its brightness
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
     return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=with_cameras))
+
+
+def _make_matt(tree: dict[str, Any]) -> None:
+    """Give a matt material to the parts of a glTF file that have none."""
+    tree.setdefault("materials", []).append(_MATT)
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            part.setdefault("material", len(tree["materials"]) - 1)
 
 
 def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

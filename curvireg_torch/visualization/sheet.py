@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..rendering import DepthRenderer
 from ..utils.files import write_file
-from .contours import draw_window
+from .contours import close_up, draw_window
 from .encoding import jpeg
 
 __all__ = ["SheetEntry", "thumbnail", "write_sheet"]
@@ -36,12 +36,10 @@ figcaption {{ overflow-wrap: anywhere }}
 
 @dataclass(frozen=True)
 class SheetEntry:
-    """A photograph on the page.
+    """A photograph on the page: the number of its row, from 1, its name, and the outcome in words.
 
-    Attributes:
-        number, name, caption: of its row, from 1; of the photograph; the outcome in words.
-        kind: "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red).
-        picture: returns its thumbnail or None; called only for entries that are written.
+    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red); ``picture`` returns its
+    thumbnail or None and is called only for entries that are written.
     """
 
     number: int
@@ -56,13 +54,9 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3) of the photograph.
     """
-    H, W = image.shape[-2:]
-    x0, y0, x1, y1 = box
-    margin = 0.25 * max(x1 - x0, y1 - y0)
-    left, top = max(0, int(x0 - margin)), max(0, int(y0 - margin))
-    right, bottom = min(W, int(x1 + margin) + 1), min(H, int(y1 + margin) + 1)
-    scale = min(1.0, SIDE / max(right - left, bottom - top))
-    return jpeg(draw_window(renderer, projection, image, (left, top, right, bottom), scale, box), 80)
+    window = close_up(image.shape[-2:], box)
+    scale = min(1.0, SIDE / max(window[2] - window[0], window[3] - window[1]))
+    return jpeg(draw_window(renderer, projection, image, window, scale, box), 80)
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:

@@ -1,24 +1,22 @@
 """A video of the poses of a followed object."""
 
-import os
-import secrets
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.result import verdict
 from .contours import draw_window
+from .overlay import VERDICT_COLOURS
 
-__all__ = ["OverlayVideo"]
+__all__ = ["OverlayVideo", "annotated_frame"]
 
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
-_NO_POSE = (255, 90, 80)
-_COLOURS = {"likely": (90, 230, 120), "unsure": (255, 190, 60), "no match": _NO_POSE}
 
 
 class OverlayVideo:
@@ -33,7 +31,6 @@ class OverlayVideo:
 
     Example:
         >>> import tempfile
-        >>> import torch
         >>> import curvireg_torch as cr
         >>> from curvireg_torch.synthetic import example_mesh
         >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
@@ -46,7 +43,6 @@ class OverlayVideo:
 
     def __init__(self, path: Path, registrar: Registrar, *, fps: float) -> None:
         self.path, self.registrar, self.fps = path, registrar, fps
-        self._temporary = path.with_name(f"{path.stem}.{secrets.token_hex(4)}.tmp{path.suffix}")
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
 
@@ -58,20 +54,18 @@ class OverlayVideo:
         if image is None:
             if self._writer is None:
                 return
-            picture = np.zeros((self._size[1], self._size[0], 3), np.uint8)
-        else:
-            picture = draw_frame(self.registrar, image, result)
-            if self._writer is None:
-                self._writer = self._open(picture)
-            if picture.shape[1::-1] != self._size:
-                picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
-        _write_caption(picture, result)
+            image = torch.zeros(3, self._size[1], self._size[0], dtype=torch.uint8)
+        picture = annotated_frame(self.registrar, image, result)
+        if self._writer is None:
+            self._writer = self._open(picture)
+        if picture.shape[1::-1] != self._size:
+            picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
         self._writer.write(picture[..., ::-1])
 
     def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
         self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # the codec needs even numbers
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        writer = cv2.VideoWriter(str(self._temporary), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
+        writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
         if not writer.isOpened():
             warnings.warn("this OpenCV has no MPEG-4 encoder; no overlay is written", stacklevel=3)
         return writer
@@ -80,8 +74,6 @@ class OverlayVideo:
         """Finish the file. Nothing is written if there was no frame."""
         if self._writer is not None:
             self._writer.release()
-        if self._temporary.exists():
-            os.replace(self._temporary, self.path)
 
     def __enter__(self) -> "OverlayVideo":
         return self
@@ -90,27 +82,25 @@ class OverlayVideo:
         self.close()
 
 
-def draw_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
-    """(H, W, 3) uint8 of the image, of at most 960 px, with the contours of the mesh if there is a pose."""
+def annotated_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
+    """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose, and a caption."""
     H, W = image.shape[-2:]
     found = isinstance(result, Registration)
     renderer = registrar.of_model(result.model if found else 0).describer.renderer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
-    return draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
+    picture = draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
+    text, colour = caption(result)
+    scale = max(0.4, picture.shape[1] / 1200)
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), colour, cv2.FILLED)
+    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
 
 
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
-        return "lost" if isinstance(result.error, LostObjectError) else "failed", _NO_POSE
+        return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS["no match"]
     word = verdict(result.confidence, result.none, result.reliable)
     number = "" if result.confidence is None else f", confidence {result.confidence:.2f}"
-    return word + number, _COLOURS[word]
-
-
-def _write_caption(picture: np.ndarray, result: Registration | FailedRegistration) -> None:
-    text, colour = caption(result)
-    scale = max(0.4, picture.shape[1] / 1200)
-    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), (0, 0, 0), cv2.FILLED)
-    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+    return word + number, VERDICT_COLOURS[word]

@@ -133,7 +133,7 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
     ("words", "source", "message"),
     [
         (["--out", "OUT"], "shots", "give --camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov"),
-        (["--camera", *CAMERA], "shots", "give --out DIR, or --json"),
+        (["--camera", *CAMERA], "shots", "give --out DIR, --show or --json"),
         (["--camera", *CAMERA, "--out", "OUT"], "nowhere.mp4", "nowhere.mp4: no such folder or video; or give the"),
         (["--camera", *CAMERA, "--out", "OUT"], "99", "99: no such camera"),
         (["--camera", *CAMERA, "--out", "OUT"], "rtsp://127.0.0.1:9/none", "the stream cannot be opened"),

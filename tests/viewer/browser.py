@@ -46,16 +46,8 @@ class Browser:
         options.add_experimental_option("prefs", {"download.default_directory": str(folder / "downloads")})
         self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(PROGRAMS[1]))
         self.folder = folder
-        self.open(address)
-
-    def open(self, address):
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
-
-    @property
-    def page(self):
-        """The name of the page in its address."""
-        return self.driver.current_url.rsplit("/", 1)[1]
 
     def part(self, name):
         return self.driver.find_element("css selector", f'[data-testid="{name}"]')

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -72,8 +73,9 @@ def registered(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CURVIREG_CACHE", str(folder / "cache"))
         session = new_session("--pipeline", str(folder / "small.json"))
-        session.open_photo(folder / "photo.png", "my photo.png")
+        shutil.copy(folder / "photo.png", folder / "my photo.png")
+        session.open_photo(folder / "my photo.png").set_box(tuple(round(v, 1) for v in box))
         session.open_mesh(folder / "truck.ply")
-        session.box, session.camera = tuple(round(v, 1) for v in box), (260.0, 260.0, 119.5, 89.5)
+        session.set_camera((260.0, 260.0, 119.5, 89.5))
         session.register()
         yield session, folder, T

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from curvireg_torch.visualization.contours import close_up
 from tests.viewer.browser import MISSING
 from tests.viewer.test_session import run_command
 
@@ -17,12 +18,12 @@ pytestmark = [
 ]
 
 
-def test_uploads_that_are_too_large_or_have_no_length_are_refused_before_they_are_read(address, browser):
+def test_uploads_that_are_too_large_or_have_no_length_are_refused_before_they_are_read(address):
     host, port = re.search(r"//([\d.]+):(\d+)/", address).groups()
     token = address.rstrip("/").rsplit("/", 1)[1]
     for headers in ({"Content-Length": str(1 << 40)}, {"Transfer-Encoding": "chunked"}):
         connection = http.client.HTTPConnection(host, int(port))
-        connection.putrequest("POST", f"/{token}/{browser.page}/upload")
+        connection.putrequest("POST", f"/{token}/upload")
         for name, value in headers.items():
             connection.putheader(name, value)
         connection.endheaders()
@@ -36,11 +37,11 @@ def test_page_from_upload_to_download(browser, folder):
     browser.unfold("camera")
     browser.unfold("command-line")
     assert browser.text("camera-facts").startswith("unknown")
-    browser.part("fov").send_keys("65")
+    browser.part("camera").send_keys("65")
     browser.wait(lambda: browser.text("camera-facts").startswith("guessed from the field of view"), "field of view")
     browser.wait(lambda: "--fov 65" in browser.text("command"), "command")
     browser.click("exif")
-    browser.wait(lambda: browser.text("fov") == "", "field of view cleared")
+    browser.wait(lambda: browser.text("camera") == "", "field of view cleared")
     caption = "guessed from the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
     browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
     assert browser.part("register").get_attribute("disabled")
@@ -89,11 +90,10 @@ def test_page_shows_the_result(browser, folder):
     browser.part("mesh").click()  # in the middle
     browser.wait(lambda: 0.45 < float(layer.value_of_css_property("opacity")) < 0.55, "opacity", 20)
     images = browser.wait(lambda: browser.part("panel-answer").find_elements("css selector", "img"), "cards")
-    x0, y0, x1, y1 = json.loads((folder / "box.json").read_text())
-    margin = 0.25 * max(x1 - x0, y1 - y0)
-    width = min(240, int(x1 + margin) + 1) - max(0, int(x0 - margin))  # the box with a margin
+    left, _, right, _ = close_up((180, 240), json.loads((folder / "box.json").read_text()))
     browser.wait(
-        lambda: [int(x.get_attribute("naturalWidth")) for x in images] == pytest.approx([width] * 2, abs=2), "two"
+        lambda: [int(x.get_attribute("naturalWidth")) for x in images] == pytest.approx([right - left] * 2, abs=2),
+        "two",
     )
 
 
@@ -152,6 +152,16 @@ def test_the_pose_is_corrected_on_the_photograph(browser, folder):
     browser.click("answer-1")
     browser.wait(lambda: "moved" not in browser.text("facts"), "as it was found")
     assert saved(browser)["rotation"] == before["rotation"]
+
+
+def test_another_photograph_has_its_own_answer(browser, folder):
+    before = saved(browser)
+    browser.drop(folder / "photo.png")
+    browser.wait(lambda: not browser.part("answers").is_displayed(), "no answer yet")
+    browser.click("photograph-1")
+    browser.wait(lambda: browser.part("answers").is_displayed(), "its answer again")
+    assert saved(browser) == before
+    assert browser.part("mode-pose").get_attribute("aria-pressed") == "true"
 
 
 def scroll(browser, element, amount):

@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.synthetic import demo_scene, example_mesh
+from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
 from tests.viewer.test_browser import scroll
 
@@ -14,6 +15,14 @@ pytestmark = [
     pytest.mark.browser,
     pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def _own_screen(browser):
+    """A test that fails leaves no small screen, and none begins scrolled down."""
+    yield
+    browser.emulate(0, 0)
+    browser.driver.execute_script("scrollTo(0, 0)")
 
 
 def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
@@ -31,6 +40,7 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
     from selenium.webdriver import ActionChains
 
+    browser.emulate(1440, 900)
     browser.unfold("command-line")
     canvas = browser.wait(lambda: browser.part("preview").find_element("css selector", "canvas"), "the model")
     labels = """
@@ -83,6 +93,7 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
 
 
 def test_contours_follow_the_mesh_that_is_dragged(browser):
+    browser.emulate(1440, 900)
     before = browser.text("facts")
 
     def follows():
@@ -100,7 +111,6 @@ def test_dark_colours_follow_the_system(browser):
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
     browser.picture("viewer-dark")
-    browser.emulate(0, 0)
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
@@ -115,7 +125,6 @@ def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
         browser.wait(lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5)
     assert browser.driver.execute_script("return scrollY") > 300
     assert viewport.rect["width"] > 0.5 * size[0]
-    browser.emulate(0, 0)
 
 
 def test_a_small_screen_stacks_everything(browser):
@@ -129,7 +138,6 @@ def test_a_small_screen_stacks_everything(browser):
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
     browser.picture("viewer-phone")
-    browser.emulate(0, 0)
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
@@ -193,7 +201,6 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
     browser.emulate(1440, 900)
     browser.picture("viewer-mistakes")
-    browser.emulate(0, 0)
     browser.drop(folder / "photo.png")
     browser.wait(lambda: browser.text("message-photograph") == "", "gone")
     mesh = example_mesh()
@@ -204,3 +211,46 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.click("use-mm")
     browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
     browser.wait(lambda: browser.messages() == [], "all gone")
+
+
+def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(browser, folder):
+    scenes = {f"table-{seed}.png": demo_scene(seed) for seed in (4, 5)}
+    for name, scene in scenes.items():
+        (folder / name).write_bytes(png(to_uint8(scene.image)))
+    scene.mesh.apply_scale(1000.0)  # the page still has the unit mm
+    scene.mesh.export(folder / "table.ply")
+    browser.drop(*map(folder.joinpath, [*scenes, "table.ply"]))
+    browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "all")
+    x0, y0, x1, y1 = scene.box.tolist()
+    browser.drag((x0, y0), (x1, y1), 960)
+    browser.wait(lambda: browser.box() == pytest.approx([x0, y0, x1, y1], abs=2), "its box")
+    thumbnails = browser.part("strip").find_elements("css selector", "img")
+    assert [image.get_attribute("alt") for image in thumbnails][-2:] == list(scenes)
+    for number, is_there in ((len(thumbnails) - 1, False), (len(thumbnails), True)):
+        browser.click(f"photograph-{number}")
+        browser.wait(lambda is_there=is_there: (browser.box() is not None) == is_there, f"box of {number}")
+
+    def count():
+        return len(browser.part("strip").find_elements("css selector", "img"))
+
+    for left in range(len(thumbnails) - 1, 1, -1):  # those of the tests before
+        browser.click("photograph-1")
+        browser.wait(lambda: browser.part("photograph-1").get_attribute("aria-pressed") == "true", "the first")
+        browser.click("no-photo")
+        browser.wait(lambda n=left: count() == n, f"{left} left")
+    browser.click("photograph-2")
+    browser.wait(lambda: browser.box() is not None, "the last one")
+    browser.emulate(1440, 900)
+    browser.picture("viewer-strip")
+    (folder / "cam.yaml").write_text(
+        "%YAML:1.0\n---\nimage_width: 960\nimage_height: 720\n"
+        "camera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n"
+        "  data: [1000., 0., 479.5, 0., 1000., 359.5, 0., 0., 1.]\n"
+        "distortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n  dt: d\n  data: [-0.3, 0.1, 0., 0., 0.]\n"
+    )
+    browser.drop(folder / "cam.yaml")
+    browser.wait(lambda: browser.text("photograph-facts").endswith("; undistorted"), "undistorted")
+    browser.unfold("camera")
+    browser.wait(lambda: browser.text("camera-facts") == "from a calibration file, without its distortion", "facts")
+    browser.click("no-photo")
+    browser.wait(lambda: not browser.part("strip").is_displayed(), "one photograph needs no strip")

@@ -1,6 +1,7 @@
 """The photograph, the steps and the fields of the page, without a browser."""
 
 import asyncio
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,10 +12,10 @@ from nicegui.client import Client
 from nicegui.page import page
 
 from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.geometry import Camera
 from curvireg_torch.viewer.page import Steps
-from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.side import Answers, Inputs, Preview
-from curvireg_torch.viewer.stage import Stage, contour_paths
+from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
 from tests.viewer.test_session import write_scene
 
@@ -22,9 +23,8 @@ from tests.viewer.test_session import write_scene
 @pytest.fixture
 def workspace(tmp_path):
     write_scene(tmp_path)
-    options = RegisterOptions(limits={"front": "-x", "theta": (-10.0, 10.0)})
-    workspace = Workspace(Session(options), tmp_path / "page", asyncio.Semaphore(1))
-    asyncio.run(workspace.open_photo(tmp_path / "photo.png", "photo.png"))  # 240 x 180 px
+    workspace = Workspace(RegisterOptions(limits={"front": "-x", "theta": (-10.0, 10.0)}), tmp_path)
+    asyncio.run(workspace.open_photo(tmp_path / "photo.png"))  # 240 x 180 px
     return workspace
 
 
@@ -45,193 +45,176 @@ def drag(stage, start, end):
 
 
 def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
-    session, stage = workspace.session, build(Stage)
+    shot, stage = workspace.session.shot, build(Stage)
     drag(stage, (20, 30), (120, 90))
-    assert session.box == pytest.approx((20, 30, 120, 90))
+    assert shot.box == pytest.approx((20, 30, 120, 90))
     drag(stage, (122, 60), (150, 60))  # the right edge, which is near enough
-    assert session.box == pytest.approx((20, 30, 150, 90))
-    send(stage, "nudge", dx=-1, dy=0, shift=True, alt=False)
-    assert session.box == pytest.approx((10, 30, 140, 90))
-    send(stage, "nudge", dx=0, dy=1, shift=False, alt=True)
-    assert session.box == pytest.approx((10, 30, 140, 91))
-    send(stage, "undo")
-    assert session.box == pytest.approx((10, 30, 140, 90))
+    assert shot.box == pytest.approx((20, 30, 150, 90))
+    send(stage, "nudge", dx=-1, dy=0, shift=True)
+    assert shot.box == pytest.approx((10, 30, 140, 90))
+    for box in ((20, 30, 150, 90), (10, 30, 140, 90)):
+        send(stage, "undo")  # the second one repeats it
+        assert shot.box == pytest.approx(box)
     for kind in ("press", "move", "cancel", "release"):
         send(stage, kind, 0.9, 0.9)
-    assert session.box == pytest.approx((10, 30, 140, 90))
+    assert shot.box == pytest.approx((10, 30, 140, 90))
     assert stage.shapes.content.count("<rect") == 2
     assert "viewBox='-0.5 -0.5 240 180'" in stage.shapes.content
     send(stage, "remove")
-    assert session.box is None
+    assert shot.box is None
     assert "<rect" not in stage.shapes.content
 
 
-def test_steps_tick_off_and_say_what_is_missing(workspace, build):
+def test_messages_are_text_and_not_html(workspace, build):
     steps = build(Steps)
-
-    def done():
-        steps.refresh()
-        return [name for name, card in steps.cards.items() if "done" in card.classes]
-
-    assert done() == ["photograph"]
-    assert steps.facts["photograph"].content == "photo.png: 240 x 180 px"
-    assert "disabled" in steps.find.props
-    asyncio.run(workspace.open_mesh(workspace.folder.parent / "truck.ply", "truck.ply"))
     workspace.messages["mesh"] = "a.ply: <b>empty</b>"
-    assert done() == ["photograph", "mesh"]
-    assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;", "text, not HTML"
-    assert "disabled" not in steps.find.props
-    assert steps.find.content == "Find the object and its pose"
-    workspace.session.box = (10.0, 20.0, 60.0, 70.0)
-    assert done() == ["photograph", "mesh", "box"]
-    assert steps.find.content == "Find the pose"
+    steps.refresh()
+    assert steps.messages["mesh"].content == "a.ply: &lt;b&gt;empty&lt;/b&gt;"
+    assert "disabled" in steps.find.props
 
 
 def test_typed_numbers_go_into_the_session(workspace, build):
     inputs, session = build(Inputs), workspace.session
-    inputs.camera[0].set_value(300)
-    assert session.camera is None, "not before all four are there"
-    for number, value in zip(inputs.camera[1:], (300, 119.5, 89.5), strict=True):
-        number.set_value(value)
-    assert session.camera == (300, 300, 119.5, 89.5)
+
+    def typed(words):
+        inputs.camera.set_value(words)
+        asyncio.run(inputs._typed())
+        inputs.refresh()
+        return session.options.camera, session.options.guess
+
+    for words in ("300 300 119.5", "3e", "300"):
+        assert typed(words) == (None, None), "not before it is complete"
+    assert typed("300, 300, 119.5 89.123456789") == ((300, 300, 119.5, 89.123456789), None)
+    assert typed("65.5") == (None, 65.5)
+    assert typed("") == (None, None)
+    asyncio.run(inputs._set_camera(guess="exif"))
     inputs.refresh()
-    inputs.fov.set_value(65)
-    assert (session.camera, session.guess) == (None, 65)
+    assert inputs.camera_facts.content.endswith("has no focal length: no covariance")
+    session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2), guess=None)
     inputs.refresh()
-    assert [number.value for number in inputs.camera] == [None] * 4
-    inputs._set_camera(guess="exif")
+    assert inputs.camera.value == "300 300 119.5 0.30000000000000004"
+    asyncio.run(inputs._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0))))
     inputs.refresh()
-    assert inputs.fov.value is None
-    assert inputs.camera_facts.content.endswith("which has no focal length")
+    assert inputs.camera_facts.content == "from a calibration file, without its distortion"
+    assert isinstance(typed(inputs.camera.value)[0], Camera), "what is shown is not typed"
+    assert inputs.command.content.startswith("None: ")
 
 
-def test_two_windows_do_not_overwrite_each_others_hints(workspace, build):
-    """One window gives the camera and the front, the other the hint: all hold, and both show them."""
-    session = workspace.session
-    asyncio.run(workspace.open_mesh(workspace.folder.parent / "truck.ply", "truck.ply"))
-    one, other = build(Inputs), build(Inputs)
-    previews = [build(Preview), build(Preview)]
-    for number, value in zip(one.camera, (300, 300, 119.5, 89.5), strict=True):
-        number.set_value(value)
+def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(workspace, build):
+    session, previews = workspace.session, [build(Preview), build(Preview)]
+    asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
+
+    def click(mark, *point):
+        previews[0].mark = mark
+        hit = SimpleNamespace(**dict(zip("xyz", point, strict=True)))
+        asyncio.run(previews[0]._clicked(SimpleNamespace(hits=[hit])))
+        return session.options.up, session.options.limits.get("front")
+
+    assert click("", 0, 0.9, 0) == (None, "-x")
+    assert click("front", 0.1, -0.9, 0.2) == (None, session.mesh_axis((0.0, -1.0, 0.0)))
     session.hint_direction((3.0, 0.0, 0.0))
-    previews[1].mark = "front"
-    hit = SimpleNamespace(x=0.1, y=-0.9, z=0.2)
-    asyncio.run(previews[1]._clicked(SimpleNamespace(hits=[hit])))
-    for part in (one, other):
-        part.refresh()
-        assert [number.value for number in part.camera] == [300, 300, 119.5, 89.5]
     for preview in previews:
         asyncio.run(preview.refresh())
         assert preview.facts.content == "Hint: seen from azimuth 90, elevation 0, within 45 degrees."
     assert "--near 90 0 0 --within 45" in session.command()
-    assert session.options.limits["front"] == session.mesh_axis((0.0, -1.0, 0.0))
     session.remove_limits()
     assert "--near" not in session.command()
-
-
-def test_a_click_marks_what_is_up(workspace, build):
-    session, preview = workspace.session, build(Preview)
     session.set_limits(front=None)
-    asyncio.run(workspace.open_mesh(workspace.folder.parent / "truck.ply", "truck.ply"))
-    for mark, point, up in (("", (0, 0.9, 0), None), ("up", (0.1, 0.9, 0.2), "y"), ("up", (0, 0, -1.0), "-y")):
-        preview.mark = mark
-        asyncio.run(preview._clicked(SimpleNamespace(hits=[SimpleNamespace(**dict(zip("xyz", point, strict=True)))])))
-        assert session.options.up == up
+    assert click("up", 0.1, 0.9, 0.2) == ("y", None)
+    assert click("up", 0, 0, -1.0) == ("-y", None)
     assert session.mesh.metadata["up"] == "-y"
-    preview.mark = "front"
-    asyncio.run(preview._clicked(SimpleNamespace(hits=[SimpleNamespace(x=0.0, y=0.0, z=1.0)])))
-    assert "front" not in session.options.limits, "what is up is not the front"
+    assert click("front", 0, 0, 1.0) == ("-y", None), "what is up is not the front"
 
 
-def test_each_remark_has_its_repair(registered, tmp_path, monkeypatch):
-    session, started = registered[0], []
+@pytest.fixture
+def shown(registered, tmp_path):
+    """The page of a session with a result, which is restored afterwards."""
+    session = registered[0]
+    workspace = Workspace(session.options, tmp_path)
+    workspace.session = session
+    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
+    shot.choose(0)
     with Client(page(""), request=None):
-        answers = Answers(Workspace(session, tmp_path / "page", asyncio.Semaphore(1)))
-    monkeypatch.setattr(answers.workspace, "start_search", lambda: started.append((session.box, session.guess)))
-    plain = {**session.document(), "corrected_box": None}
+        yield workspace
+    vars(shot).update(kept)
+    session.options, session.shots, session.shot = options, [shot], shot
+
+
+def test_each_remark_has_its_repair(shown, monkeypatch):
+    session, started = shown.session, []
+    shot, answers = session.shot, Answers(shown)
+    monkeypatch.setattr(shown, "start_search", lambda: started.append((shot.box, session.options.guess)))
+    plain, before = {**session.document(), "corrected_box": None}, shot.box
     assert answers._repairs(plain, "likely") == {}
     hint = {**plain, "prior": {"contradiction": "better outside"}, "corrected_box": [1.04, 2, 30, 40]}
-    before = session.box, session.camera, session.options
     session.set_limits(elevation=(0.0, 10.0))
     repairs = answers._repairs(hint, "no match")
     assert list(repairs) == ["Search without the hint", "Search with that box", "Draw the box again"]
     for repair in repairs.values():
         repair()
     assert session.options.limits == {}
-    assert started == [(before[0], None), ((1.0, 2, 30, 40), None)]
-    assert session.box is None
+    assert started == [(before, None), ((1.0, 2, 30, 40), None)]
+    assert (shot.box, shot.box_before) == (None, (1.0, 2, 30, 40))
     monkeypatch.setattr(type(session), "has_exif", True)
-    session.camera = None
+    session.options = replace(session.options, camera=None)
     answers._repairs(plain, "likely")["Search with the photograph's EXIF camera"]()
     assert started[-1] == (None, "exif")
-    session.box, session.camera, session.options, session.guess = *before, None
 
 
-@pytest.fixture
-def posed(registered, tmp_path):
-    """A stage that shows the first answer of a session."""
-    session = registered[0]
-    session.choose(0)
-    with Client(page(""), request=None):
-        stage = Stage(Workspace(session, tmp_path / "page", asyncio.Semaphore(1)))
-        asyncio.run(stage.refresh())
-        yield stage
-
-
-def test_the_pose_is_dragged_on_the_photograph(posed):
-    session = posed.session
+def test_the_pose_is_dragged_on_the_photograph(shown):
+    shot, posed = shown.session.shot, Stage(shown)
+    asyncio.run(posed.refresh())
     assert posed.mode == "pose"
-    T, K = session.answer.pose.projection
-    describer = session.result.registrar.describer
+    T, K = shot.answer.pose.projection
+    describer = shot.result.registrar.describer
 
     def centre():
-        at = K @ (session.answer.pose.projection[0] @ torch_point(describer.centre))[:3]
+        T = shot.answer.pose.projection[0]
+        at = K @ (T[:3, :3] @ describer.centre + T[:3, 3])
         return (at[:2] / at[2]).tolist()
 
     x, y = centre()
     drag(posed, (x, y), (x + 20, y + 10))
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
-    assert session.answer.pose.projection[0][:3, :3].tolist() == T[:3, :3].tolist()
+    assert shot.answer.pose.projection[0][:3, :3].tolist() == T[:3, :3].tolist()
     asyncio.run(posed.refresh())
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
-    assert len(session.answer.edits) == 2
+    assert len(shot.answer.edits) == 2
     send(posed, "undo")
-    assert len(session.answer.edits) == 1
+    assert len(shot.answer.edits) == 1
     for kind, values in (
         ("scale", {"factor": 1.1, "roll": 5.0}),
-        ("nudge", {"dx": 1, "dy": 0, "shift": True, "alt": False}),
+        ("nudge", {"dx": 1, "dy": 0, "shift": True}),
     ):
         send(posed, kind, **values)
-    assert len(session.answer.edits) == 1, "one change, when it rests"
+    assert len(shot.answer.edits) == 1, "one change, when it rests"
     posed._last_gesture -= 10
     asyncio.run(posed.refresh())
-    assert len(session.answer.edits) == 2
+    assert len(shot.answer.edits) == 2
     send(posed, "scale", factor=1e6, roll=0.0)  # it would touch the camera
-    assert not posed._commit()
+    assert posed.moved is None
     posed._set_mode("box")
     asyncio.run(posed.refresh())
     assert "class='handle line'" in posed.shapes.content
 
 
-def torch_point(centre):
-    import torch
-
-    return torch.cat([centre, torch.ones(1, dtype=centre.dtype)])
-
-
-def test_contours_are_followed_at_their_place(registered):
-    import re
-
-    import numpy as np
-
-    session = registered[0]
-    result, (T, K) = session.result, session.result.registration.projection
-    paths = contour_paths(result.registrar, T, K)
-    ends = np.array([float(v) for v in re.findall(r"[-\d.]+", paths.split("class='rim'/>")[2].split("class=")[0])])
-    ends = ends.reshape(-1, 2)
-    depth = result.registrar.describer.renderer.render(T[None], K, (180, 240))[0, 0].numpy() > 0
-    rows, columns = np.nonzero(depth)
-    assert len(ends) > 200
-    box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    assert [*ends.min(axis=0), *ends.max(axis=0)] == pytest.approx(box, abs=2.5)  # half a dash is 1.1 px
+def test_photographs_are_chosen_from_a_strip(shown, registered):
+    session, stage = shown.session, Stage(shown)
+    asyncio.run(stage.refresh())
+    assert stage.strip.default_slot.children == []
+    first, second = session.shot, session.open_photo(registered[1] / "photo.png")
+    asyncio.run(stage.refresh())
+    assert (stage.mode, stage.layers.visible) == ("box", False)
+    one, other = stage.strip.default_slot.children
+    assert (one.props["aria-pressed"], other.props["aria-pressed"]) == ("false", "true")
+    assert ("done" in one.classes, "done" in other.classes) == (True, False)
+    drag(stage, (20, 30), (120, 90))
+    stage._select(0)
+    asyncio.run(stage.refresh())
+    assert (session.shot, stage.mode, stage.layers.visible) == (first, "pose", True)
+    assert second.box == pytest.approx((20, 30, 120, 90))
+    session.shot = second
+    shown.remove_photo()
+    asyncio.run(stage.refresh())
+    assert stage.strip.default_slot.children == []

@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -15,14 +14,14 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.errors import BankError, CurviregError, CurviregWarning, ImageError, InvalidInputError, MeshError
-from curvireg_torch.evaluation.opening import read_start
+from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
+from curvireg_torch.evaluation.opening import RegisterOptions, read_start
 from curvireg_torch.evaluation.store import to_json
-from curvireg_torch.geometry import rotation_error
-from curvireg_torch.geometry.calibration import Camera
+from curvireg_torch.geometry import Camera, rotation_error, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.viewer.session import Answer, Session
+from curvireg_torch.viewer import session as module
+from curvireg_torch.viewer.session import Answer, Session, dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -65,18 +64,17 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def session(registered):
-    """The session at its first hypothesis; its camera is restored afterwards."""
+    """The session at its first hypothesis; its options and its result are restored afterwards."""
     session = registered[0]
-    session.choose(0)
-    camera = session.camera
+    session.shot.choose(0)
+    options, result = session.options, session.shot.result
     yield session
-    session.camera, session.guess = camera, None
+    session.options, session.shot.result = options, result
 
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
     _, folder, truth = registered
-    assert session.command().startswith(f"curvireg register 'my photo.png' {folder / 'truck.ply'} ")
-    (folder / "my photo.png").write_bytes((folder / "photo.png").read_bytes())
+    assert session.command().startswith(f"curvireg register '{folder}/my photo.png' {folder / 'truck.ply'} ")
     written = run_command(folder, session.command())
     document = json.loads(to_json(session.document()))
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
@@ -87,8 +85,8 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
 
 
 def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
-    found, first = session.result.registration, session.document()
-    session.choose(1)
+    found, first = session.shot.result.registration, session.document()
+    session.shot.choose(1)
     document = json.loads(to_json(session.document()))
     assert document["rotation"] == first["top"][1]["rotation"]
     assert document["translation"] == first["top"][1]["translation"]
@@ -97,36 +95,36 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     assert document["viewer"]["hypothesis"] == 1
     # A pipeline that was calibrated has probabilities; each answer has its own.
     calibrated = replace(found, probabilities=(0.95, 0.03))
-    session.result = replace(session.result, registration=calibrated)
+    session.shot.result = replace(session.shot.result, registration=calibrated)
     assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
     assert session.document()["probabilities"] == [0.03, 0.95]
     assert session.document()["none"] == pytest.approx(0.02)
     assert session.document()["covariance"] is None
-    session.choose(0)
+    session.shot.choose(0)
     assert Answer(found.hypotheses[0]).registration(calibrated) is calibrated
-    session.result = replace(session.result, registration=found)
+    session.shot.result = replace(session.shot.result, registration=found)
     # The file is a start for the command line, and picture and scene show the same pose.
     folder = registered[1]
-    session.choose(1)
+    session.shot.choose(1)
     (folder / "chosen.json").write_text(to_json(session.document()))
     start, confidence = read_start(folder / "chosen.json")
-    assert start == tuple(map(tuple, session.answer.pose.transform.tolist()))
+    assert start == tuple(map(tuple, session.shot.answer.pose.transform.tolist()))
     assert confidence is None
-    scene = trimesh.load(io.BytesIO(session.glb()), file_type="glb")
+    scene = trimesh.load(io.BytesIO(session.shot.glb()), file_type="glb")
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.allclose(flip @ scene.graph["object"][0], session.answer.pose.transform, atol=1e-5)
-    overlays = [session.overlay()]
-    session.choose(0)
-    assert session.overlay() != overlays[0]
+    assert np.allclose(flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5)
+    overlays = [session.shot.overlay()]
+    session.shot.choose(0)
+    assert session.shot.overlay() != overlays[0]
 
 
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
-    before, describer = session.answer.pose, session.result.registrar.describer
+    before, describer = session.shot.answer.pose, session.shot.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    assert session.answer_before is None
-    moved = session.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
-    session.place(moved)
-    pose = session.answer.pose
+    assert session.shot.answer_before is None
+    moved = session.shot.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
+    session.shot.place(moved)
+    pose = session.shot.answer.pose
     assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
     torch.testing.assert_close(shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
@@ -137,188 +135,230 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
         assert document[name] is None, name
     assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (False, [], {})
     assert document["viewer"]["by_hand"] == ["moved: rotated 6.0 degrees, shifted 0.05 radii"]
-    session.fit()
-    fitted = session.answer
+    session.shot.fit()
+    fitted = session.shot.answer
     assert fitted.edits[1].startswith("contours fitted, edge support ")
     assert float(rotation_error(fitted.pose.rotation, before.rotation)) < 1.5
     assert float((fitted.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
     for answer in (pose, fitted.pose):  # one step back, and again
-        session.undo()
-        assert session.answer.pose is answer
-    session.choose(1)
-    assert (session.answer.edits, session.answer_before) == ((), None)
+        session.shot.undo()
+        assert session.shot.answer.pose is answer
+    session.shot.choose(1)
+    assert (session.shot.answer.edits, session.shot.answer_before) == ((), None)
     with pytest.raises(InvalidInputError, match="touch the camera"):
-        session.result.moved(moved, translation=(0, 0, -100))
+        session.shot.result.moved(moved, translation=(0, 0, -100))
 
 
 def test_the_python_program_gives_the_same_numbers(session, registered):
-    session.choose(1)
-    (registered[1] / "my photo.png").write_bytes((registered[1] / "photo.png").read_bytes())
+    session.shot.choose(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(registered[1])
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
         names: dict = {}
         exec(session.python(), names)
     found = {name: torch.tensor(names["pose"][name], dtype=torch.float64) for name in ("rotation", "translation")}
-    assert float(rotation_error(found["rotation"], session.answer.pose.rotation)) < 0.1
-    assert torch.allclose(found["translation"], session.answer.pose.translation, rtol=1e-3)
-    session.place(session.result.moved(session.answer.pose.projection[0], rotation=(0, 6, 0)))
-    assert f"'rotation': {session.answer.pose.rotation.tolist()}" in session.python()
+    assert float(rotation_error(found["rotation"], session.shot.answer.pose.rotation)) < 0.1
+    assert torch.allclose(found["translation"], session.shot.answer.pose.translation, rtol=1e-3)
+    session.shot.place(session.shot.result.moved(session.shot.answer.pose.projection[0], rotation=(0, 6, 0)))
+    assert f"'rotation': {session.shot.answer.pose.rotation.tolist()}" in session.python()
 
 
 def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
-    session.camera = None
+    registrar = session.shot.result.registrar
+    session.set_camera()
     session.register()
-    before, T = session.answer.pose, session.answer.pose.projection[0]
-    session.place(session.result.moved(T, rotation=(0, 0, 5)))
-    pose = session.answer.pose
+    assert session.shot.result.registrar is registrar, "the views are not rendered again"
+    before, T = session.shot.answer.pose, session.shot.answer.pose.projection[0]
+    session.shot.place(session.shot.result.moved(T, rotation=(0, 0, 5)))
+    pose = session.shot.answer.pose
     assert pose.translation is None
     assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(5, abs=1e-3)
     # A translation keeps the rotation of the projection and changes the allocentric one.
-    session.place(session.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
-    assert torch.equal(session.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
-    assert 0.1 < float(rotation_error(session.answer.pose.rotation, pose.rotation)) < 5
+    session.shot.place(session.shot.result.moved(pose.projection[0], translation=(0.1, 0, 0)))
+    assert torch.equal(session.shot.answer.pose.projection[0][:3, :3], pose.projection[0][:3, :3])
+    assert 0.1 < float(rotation_error(session.shot.answer.pose.rotation, pose.rotation)) < 5
     assert session.document()["translation"] is None
 
 
-def test_register_with_a_field_of_view(session):
-    camera, session.camera = session.camera, None
-    session.guess = 2 * math.degrees(math.atan(120 / 260))
-    session.register()
-    document = session.document()
-    assert document["inputs"]["camera_source"] == "fov"
-    assert document["inputs"]["camera"] == pytest.approx(camera)
-    assert document["translation"] is not None
-    assert document["covariance"] is None
-
-
 def test_messages_use_the_names_of_the_user(folder):
-    session = new_session()
-    (folder / "upload-1").write_text("not a picture")
-    with pytest.raises(ImageError, match=r"^cat\.jpg: "):
-        session.open_photo(folder / "upload-1", "cat.jpg")
-    for suffix, error in ((".obj", MeshError), (".safetensors", BankError)):
-        (folder / f"upload-2{suffix}").write_text("")
-        with pytest.raises(error, match=rf"^cat{suffix}: ") as caught:
-            session.open_mesh(folder / f"upload-2{suffix}", f"cat{suffix}")
-        assert str(folder) not in str(caught.value)
-    assert session.photo_path is session.mesh_path is None
-    warnings = CurviregWarning("large", subject=folder / "upload-2.obj"), UserWarning("plain")
+    session = Session(RegisterOptions(), folder)
+    assert [session.name(path) for path in (folder / "cat.obj", "other/cat.obj", "")] == [
+        "cat.obj",
+        "other/cat.obj",
+        "",
+    ]
+    warnings = CurviregWarning("large", subject=folder / "cat.obj"), UserWarning("plain")
     assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
         session.register()
     with pytest.raises(InvalidInputError, match="register first"):
-        session.fit()
+        session.shot.fit()
 
 
-def test_open_mesh_describes_the_mesh(folder):
-    mesh = example_mesh()
-    mesh.export(folder / "grey.ply")
-    mesh.visual.face_colors = [200, 20, 20, 255]
-    mesh.export(folder / "red.ply")
-    assert new_session().open_mesh(folder / "grey.ply").endswith(" m, rendered in grey")
-    assert new_session().open_mesh(folder / "red.ply").endswith(" m, rendered in its colours")
+def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
+    session, folder, _ = registered
+    first = session.shot
+    second = session.open_photo(folder / "photo.png")
+    assert session.shot is second
+    assert (second.box, second.result) == (None, None)
+    second.set_box((10.0, 20.0, 90.0, 80.0))
+    session.shot = first
+    assert session.request() == first.result.request
+    assert second.box == (10.0, 20.0, 90.0, 80.0)
+    monkeypatch.setattr(module, "MAX_VIEWER_PHOTOGRAPHS", 2)
+    with pytest.raises(InvalidInputError, match="2 photographs are open"):
+        session.open_photo(folder / "photo.png")
+    session.shot = second
+    session.remove_photo()
+    assert (session.shots, session.shot) == ([first], first)
 
 
-def test_a_photograph_replaces_box_and_camera_of_the_former_one_unless_it_is_damaged(folder):
-    session = new_session("--fov", "65")
+def test_distortion_is_removed_from_all_photographs(folder):
+    K = torch.tensor([[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]])
+    session = new_session("photo.png", "truck.ply", "--pipeline", "small.json")  # 240 x 180 px
+    session.set_camera(Camera(K, size=(360, 480)))
     session.load()
+    plain = session.shot.photo
+    assert session.request().camera == pytest.approx((250, 250, 119.5, 89.5))
+    assert plain.notes == ()
+    assert "--camera 250 250 119.5 89.5" in session.command()
+    session.shot.set_box((10.0, 20.0, 90.0, 80.0))
+    camera, box = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480)), ["--box", "10", "20", "90", "80"]
+    (folder / "cam.json").write_text(json.dumps({"K": K.tolist(), "D": camera.distortion, "image_size": [480, 360]}))
+    given = new_session("photo.png", "truck.ply", "--camera", "cam.json", *box)
+    given.load()
+    seen = undistorted(plain.image, camera, torch.tensor([10.0, 20, 90, 80]))
+    assert torch.equal(given.shot.photo.image, seen.image)
+    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), (
+        "the option is of the photograph as it was taken"
+    )
+    with pytest.raises(InvalidInputError, match="--box: needs a photograph"):
+        new_session(*box).load()
+    session.set_camera(camera)
+    assert torch.equal(session.shot.photo.image, seen.image)
+    assert session.shot.photo.notes == ("undistorted",)
+    assert (session.shot.box, session.command()) == (None, ""), "boxes were of other pixels"
     session.open_photo(folder / "photo.png")
-    assert session.guess == 65, "of the command line, for the first photograph"
-    session.open_photo(folder / "photo.png")
-    assert (session.box, session.camera, session.guess) == (None, None, None)
-    (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:200])
-    with pytest.raises(ImageError):
-        session.open_photo(folder / "broken.png")
-    assert session.photo_path == folder / "photo.png"
-
-
-@pytest.mark.usefixtures("folder")
-def test_load_takes_files_box_and_camera_from_the_options():
-    session = new_session("photo.png", "truck.ply", "--box", "10", "20", "90", "80", "--fov", "65")
-    assert "968 faces" in session.load()
-    assert session.command() == "curvireg register photo.png truck.ply --box 10 20 90 80 --fov 65 --out result"
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_calibrated_camera_becomes_numbers_unless_it_distorts():
-    K = [[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]]
-    session = new_session("photo.png", "truck.ply")  # 240 x 180 px
-    session.options = replace(session.options, camera=Camera(K, size=(360, 480)))
-    session.load()
-    assert session.camera == pytest.approx((250, 250, 119.5, 89.5))
-    session.options = replace(session.options, camera=Camera(K, (-0.3, 0.1, 0, 0)))
-    with pytest.raises(InvalidInputError, match=r"^--camera: it has lens distortion"):
-        session.load()
+    assert session.shot.photo.notes == ("undistorted",)
+    with pytest.raises(InvalidInputError, match="another aspect ratio"):
+        session.set_camera(Camera(K, size=(480, 640 + 90)))
+    assert session.is_undistorted, "nothing has changed"
+    session.shot.set_box(tuple(scene(0)[1].tolist()))
+    session.register()
+    document = session.document()
+    assert document["inputs"]["camera_source"] == "file"
+    assert document["camera"] == camera.at((180, 240)).describe()
+    assert "cr.register(cr.geometry.undistorted(cr.data.read_photo(" in session.python()
+    session.set_camera((250.0, 250.0, 119.5, 89.5))
+    assert [torch.equal(shot.photo.image, plain.image) for shot in session.shots] == [True, True]
 
 
 def test_command_contains_inputs_and_options(folder):
     session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
-    session.open_photo(folder / "photo.png", "photo.png")
+    session.open_photo(Path("photo.png"))
     assert not session.has_exif
     with_exif(folder / "photo.png", exif(1, 50))
-    session.open_photo(folder / "photo.png", "photo.png")
+    session.open_photo(Path("photo.png")).set_box((10.0, 20.5, 90.0, 80.0))
     assert session.has_exif
-    session.guess, session.box = "exif", (10.0, 20.5, 90.0, 80.0)
+    session.set_camera(guess="exif")
     assert session.command() == (
         "curvireg register photo.png MESH --box 10 20.5 90 80 --camera exif "
         "--unit mm --up=-y --pose any --preset fast --out result"
     )
-    session.camera, session.guess = (300.0, 300.5, 119.5, 89.5), None
+    session.set_camera((300.0, 300.5, 119.5, 89.5))
     assert "--camera 300 300.5 119.5 89.5 --unit" in session.command()
-    session.camera, session.guess = None, 65.0
+    session.set_camera(guess=65.0)
     assert "--box 10 20.5 90 80 --fov 65 --unit" in session.command()
-    session.guess, session.options = 180.0, replace(session.options, unit="m")
+    session.options = replace(session.options, unit="m", guess=180.0)
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
 
 
-def test_command_contains_the_limits_on_the_pose(folder):
-    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2"]
-    session = new_session("photo.png", "truck.ply", *words)
-    session.load()
+def test_command_contains_the_limits_on_the_pose():
+    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2", "--fov", "65"]
+    session = new_session(*words)
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
     again = register_options(parse(shlex.split(session.command())[1:]))
-    assert again.limits == session.request().limits
-    assert session.request().entry(folder / "photo.png").prior.to_dict() == {
-        "azimuth": (315.0, 45.0),
-        "elevation": (-10.0, 40.0),
-        "distance": (0.5, 2.0),
-        "viewpoint": (10.0, -20.5, 0.0),
-        "within": 30.0,
-        "front": "-x",
-    }
+    assert (again.limits, again.guess) == (session.request().limits, 65)
+    assert again.limits["viewpoint"] == (10.0, -20.5, 0.0)
     session.set_limits(**{**dict.fromkeys(session.options.limits), "front": "y"})
     assert "--front" not in session.command(), "it limits nothing by itself"
 
 
-def test_limits_do_not_open_the_mesh_again(session):
-    registrar = session.result.registrar
-    session.set_limits(elevation=(35.0, 90.0))
-    session.register()
-    session.set_limits(elevation=None)
-    assert session.result.registrar is registrar
-    assert session.document()["prior"]["elevation"] == (35.0, 90.0)
-    assert session.answer.pose.viewpoint[1] > 32.0
-
-
 @pytest.mark.usefixtures("folder")
-def test_register_is_cancelled_by_the_user(monkeypatch):
-    box = map(str, scene(0)[1].tolist())
-    session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
+def test_register_is_cancelled_by_the_user():
+    session = new_session(
+        "photo.png", "truck.ply", "--pipeline", "small.json", "--box", *map(str, scene(0)[1].tolist())
+    )
     session.load()
-    report_progress, stages = session._report_progress, []
-
-    def cancel_later(stage, *progress):
-        stages.append(stage)
-        session.cancelled = stage != "bank"
-        report_progress(stage, *progress)
-
-    monkeypatch.setattr(session, "_report_progress", cancel_later)
+    session.cancelled = True
     with pytest.raises(CurviregError, match=r"^stopped$"):
         session.register()
-    assert "bank" not in stages[-1:]
-    assert len(set(stages)) == 2, "at the first step after it"
-    assert session.result is None
-    assert not session.cancelled
+    assert (session.shot.result, session.cancelled) == (None, False)
+    assert session.progress[0] == "bank", "at the first step"
+
+
+BOX = (10.0, 20.0, 60.0, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("box", "start", "end", "expected"),
+    [
+        (None, (60, 50), (10, 20.26), (10, 20.3, 60, 50)),
+        (BOX, (200, 200), (201, 202), BOX),
+        (BOX, (11, 35), (5, 99), (5, 20, 60, 50)),
+        (BOX, (30, 19), (0, 25), (10, 25, 60, 50)),
+        (BOX, (59, 51), (80, 90), (10, 20, 80, 90)),
+        (BOX, (30, 35), (35, 25), (15, 10, 65, 40)),
+        (BOX, (100, 100), (120, 130), (100, 100, 120, 130)),
+        (BOX, (10, 35), (90, 35), (60, 20, 90, 50)),
+        ((10, 10, 16, 16), (15.5, 13), (30, 13), (10, 10, 30, 16)),
+    ],
+    ids=["new", "click", "left", "top", "corner", "inside", "outside", "across", "small"],
+)
+def test_a_drag_draws_moves_and_resizes_boxes(box, start, end, expected):
+    assert dragged_box(box, start, end, reach=4.0) == expected
+
+
+@pytest.fixture
+def pose(session):
+    """A result, its pose and camera, and the mesh's centre and radius."""
+    result = session.shot.result
+    return result, *result.registration.projection, result.registrar.describer
+
+
+def seen(T, K, point):
+    at = K @ (T[:3, :3] @ point + T[:3, 3])
+    return at[:2] / at[2]
+
+
+def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
+    result, T, K, describer = pose
+    moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
+    shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
+    torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
+    assert torch.equal(moved[:3, :3], T[:3, :3])
+
+
+def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
+    result, T, K, describer = pose
+    near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
+    turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
+    shift = seen(turned, K, near) - seen(T, K, near)
+    assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
+    assert 3 < shift[1] < 6
+    torch.testing.assert_close(seen(turned, K, describer.centre), seen(T, K, describer.centre))
+
+
+def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
+    result, T, K, describer = pose
+    moved = result.scaled(T, 1.25, roll=30.0)
+    centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (T, moved)]
+    torch.testing.assert_close(centres[1], centres[0] / 1.25)
+    assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
+    # Clockwise on the screen: what is right of the centre goes down.
+    right = T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
+    assert seen(moved, K, right)[1] > seen(T, K, right)[1]
+    with pytest.raises(InvalidInputError, match="touch the camera"):
+        result.scaled(T, 1000.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.visualization.contours import contour_layer, draw_box, line_width
+from curvireg_torch.visualization.contours import contour_layer, draw_box
 
 FOCAL, SIZE = 200.0, 120
 CAMERA = torch.tensor([[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]])
@@ -64,17 +64,6 @@ def test_contour_layer_leaves_out_specks():
     bump[60:62, 60:62] = 4.0
     bump[15, 15] = 6.0  # the depth range
     assert not colour(contour_layer(bump, CAMERA), ORANGE)[30:90, 30:90].any()
-
-
-def test_contour_layer_of_an_object_outside_the_picture():
-    assert not contour_layer(torch.zeros(9, 7), CAMERA).any()
-    full = contour_layer(torch.full((40, 40), 2.0), CAMERA)
-    assert not full.any(), "the picture's border is no contour"
-
-
-def test_line_width_grows_with_the_picture():
-    assert line_width((100, 200)) == 1.5
-    assert line_width((1600, 1200)) == 2 * line_width((800, 600)) > 4
 
 
 @pytest.mark.parametrize("background", [0, 128, 255])

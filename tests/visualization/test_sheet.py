@@ -10,6 +10,7 @@ import torch
 from curvireg_torch import Registrar
 from curvireg_torch.geometry import project_points
 from curvireg_torch.visualization import sheet
+from curvireg_torch.visualization.contours import close_up
 from tests._support.scenes import scene, truck_bank, unrefined
 
 
@@ -30,9 +31,8 @@ def test_thumbnail_draws_contours_on_the_object(scale):
     # Project the vertices into the thumbnail.
     T, K = result.projection
     uv = project_points(torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K)[0]
-    margin = 0.25 * max(edges[2] - edges[0], edges[3] - edges[1])
-    left, top = int(edges[0] - margin), int(edges[1] - margin)
-    shrink = pixels.shape[1] / (int(edges[2] + margin) + 1 - left)
+    left, top, right, _ = close_up(photograph.shape[-2:], edges)
+    shrink = pixels.shape[1] / (right - left)
     expected = [(v + 0.5 - start) * shrink - 0.5 for v, start in zip(uv.T, (left, top), strict=True)]
     for drawn, projected in zip((x, y), expected, strict=True):
         # The box is drawn over the outermost pixels.

@@ -150,7 +150,7 @@
     const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     let what = null;
     if (at.matches?.(".viewport")) {
-      if (arrow) what = { type: "nudge", dx: arrow[0], dy: arrow[1], shift: event.shiftKey, alt: event.altKey };
+      if (arrow) what = { type: "nudge", dx: arrow[0], dy: arrow[1], shift: event.shiftKey };
       else if (event.key === "Delete" || event.key === "Backspace") what = { type: "remove" };
     }
     if ((event.ctrlKey || event.metaKey) && event.key === "z" && !at.matches?.("input, textarea")) what = { type: "undo" };

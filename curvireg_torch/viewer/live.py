@@ -1,0 +1,69 @@
+"""A page with the latest frame of a video and the contours of its pose: ``curvireg follow --show``."""
+
+import sys
+import threading
+from typing import Any, Self
+
+from nicegui import app, ui
+from starlette.responses import Response
+from torch import Tensor
+
+from ..registration import FailedRegistration, Registrar, Registration
+from ..visualization.encoding import jpeg
+from ..visualization.video import annotated_frame
+from .server import listen, make_server
+
+__all__ = ["LivePage"]
+
+HOST = "127.0.0.1"
+TICK_SECONDS = 0.04  # between two looks for a new frame
+QUALITY = 80  # of the JPEG files
+STOP_SECONDS = 5.0  # that the server may take to end
+
+
+class LivePage:
+    """Opens a page that shows the latest frame; a frame is drawn only once the one before has reached a browser.
+
+    As a context manager, it serves the page on this machine, in a thread.
+    """
+
+    def __init__(self, registrar: Registrar) -> None:
+        self.registrar, self.frame, self.number, self.ratio = registrar, b"", 0, 1.0
+        self._wanted = True
+
+    def __enter__(self) -> Self:
+        app.get("/frame")(self._send)
+        ui.page("/")(self._build)
+        self._listener = listen(HOST, 0)
+        self._server = make_server(self._listener, HOST, browser=True, printed_to=sys.stderr)
+        self._thread = threading.Thread(target=self._server.run, args=([self._listener],), daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.should_exit = True
+        self._thread.join(STOP_SECONDS)
+        self._listener.close()
+
+    def show(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
+        """Take the next frame; dropped while the one before is on its way."""
+        if self._wanted and image is not None:
+            self._wanted, self.ratio = False, image.shape[-1] / image.shape[-2]
+            self.frame = jpeg(annotated_frame(self.registrar, image, result), QUALITY)
+            self.number += 1
+
+    def _send(self) -> Response:
+        self._wanted = True
+        return Response(self.frame, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
+
+    def _build(self) -> None:
+        picture: Any = ui.interactive_image().props("data-testid=live")
+        picture.shown = 0
+
+        def refresh() -> None:
+            if picture.shown != self.number:
+                picture.shown = self.number
+                picture.set_source(f"frame?{self.number}")
+                picture.style(f"width: min(100%, {95 * self.ratio:.1f}vh)")
+
+        ui.timer(TICK_SECONDS, refresh)

@@ -1,0 +1,90 @@
+"""``curvireg follow --show``: a page with the latest frame."""
+
+import json
+import threading
+import time
+import urllib.error
+import urllib.request
+import webbrowser
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("nicegui", reason="nicegui is not installed")
+
+from curvireg_torch.cli import main
+from curvireg_torch.registration import Follower
+from curvireg_torch.visualization.contours import OUTLINE
+from tests._support.lists import CAMERA
+from tests._support.scenes import learned_registrar, sequence
+
+
+class Camera:
+    """Delivers the frames of a sequence, each once the one before was taken."""
+
+    def __init__(self, frames, taken):
+        self.frames, self.taken, self.number = frames, taken, 0
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def get(self, _):
+        return 0.0
+
+    def release(self):
+        pass
+
+    def read(self):
+        while len(self.taken) < self.number:
+            time.sleep(0.01)
+        self.number += 1
+        return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
+
+
+def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
+    scenes = sequence(4)
+    learned_registrar().bank.save(tmp_path / "truck.safetensors")
+    pictures = [(image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy() for image, _, _ in scenes]
+    seen, pages, threads = [], [], []
+    call = Follower.__call__
+
+    def watch(address):
+        with urllib.request.urlopen(address) as answer:
+            pages.append((address, answer.read().decode(), answer.headers["content-security-policy"]))
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(address, headers={"Origin": "http://evil.example"}))
+        while len(seen) < 3:
+            picture = urllib.request.urlopen(f"{address}frame").read()
+            if picture and picture not in seen:
+                seen.append(picture)
+
+    def interrupted(self, *arguments):
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        return call(self, *arguments)
+
+    def open_browser(address):
+        threads.append(threading.Thread(target=watch, args=(address,)))
+        threads[0].start()
+
+    monkeypatch.setattr(webbrowser, "open", open_browser)
+    monkeypatch.setattr(Follower, "__call__", interrupted)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Camera(pictures, seen))
+    box = map(str, scenes[0][1].tolist())
+    words = ["follow", "0", str(tmp_path / "truck.safetensors"), "--camera", *map(str, CAMERA), "--box", *box]
+    assert main([*words, "--show", "--json"]) == 0
+    threads[0].join(10)
+    printed = capsys.readouterr()
+    assert [json.loads(line)["frame"] for line in printed.out.splitlines()] == [f"frame-00000{k}" for k in range(3)]
+    assert "3 frames: 3 of 3 believed" in printed.err
+    ((address, page, policy),) = pages
+    assert address in printed.err
+    assert "live" in page
+    assert policy.startswith("default-src 'none'")
+    for picture in seen:
+        pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+        assert pixels.shape == (180, 240, 3)
+        assert (np.abs(pixels - OUTLINE).sum(axis=2) < 120).sum() > 50, "the outline"
+    with pytest.raises(urllib.error.URLError):  # it has ended
+        urllib.request.urlopen(address, timeout=5)
