@@ -328,7 +328,7 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
             bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)
-                for chunk in crops.split(matcher.chunk_size):
+                for chunk in crops.split(16):
                     orders[f"{depth}/{photo}"].append(matcher.rank(matcher.features(chunk)).top(max(RANKS)))
     found = {name: torch.cat(parts) for name, parts in orders.items()}
     return Rankings(views, categories, torch.stack(truth), torch.stack(errors), found)
