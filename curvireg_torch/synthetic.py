@@ -17,7 +17,6 @@ from .mesh.mesh import mesh_centre, mesh_radius
 from .rendering import render_colour, render_depth
 
 __all__ = ["DemoScene", "demo_scene", "example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
-
 RED, STEEL, WOOD, RUBBER = (196, 44, 34, 255), (120, 124, 130, 255), (222, 190, 138, 255), (44, 44, 48, 255)
 PAINT = [STEEL, RED, RED, WOOD, WOOD, WOOD, STEEL, *[RUBBER] * 6]  # of the parts, in their order
 DEFOCUS = 1.5  # blur of the background in px
@@ -96,10 +95,8 @@ def synthesize_photograph(
     texture: float = 0.35,
 ) -> tuple[Tensor, Tensor]:
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box (4,) in px.
-
     ``texture`` is the contrast of a random solid pattern; a mesh with face colours shows those instead. The background
-    (3, H, W), default :func:`procedural_background`, is out of focus.
-    """
+    (3, H, W), default :func:`procedural_background`, is out of focus."""
     H, W = size
     # Supersampling by two.
     K = torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]).double() @ camera_matrix.double()

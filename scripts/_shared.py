@@ -35,9 +35,11 @@ def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
 
 
 def write_json(path: Path, content: Any, indent: int = 2) -> None:
-    """Write a record, and create its folder if needed."""
+    """Write a record, and create its folder if needed; an interrupted run leaves no half of a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
+    part = path.with_name(f"{path.name}.{os.getpid()}")
+    part.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
+    part.replace(path)
 
 
 def today() -> str:

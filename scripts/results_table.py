@@ -19,25 +19,13 @@ from scripts._shared import REPOSITORY, RESULTS, commit, replace_between, today,
 BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
 
 PASCAL3D = (
-    ["set", "N", "Acc 30°", "Acc 10°", "median", "Acc 30°, symmetric", "easy: Acc 30°", "median", "s/object"],
+    "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median | s/object",
     "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is below; median: of that "
     "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; easy: neither truncated, "
     "occluded nor difficult. No camera is given. s/object: one thread, with other work on the machine.",
 )
 BOP = (
-    [
-        "set",
-        "N",
-        "Acc 15°",
-        "Acc 30°",
-        "median",
-        "ADD(-S) 0.1d",
-        "AR MSSD",
-        "AR MSPD",
-        "unoccluded: N",
-        "Acc 30°",
-        "s/object",
-    ],
+    "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | Acc 30° | s/object",
     "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean distance of model "
     "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; unoccluded: at least 95 % "
     "visible. Box and camera matrix are given.",
@@ -84,8 +72,9 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            rows = [columns, ["---"] * len(columns), *(cells(r["name"], r["summary"]) for r in chosen)]
-            body = "\n".join("| " + " | ".join(row) + " |" for row in rows)
+            rows = [columns, " | ".join(["---"] * (columns.count("|") + 1))]
+            rows += [" | ".join(cells(r["name"], r["summary"])) for r in chosen]
+            body = "\n".join(f"| {row} |" for row in rows)
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])

@@ -77,7 +77,7 @@ def test_json_contains_every_setting():
         changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
     for term in base.terms:
         for f in fields(term):
-            value = {"none": "bank", "monotone": "paper", 1000: 7, 32: 7}.get(getattr(term, f.name), 0.3)
+            value = {"none": "bank", "monotone": "paper", 1000: 7, 64: 7}.get(getattr(term, f.name), 0.3)
             if f.name != "weights":
                 changed.append(base.with_term(term.name, **{f.name: value}))
     texts = {pipeline.to_json() for pipeline in changed}

@@ -2,6 +2,7 @@
 
 import argparse
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -123,12 +124,10 @@ def view(arguments: argparse.Namespace) -> None:
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
     check_given(photos, meshes)
     check_viewer("view")
-    from ..evaluation.opening import check_camera
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
     options = register_options(arguments, photos, meshes)
-    check_camera(options.camera, options.guess)
     with one_torch_thread():
         serve(options, host=arguments.host, port=arguments.port, browser=arguments.browser)
 
@@ -156,14 +155,13 @@ def draw(arguments: argparse.Namespace) -> None:
     import torch
 
     from ..data import read_photo
-    from ..evaluation.opening import check_camera, open_registrar
+    from ..evaluation.opening import open_registrar
     from ..evaluation.runner import register_entry, seen_image
     from ..registration.result import used_box
     from ..utils.threads import one_torch_thread
     from ..visualization import contour_overlay, plots
 
     options = register_options(arguments, [arguments.photo], [arguments.mesh])
-    check_camera(options.camera, options.guess)
     photo = read_photo(options.photos[0], dtype=torch.uint8)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
@@ -194,47 +192,36 @@ def add_demo(commands: Any) -> None:
 
 def demo(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
-    check_writable(arguments.out, "--out")
-    from ..utils.threads import one_torch_thread
-
-    with one_torch_thread():
-        _register_scene(arguments)
-
-
-def _register_scene(arguments: argparse.Namespace) -> None:
+    out = arguments.out
+    check_writable(out, "--out")
+    from ..data import read_photo
     from ..evaluation.result_files import write_result
+    from ..evaluation.runner import register_entry
     from ..geometry import rotation_error
-    from ..matching import cached_bank
-    from ..registration import Registrar, Registration
-    from ..registration.result import result_document
     from ..synthetic import demo_scene
+    from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png
     from ..visualization.overlay import to_uint8
-    from .register import print_result, show_stages
+    from .register import opened_registrar, print_result
 
-    scene = demo_scene(arguments.seed)
-    mesh, image, box, truth = scene.mesh, scene.image, scene.box, scene.truth
-    options = register_options(arguments)
-    pipeline = options.open_pipeline()
-    with show_stages(enabled=options.progress) as progress:
-        start = time.perf_counter()
-        bank = cached_bank(mesh, pipeline=pipeline, renderer=options.renderer, progress=progress or options.progress)
-        ready = time.perf_counter()
-        settings: dict[str, Any] = {"renderer": options.renderer, "device": options.device}
-        registrar = Registrar(bank, pipeline=pipeline, progress=progress or False, **settings)
-        result = registrar([image], box[None], scene.camera_matrix)[0]
-    assert isinstance(result, Registration)
-    assert result.translation is not None
-    seconds = {"bank": ready - start, "register": time.perf_counter() - ready}
-    document = result_document(result, registrar, seconds)
-    document["rotation_error_deg"] = float(rotation_error(result.rotation, truth[:3, :3]))
-    document["translation_error"] = float((result.translation - truth[:3, 3]).norm() / truth[:3, 3].norm())
-    document["truth"] = {"rotation": truth[:3, :3].tolist(), "translation": truth[:3, 3].tolist()}
-    document["inputs"] = {"seed": arguments.seed, "box": box.tolist()}
-    write_result(arguments.out, document, registrar, result, image, box)
-    write_file(arguments.out / "mesh.ply", mesh.export(file_type="ply"))
-    write_file(arguments.out / "photo.png", png(to_uint8(image)))
-    print_result(document, arguments.out)
+    with one_torch_thread():
+        scene = demo_scene(arguments.seed)
+        write_file(out / "mesh.ply", scene.mesh.export(file_type="ply"))
+        write_file(out / "photo.png", png(to_uint8(scene.image)))
+        options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
+        K, photo = scene.camera_matrix, read_photo(out / "photo.png")
+        camera = tuple(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        entry = replace(options, box=tuple(scene.box.tolist()), camera=camera).entry(out / "photo.png")
+        with opened_registrar(options) as (registrar, seconds):
+            result, document = register_entry(entry, photo, registrar, bank_seconds=seconds)
+        assert result.translation is not None
+        R, t = scene.truth[:3, :3], scene.truth[:3, 3]
+        document["rotation_error_deg"] = float(rotation_error(result.rotation, R))
+        document["translation_error"] = float((result.translation - t).norm() / t.norm())
+        document["truth"] = {"rotation": R.tolist(), "translation": t.tolist()}
+        document["inputs"]["seed"] = arguments.seed
+        write_result(out, document, registrar, result, photo.image, scene.box)
+    print_result(document, out)
     print(
         f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
         f"translation {100 * document['translation_error']:.1f} % of the distance"

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingFileError("no such folder; datasets/README.md shows the layout", subject=arguments.root)
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
-    from ..evaluation.workers import run_processes
+    from ..evaluation.store import run_processes
     from ..pipeline import Pipeline
     from ..utils.threads import one_torch_thread
 

@@ -5,7 +5,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..evaluation.opening import RegisterOptions
-    from ..registration import FailedRegistration, Follower, Registration
+    from ..registration import FailedRegistration, Registration
 
 FOLDER_FPS = 10.0
 """Frames per second of the overlay of a folder, or of a camera that does not tell."""
@@ -60,14 +60,12 @@ def run(arguments: argparse.Namespace) -> None:
     check_given([] if live else [Path(source)], [arguments.mesh])
     if not live and not Path(source).exists():
         raise MissingFileError("no such folder or video; or give the number of a camera, or rtsp://...", subject=source)
-    from ..evaluation.opening import check_camera
     from ..evaluation.runner import CAMERA_OPTIONS
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
         raise InvalidInputError(f"follow: give {CAMERA_OPTIONS}")
-    check_camera(options.camera, options.guess)
     if out is None and not (arguments.json or arguments.show):
         raise InvalidInputError("follow: give --out DIR, --show or --json")
     if arguments.show:
@@ -102,7 +100,7 @@ def _follow(
     registrar = open_registrar(options, options.meshes, options.open_field())
     rows: list[list[Any]] = []
     seconds: list[float] = []
-    object_pose, start, video, page = _Poses(options, registrar), time.monotonic(), None, None
+    start, video, page = time.monotonic(), None, None
     try:
         with ExitStack() as stack:
             if out is not None:
@@ -112,10 +110,8 @@ def _follow(
 
                 page = stack.enter_context(LivePage(registrar))
             bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
-            for name, image in bar:
-                begun = time.perf_counter()
-                shown, result = object_pose(image)
-                seconds.append(time.perf_counter() - begun)
+            for name, shown, result, took in _poses(options, registrar, bar):
+                seconds.append(took)
                 rows.append(_row(name, result))
                 if as_json:
                     print(_json_line(rows[-1], result, time.monotonic() - start), flush=True)
@@ -132,73 +128,69 @@ def _follow(
     return rows, seconds, None if video is None else video.path
 
 
-class _Poses:
-    """The pose in each frame, which is returned without the distortion of its camera."""
+def _poses(
+    options: "RegisterOptions", registrar: Any, frames: "Iterable[tuple[str, Tensor | ImageError]]"
+) -> "Iterator[tuple[str, Tensor | None, Registration | FailedRegistration, float]]":
+    """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
+    import torch
 
-    def __init__(self, options: "RegisterOptions", registrar: Any) -> None:
-        self.options, self.registrar = options, registrar
-        self.follow: Follower | None = None
-        self.box: Any = None if options.box is None else list(options.box)
+    from ..evaluation.opening import prior_from_limits, read_start
+    from ..geometry import Camera, undistorted
+    from ..registration import FailedRegistration, Follower
 
-    def __call__(self, image: "Tensor | ImageError") -> tuple["Tensor | None", "Registration | FailedRegistration"]:
-        import torch
-
-        from ..evaluation.opening import prior_from_limits, read_start
-        from ..geometry import Camera, undistorted
-        from ..registration import FailedRegistration, Follower
-
+    follow, prior = None, prior_from_limits(options.limits or {})
+    box: Any = None if options.box is None else list(options.box)  # of the first frame
+    for name, image in frames:
+        begun, result = time.perf_counter(), None
         if isinstance(image, ImageError):
-            return None, FailedRegistration(image)
-        camera = self.options.camera
+            yield name, None, FailedRegistration(image), time.perf_counter() - begun
+            continue
         try:
-            if isinstance(camera, Camera):
-                seen = undistorted(image, camera, None if self.box is None else torch.tensor(self.box))
-                image, self.box = seen.image, seen.box
-            if self.follow is None:
-                prior = prior_from_limits(self.options.limits or {})
-                self.follow = Follower(self.registrar, self._matrix(image), prior=prior)
-                if self.options.start is not None:
-                    pose, confidence = read_start(self.options.start)
-                    self.follow.start(image, pose, confidence=1.0 if confidence is None else confidence)
-            box, self.box = self.box, None  # of the first frame
-            return image, self.follow(image, box)
+            if isinstance(options.camera, Camera):
+                seen = undistorted(image, options.camera, None if box is None else torch.tensor(box))
+                image, box = seen.image, seen.box
+            if follow is None:
+                follow = Follower(registrar, _camera_matrix(options, image), prior=prior)
+                if options.start is not None:
+                    pose, confidence = read_start(options.start)
+                    follow.start(image, pose, confidence=1.0 if confidence is None else confidence)
+            first_box, box = box, None
+            result = follow(image, first_box)
         except CurviregError as error:
-            return image, FailedRegistration(error)
-
-    def _matrix(self, image: "Tensor") -> "Tensor":
-        """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
-        from ..data import read_photo
-        from ..geometry import Camera, camera_matrix
-        from ..geometry.cameras import camera_of_view
-
-        size, camera, guess = (image.shape[-2], image.shape[-1]), self.options.camera, self.options.guess
-        if camera is not None:
-            return camera.at(size).matrix if isinstance(camera, Camera) else camera_matrix(*camera)
-        if guess != "exif":
-            return camera_of_view(float(guess or 0.0), size)
-        first = _photographs(self.options.photos[0])[0] if self.options.photos[0].is_dir() else None
-        K = None if first is None else read_photo(first).guessed_camera_matrix()
-        if K is None:
-            message = "no focal length in EXIF, which only photographs have; give --camera FX FY CX CY, or --fov DEG"
-            raise InvalidInputError(message, subject=first or self.options.photos[0])
-        return K
+            result = FailedRegistration(error)
+        yield name, image, result, time.perf_counter() - begun
 
 
-def _photographs(folder: Path) -> list[Path]:
-    from ..evaluation.lists import list_photographs
+def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
+    """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
+    from ..data import read_photo
+    from ..evaluation.lists import find_photographs
+    from ..geometry import Camera, camera_matrix
+    from ..geometry.cameras import camera_of_view
 
-    return [entry.photo for entry in list_photographs([folder], [folder], frames=folder).entries]
+    source, size, camera = options.photos[0], (image.shape[-2], image.shape[-1]), options.camera
+    if camera is not None:
+        return camera.at(size).matrix if isinstance(camera, Camera) else camera_matrix(*camera)
+    if options.guess != "exif":
+        return camera_of_view(float(options.guess or 0.0), size)
+    first = next(find_photographs(source, 1, source)) if source.is_dir() else None
+    K = None if first is None else read_photo(first).guessed_camera_matrix()
+    if K is None:
+        message = "no focal length in EXIF, which only photographs have; give --camera FX FY CX CY, or --fov DEG"
+        raise InvalidInputError(message, subject=first or source)
+    return K
 
 
 def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
     """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
     from ..data import Video, read_photo
+    from ..evaluation.lists import find_photographs
 
     if path.suffix.lower() in VIDEOS and path.is_file():
         video = Video(path)
         fps = video.fps if 0 < video.fps < 1000 else FOLDER_FPS
         return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, fps
-    photos = _photographs(path)
+    photos = list(find_photographs(path, 1, path))
 
     def read() -> Iterator[tuple[str, "Tensor | ImageError"]]:
         for photo in photos:

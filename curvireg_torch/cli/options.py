@@ -4,6 +4,7 @@ import argparse
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,12 @@ from ..evaluation.opening import (
     PRIOR_OPTIONS,
     Numbers,
     RegisterOptions,
+    check_camera,
     limits_from_options,
     prior_from_limits,
 )
 
-DECLARED: dict[str, dict[str, Any]] = {
-    name: how.__metadata__[0] for name, how in RegisterOptions.__annotations__.items() if hasattr(how, "__metadata__")
-}
+DECLARED = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
@@ -75,7 +75,7 @@ def register_options(
     """The options of a command; those that it lacks have their defaults.
 
     Raises:
-        InvalidInputError: limits that contradict each other, or no such device.
+        InvalidInputError: limits that contradict each other, an impossible camera, or no such device.
     """
     from ..utils.checks import check_device
 
@@ -91,6 +91,7 @@ def register_options(
         prior_from_limits(limits)
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
+    check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
 

@@ -18,8 +18,9 @@ from ..utils.files import check_writable
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
 
 if TYPE_CHECKING:
-    from ..evaluation.lists import PhotoList
     from ..evaluation.opening import RegisterOptions
+    from ..evaluation.runner import Entry
+    from ..registration import Registrar
 
 MAX_FAILURES = 10
 """Photographs of a list that could not be registered, of which the command prints the reason."""
@@ -75,7 +76,7 @@ def add_register(commands: Any) -> None:
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
         "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
-        "camera, MESH, what the options say. Or the same as JSON, COCO annotations, or the folder of a BOP scene",
+        "camera, MESH, what the options say",
     )
     add(
         "--views",
@@ -103,8 +104,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
     rig, listed = arguments.views, arguments.list is not None or arguments.views is not None
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
-    scene = arguments.list or (rig / "scene_camera.json" if rig and (rig / "scene_camera.json").is_file() else None)
-    if arguments.unit is None and scene is not None and (scene.is_dir() or rig):
+    if arguments.unit is None and rig is not None and (rig / "scene_camera.json").is_file():
         arguments.unit = "mm"  # of the models in a BOP set
     if numbers := numbers_among(arguments.paths):
         return f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take four, --distance two"
@@ -136,15 +136,14 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.opening import check_camera, prior_from_limits
+    from ..evaluation.opening import prior_from_limits
     from ..evaluation.runner import CAMERA_OPTIONS
-    from ..evaluation.workers import run_processes
+    from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
     options.open_pipeline()  # errors in options come before any photograph is read
     field, limits = options.open_field(), options.limits or {}
-    check_camera(options.camera, options.guess)
     if limits and prior_from_limits(limits) is None and arguments.list is None:
         raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
     if "distance" in limits and arguments.list is None and not (options.camera or options.guess):
@@ -164,7 +163,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
-        photos = _photo_list(options, arguments.list, out, every=arguments.every)
+        photos = _photographs(options, arguments.list, out, every=arguments.every)
         counts = _register_several(options, field, photos, out)
         if counts is None:  # another process writes the tables
             return 0
@@ -190,14 +189,13 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     import torch
 
     from ..data import read_photo
-    from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_lost, write_pose_stamped, write_result
     from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
     from ..evaluation.store import to_json
+    from ..geometry import Camera
     from ..registration.result import used_box
 
-    start, out, as_json = time.perf_counter(), arguments.out, arguments.json
-    path = options.photos[0]
+    out, as_json, path = arguments.out, arguments.json, options.photos[0]
     photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
     check_entry(entry, photo)
     if arguments.format and options.camera is options.guess is None:
@@ -206,14 +204,9 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
         print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with show_stages(enabled=options.progress) as progress:
-        if progress is not None:
-            progress("reading the mesh", 0, 1)
-        registrar = open_registrar(options, options.meshes, field, progress=progress)
-        registrar.progress = progress or False
-        ready = time.perf_counter() - start
+    with opened_registrar(options, field) as (registrar, seconds):
         try:
-            result, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+            result, document = register_entry(entry, photo, registrar, bank_seconds=seconds)
         except LostObjectError as error:
             if out is not None:
                 write_lost(out, str(error))
@@ -230,7 +223,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
         print(f"{path}: {note}", file=notes)
     remarks = list(photo.notes)
-    if document["inputs"]["camera_source"] == "file" and options.camera.distorts:
+    if isinstance(options.camera, Camera) and options.camera.distorts:
         remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
     if remarks:
         print(f"{path}: {'; '.join(remarks)}", file=notes)
@@ -244,20 +237,15 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
 
 def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
-    from ..evaluation.opening import open_registrar
     from ..evaluation.result_files import write_pose_stamped, write_views
     from ..evaluation.rigs import read_rig, register_rig
     from ..evaluation.store import to_json
 
-    start, out = time.perf_counter(), arguments.out
-    rig = read_rig(arguments.views, options.meshes[0])
+    out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
         check_writable(out, "--out")
-    with show_stages(enabled=options.progress) as progress:
-        registrar = open_registrar(options, options.meshes, field, progress=progress)
-        registrar.progress = progress or False
-        ready = time.perf_counter() - start
-        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=ready)
+    with opened_registrar(options, field) as (registrar, seconds):
+        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
     document["mesh"] = str(options.meshes[result.model])
     if out is not None:
         write_views(out, document, registrar, result, photographs)
@@ -274,7 +262,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     return result.reliable
 
 
-def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList", out: Path) -> Any:
+def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> Any:
     from ..evaluation.lists import register_list
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
@@ -289,22 +277,25 @@ def _register_several(options: "RegisterOptions", field: Any, photos: "PhotoList
     return register_list(photos, out, open_meshes, settings=settings, progress=options.progress)
 
 
-def _photo_list(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "PhotoList":
+def _photographs(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "list[Entry]":
     """The photographs that are named one by one or by the list at ``path``."""
     from ..evaluation.lists import list_photographs, read_list
 
     if path is not None:
-        photos = read_list(path, options.meshes, options.limits)
+        listed = read_list(path, options.meshes, options.limits)
+        photos = [
+            replace(entry, camera=options.guess if entry.camera is None else entry.camera, instances=options.instances)
+            for entry in listed
+        ]
         check_writable(out, "--out")
     else:
         check_writable(out, "--out")
-        same = {name: getattr(options, name) for name in ("box", "camera", "limits")}
-        photos = list_photographs(options.photos, options.meshes, **same, every=every, frames=out / "frames")
-        if given := [f"--{name}" for name in ("box", "camera") if same[name] is not None]:
-            print(f"{' and '.join(given)}: used for all {len(photos.entries)} photographs", file=sys.stderr)
+        photos = list_photographs(options, every=every, frames=out / "frames")
+        if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
+            print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    return replace(photos, entries=tuple(map(options.complete, photos.entries)))
+    return photos
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
@@ -371,6 +362,20 @@ def _advice(document: Mapping[str, Any]) -> str:
     if support is not None and support < WEAK_CONTOURS:
         return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
     return f"check that the box is tight and {mesh}"
+
+
+@contextmanager
+def opened_registrar(options: "RegisterOptions", field: Any = None) -> "Iterator[tuple[Registrar, float]]":
+    """The registrar of the options' meshes, which shows its stages, and the seconds that it took to open."""
+    from ..evaluation.opening import open_registrar
+
+    start = time.perf_counter()
+    with show_stages(enabled=options.progress) as progress:
+        if progress is not None:
+            progress("reading the mesh", 0, 1)
+        registrar = open_registrar(options, options.meshes, field, progress=progress)
+        registrar.progress = progress or False
+        yield registrar, time.perf_counter() - start
 
 
 @contextmanager

@@ -4,7 +4,7 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 ``skipped_items``), and ``annotation(index)`` returns a sample without its photograph. Nothing is downloaded.
 """
 
-from ._base import ObjectDataset, collate
+from ._base import ObjectDataset
 from .bop import BOPDataset
 from .camera_files import load_camera
 from .images import Photo, Video, read_image, read_photo
@@ -18,7 +18,6 @@ __all__ = [
     "Photo",
     "PoseFolder",
     "Video",
-    "collate",
     "load_camera",
     "read_image",
     "read_photo",

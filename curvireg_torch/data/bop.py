@@ -49,13 +49,7 @@ class BOPDataset(ObjectDataset):
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
-    def __init__(
-        self,
-        root: str | os.PathLike[str],
-        split: str = "test",
-        *,
-        targets: bool | None = None,
-    ) -> None:
+    def __init__(self, root: str | os.PathLike[str], split: str = "test", *, targets: bool | None = None) -> None:
         super().__init__()
         self.root, self.split = existing_root(root, _README), split
         scenes = self.root / split

@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, PoseFolder
 from ..errors import InvalidInputError
-from ..geometry import rotation_error, symmetry_transforms, viewpoint_from_rotation
+from ..geometry import Camera, rotation_error, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
 from ..geometry.crops import box_iou
 from ..geometry.pose_prior import object_frame
@@ -25,7 +25,6 @@ from .metrics import (
     ADD_THRESHOLDS,
     MSPD_THRESHOLDS,
     MSSD_THRESHOLDS,
-    accuracy,
     add_error,
     adds_error,
     average_recall,
@@ -35,17 +34,8 @@ from .metrics import (
     symmetric_rotation_error,
 )
 from .protocol import Protocol, hint_of_truth, perturbed_box, random_numbers
-from .runner import Entry, OtherView
+from .runner import Entry, View
 from .store import Row
-
-__all__ = [
-    "BOPBenchmark",
-    "Benchmark",
-    "Pascal3DBenchmark",
-    "PoseFolderBenchmark",
-    "detection_recall",
-    "write_bop_csv",
-]
 
 MIN_IOU = 0.5
 """Intersection over union from which a box is right."""
@@ -110,14 +100,14 @@ class Benchmark(ABC):
 
     def _entry(self, sample: Row) -> Entry:
         label, meshes, photo = self.label.format_map(sample), self.meshes(sample), Path(sample["image_path"])
-        box, K, protocol = sample["box"], sample.get("camera_matrix"), self.protocol
+        box, protocol = sample["box"], self.protocol
         unknown = protocol.box is not None and not bool(box.isfinite().all())
         return Entry(
             name=str(photo.relative_to(self.dataset.root)),
             photo=photo,
             meshes=meshes,
             box=None if protocol.box is None else tuple(perturbed_box(box, protocol, label).tolist()),
-            camera=None if K is None or not self.gives_camera else tuple(K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()),
+            camera=Camera(sample["camera_matrix"]) if self.gives_camera else None,
             prior=hint_of_truth(sample["rotation"], object_frame(format_up(meshes[0].suffix)), protocol, label),
             as_stored=True,
             label=label,
@@ -138,7 +128,7 @@ class Benchmark(ABC):
 
     def _rotation_scores(self, errors: Tensor) -> Row:
         """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
-        accuracies = {name: accuracy(errors, degrees) for name, degrees in self.thresholds.items()}
+        accuracies = {name: average_recall(errors, (degrees,)) for name, degrees in self.thresholds.items()}
         return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
 
 
@@ -302,7 +292,7 @@ class BOPBenchmark(Benchmark):
                 for i, others in zip(group, views, strict=True):
                     self.entries[i] = replace(self.entries[i], views=others)
 
-    def _views(self, first: int, group: Sequence[int]) -> tuple[OtherView, ...]:
+    def _views(self, first: int, group: Sequence[int]) -> tuple[View, ...]:
         """Photographs drawn from those of ``group`` to be registered together with that of the sample ``first``."""
         image = self.samples[first]["image_id"]
         others = [i for i in group if self.samples[i]["image_id"] != image]
@@ -310,16 +300,14 @@ class BOPBenchmark(Benchmark):
         order = torch.randperm(len(others), generator=generator).tolist()[: self.protocol.views - 1]
         return tuple(self._other_view(first, others[k]) for k in order)
 
-    def _other_view(self, first: int, other: int) -> OtherView:
+    def _other_view(self, first: int, other: int) -> View:
         entry, (one, two) = self.entries[other], (self.samples[i] for i in (first, other))
         T_one, T_two = one["T_cam_from_world"].double(), two["T_cam_from_world"].double()
         if not bool((T_one.isfinite() & T_two.isfinite()).all()):  # the object stands still: it is the world
             T_one, T_two = (transform(s["rotation"].double(), s["translation"].double()) for s in (one, two))
-        assert isinstance(entry.camera, Sequence)
-        relative = T_two @ torch.linalg.inv(T_one)
-        return OtherView(
-            entry.photo, None if entry.error else entry.box, entry.camera, tuple(map(tuple, relative.tolist()))
-        )
+        assert isinstance(entry.camera, Camera)
+        box = None if entry.error else entry.box
+        return View(entry.name, entry.photo, box, entry.camera, T_two @ torch.linalg.inv(T_one))
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Rotation errors in degrees, ADD(-S) and MSSD in diameters, MSPD in image widths."""
@@ -367,33 +355,17 @@ class BOPBenchmark(Benchmark):
         }
 
     def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
-        """The results file of the BOP challenge; it omits objects without an estimate."""
+        """The results file of the BOP challenge, with all digits; it omits objects without an estimate."""
         images = [(s["scene_id"], s["image_id"]) for s in samples]
-        times: dict[tuple[int, int], float] = defaultdict(float)
+        times: dict[tuple[int, int], float] = defaultdict(float)  # BOP wants equal seconds in all lines of an image
         for image, row in zip(images, rows, strict=True):
             times[image] += row["seconds"]["register"]
-        poses = [
-            ((*image, s["obj_id"]), row["score"], row["rotation"], row["translation"], times[image])
-            for image, s, row in zip(images, samples, rows, strict=True)
-            if "rotation" in row
-        ]
-        write_bop_csv(path, poses)
-
-
-BOPPose = tuple[Sequence[object], float, Sequence[Sequence[float]], Sequence[float], float]
-
-
-def write_bop_csv(path: Path, poses: Iterable[BOPPose]) -> None:
-    """Write poses in the format of the BOP challenge, with all digits.
-
-    Each is (scene, image and object numbers; score; 3 x 3 rotation; translation in mm; seconds for the whole image, -1
-    if unknown). BOP wants equal seconds in all lines of an image.
-    """
-    lines: list[Sequence[object]] = [("scene_id", "im_id", "obj_id", "score", "R", "t", "time")]
-    for ids, score, rotation, translation, seconds in poses:
-        R, t = (" ".join(map(str, numbers)) for numbers in (chain(*rotation), translation))
-        lines.append((*ids, score, R, t, seconds))
-    write_csv(path, lines)
+        lines: list[Sequence[object]] = [("scene_id", "im_id", "obj_id", "score", "R", "t", "time")]
+        for image, s, row in zip(images, samples, rows, strict=True):
+            if "rotation" in row:
+                R, t = (" ".join(map(str, v)) for v in (chain(*row["rotation"]), row["translation"]))
+                lines.append((*image, s["obj_id"], row["score"], R, t, times[image]))
+        write_csv(path, lines)
 
 
 def detection_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:

@@ -46,8 +46,8 @@ def evaluate(
     """Register the objects of a benchmark and score the results.
 
     ``out`` gets ``results.jsonl``, ``predictions.csv``, ``summary.json`` and ``index.html``. A second call registers
-    only what is new, or depends on files or settings that have changed. Under ``torchrun``, or in a job array that sets
-    ``RANK`` and ``WORLD_SIZE``, each process registers a part of the objects.
+    only what is new, or depends on files or settings that have changed. Under ``torchrun``, each process registers a
+    part of the objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.

@@ -19,21 +19,12 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import rotation_error
-from ..utils.checks import (
-    check_camera_matrix,
-    check_finite,
-    check_pose,
-    check_positive,
-    check_rotation,
-    check_symmetries,
-    check_tensor,
-)
+from ..utils.checks import check_camera_matrix, check_finite, check_pose, check_rotation, check_symmetries, check_tensor
 
 __all__ = [
     "ADD_THRESHOLDS",
     "MSPD_THRESHOLDS",
     "MSSD_THRESHOLDS",
-    "accuracy",
     "add_error",
     "adds_error",
     "average_recall",
@@ -77,7 +68,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """
     T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
-    return inf_unless(valid, torch.cat(means))
+    return _inf_unless(valid, torch.cat(means))
 
 
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
@@ -97,7 +88,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     tree = cKDTree(model.numpy())
     back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
     means = [float(tree.query((model @ T[:3, :3].T + T[:3, 3]).numpy())[0].mean()) for T in back]
-    return inf_unless(valid, torch.tensor(means, dtype=T_est.dtype, device=T_est.device))
+    return _inf_unless(valid, torch.tensor(means, dtype=T_est.dtype, device=T_est.device))
 
 
 def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
@@ -122,7 +113,7 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
         moved = difference.flatten(0, 1)[which]
         return torch.cat([_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)])
 
-    return inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
+    return _inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
 
 
 def mspd_error(
@@ -148,9 +139,7 @@ def mspd_error(
     batch = () if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est),)
     check_tensor(camera_matrix, "camera_matrix", (*batch, 3, 3))
     check_camera_matrix(camera_matrix)
-    K = camera_matrix.to(T_est.dtype)
-    if K.ndim == 3:
-        K = K.unsqueeze(1)
+    K = camera_matrix.to(T_est.dtype).unsqueeze(-3)
     true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
     estimated = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
 
@@ -158,10 +147,10 @@ def mspd_error(
         found = []
         for some in _chunks(which, points):
             (xy_a, front_a), (xy_b, front_b) = (_project(p.flatten(0, 1)[some], points) for p in (estimated, true))
-            found.append(inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
+            found.append(_inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
         return torch.cat(found)
 
-    return inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
+    return _inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
 
 
 def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
@@ -187,11 +176,13 @@ def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[
 def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
     """Fraction of the errors (N,) below a threshold, averaged over the thresholds in the same unit; NaN for N = 0.
 
+    With one threshold of 30 or 10 degrees it is Acc(pi/6) or Acc(pi/18).
+
     Example:
         >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
         0.5
     """
-    check_errors(errors)
+    _check_errors(errors)
     return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(thresholds)
 
 
@@ -213,7 +204,7 @@ def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tenso
 
 def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
     if symmetries is None:
-        return torch.eye(4, dtype=like.dtype, device=like.device).unsqueeze(0)
+        return torch.eye(4, dtype=like.dtype, device=like.device)[None]
     check_symmetries(symmetries)
     return symmetries.to(like)
 
@@ -236,17 +227,6 @@ def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
 
 
-def accuracy(errors: Tensor, threshold_deg: float) -> float:
-    """Fraction of the errors (N,) in degrees below a threshold: Acc(pi/6) with 30, Acc(pi/18) with 10; NaN for N = 0.
-
-    Example:
-        >>> accuracy(torch.tensor([5.0, 12.0, 40.0, 170.0]), 30.0)
-        0.5
-    """
-    check_positive(threshold_deg, "threshold_deg")
-    return average_recall(errors, (threshold_deg,))
-
-
 def median_error(errors: Tensor) -> float:
     """Median of the errors (N,) (MedErr): the mean of the middle two for an even number, NaN for N = 0.
 
@@ -254,8 +234,8 @@ def median_error(errors: Tensor) -> float:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
         26.0
     """
-    check_errors(errors)
-    if errors.numel() == 0:
+    _check_errors(errors)
+    if not len(errors):
         return math.nan
     ordered = errors.double().sort().values
     return float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
@@ -284,19 +264,17 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     valid = R_est.isfinite().flatten(-2).all(-1)
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
-    return inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
+    return _inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
 
 
-def check_errors(errors: Tensor) -> None:
-    """``errors`` is a floating (N,) tensor of numbers >= 0, ``inf`` included, NaN excluded."""
+def _check_errors(errors: Tensor) -> None:
     check_tensor(errors, "errors", (None,))
-    bad = int((~(errors >= 0)).sum())
-    if bad:
+    if bad := int((~(errors >= 0)).sum()):
         raise InvalidInputError(
             f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
         )
 
 
-def inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
+def _inf_unless(valid: Tensor, errors: Tensor) -> Tensor:
     """``errors``, replaced by ``inf`` where ``valid`` is False."""
     return torch.where(valid, errors, torch.full_like(errors, torch.inf))

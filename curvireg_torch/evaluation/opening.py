@@ -8,9 +8,9 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
 from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from ..pipeline import Pipeline
     from ..registration import Registrar
     from .runner import Entry
-
-__all__ = ["PRIOR_OPTIONS", "QUALIFIERS", "Numbers", "RegisterOptions", "check_camera", "open_registrar"]
 
 WITHIN = 45.0
 """Degrees of ``within`` beside ``near`` if none are given."""
@@ -79,10 +77,10 @@ def camera_option(text: str) -> Any:
         raise argparse.ArgumentTypeError(f"{error}; or give FILE (a calibration), exif, or --fov DEG") from None
 
 
-def _option(text: str, **how: Any) -> dict[str, Any]:
-    """Annotation of a field that is an option: its help, and other arguments of ``ArgumentParser.add_argument``;
+def _option(default: Any, text: str, **how: Any) -> Any:
+    """A field that is an option: its default, its help, and other arguments of ``ArgumentParser.add_argument``;
     ``flag`` is its name where that is not the field's."""
-    return {"help": text, **how}
+    return field(default=default, metadata={"help": text, **how})
 
 
 PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
@@ -100,88 +98,60 @@ PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class RegisterOptions:
-    """What to register, and how; the names and defaults are those of ``curvireg register``.
+    """What to register, and how; names, defaults and help texts are those of ``curvireg register``."""
 
-    Attributes:
-        photos: photographs, folders, patterns or videos.
-        meshes: mesh files or banks; of several, each photograph is registered to the best.
-        box, camera: x0, y0, x1, y1 and fx, fy, cx, cy in px, or a calibrated camera; None: detected, and unknown.
-        guess: of an unknown camera: "exif", or the horizontal field of view in degrees.
-        limits: on the pose, arguments of :class:`PosePrior`.
-        preset, pipeline: name of a pipeline, or its JSON file; None: the pipeline of a bank, or the default.
-        pose, top: the pose prior, and the number of hypotheses; None: those of the pipeline.
-
-    The help texts of the other fields are those of the command line.
-    """
-
-    photos: tuple[Path, ...] = ()
-    meshes: tuple[Path, ...] = ()
-    box: Annotated[
-        tuple[float, float, float, float] | None,
-        _option("in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")),
-    ] = None
-    camera: Annotated[
-        Any,  # four numbers, a Camera, or None
-        _option(
-            "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
-            "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
-            "result then has no covariance",
-            type=camera_option,
-        ),
-    ] = None
-    mask: Annotated[
-        Path | None, _option("picture in which the object is white, instead of --box or beside it", type=Path)
-    ] = None
-    guess: Annotated[
-        str | float | None, _option("horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG"))
-    ] = None
-    start: Annotated[
-        Path | None,
-        _option("result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path),
-    ] = None
-    limits: Mapping[str, Any] | None = None
-    unit: Annotated[
-        str,
-        _option("of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)),
-    ] = "m"
-    pose: Annotated[
-        str | None,
-        _option(
-            "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from "
-            "10 degrees below to 60 above; faster, and right more often where it is true (default: any)",
-            choices=("any", "upright"),
-        ),
-    ] = None
-    up: Annotated[
-        str | None,
-        _option("axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES),
-    ] = None
-    mesh_is: Annotated[
-        str | None,
-        _option(
-            "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
-            "(default: exact with a camera, similar without)",
-            choices=MESH_KINDS,
-        ),
-    ] = None
-    preset: Annotated[
-        str | None,
-        _option(
-            "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
-            f"search and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
-            choices=PRESET_NAMES,
-        ),
-    ] = None
-    pipeline: Annotated[Path | None, _option("JSON of a pipeline, instead of --preset", type=Path)] = None
-    instances: Annotated[int, _option("without a box: up to so many objects (default: 1)", type=whole_number(1))] = 1
-    field: Annotated[Path | None, _option("weights of a learned field", type=Path)] = None
-    top: Annotated[int | None, _option("hypotheses to carry and report (default: 5)", type=whole_number(1))] = None
-    refine: Annotated[bool, _option("stop at the best view of the bank", flag="--no-refine", action="store_false")] = (
-        True
+    photos: tuple[Path, ...] = ()  # photographs, folders, patterns or videos
+    meshes: tuple[Path, ...] = ()  # mesh files or banks; of several, each photograph is registered to the best
+    box: tuple[float, float, float, float] | None = _option(
+        None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
     )
-    renderer: Annotated[str, _option("default: auto", choices=RENDERER_NAMES)] = "auto"
-    device: Annotated[str, _option("device of modules, bank and search (default: cpu)")] = "cpu"
-    progress: Annotated[bool, _option("no progress bars", flag="--quiet", action="store_false")] = True
+    camera: Any = _option(  # four numbers, a Camera, or None
+        None,
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
+        "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
+        "result then has no covariance",
+        type=camera_option,
+    )
+    mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
+    guess: str | float | None = _option(
+        None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
+    )
+    start: Path | None = _option(
+        None, "result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path
+    )
+    limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
+    unit: str = _option(
+        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    )
+    pose: str | None = _option(
+        None,
+        "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
+        "degrees below to 60 above; faster, and right more often where it is true (default: any)",
+        choices=("any", "upright"),
+    )
+    up: str | None = _option(
+        None, "axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES
+    )
+    mesh_is: str | None = _option(
+        None,
+        "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
+        "(default: exact with a camera, similar without)",
+        choices=MESH_KINDS,
+    )
+    preset: str | None = _option(
+        None,
+        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search "
+        f"and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
+        choices=PRESET_NAMES,
+    )
+    pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)
+    instances: int = _option(1, "without a box: up to so many objects (default: 1)", type=whole_number(1))
+    field: Path | None = _option(None, "weights of a learned field", type=Path)
+    top: int | None = _option(None, "hypotheses to carry and report (default: 5)", type=whole_number(1))
+    refine: bool = _option(True, "stop at the best view of the bank", flag="--no-refine", action="store_false")
+    renderer: str = _option("auto", "default: auto", choices=RENDERER_NAMES)
+    device: str = _option("cpu", "device of modules, bank and search (default: cpu)")
+    progress: bool = _option(True, "no progress bars", flag="--quiet", action="store_false")
 
     @property
     def bank_decides(self) -> bool:
@@ -202,17 +172,16 @@ class RegisterOptions:
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
     def entry(self, photo: Path) -> "Entry":
-        """A photograph with the box, camera and meshes of these options."""
+        """A photograph with the box, camera, meshes and other inputs of these options."""
+        from ..geometry import Camera, camera_matrix
         from .runner import Entry
 
-        prior = prior_from_limits(self.limits or {})
-        return self.complete(Entry((), str(photo), photo, self.meshes, self.box, self.camera, self.mask, prior=prior))
-
-    def complete(self, entry: "Entry") -> "Entry":
-        """A photograph of a list with the options that a list does not hold."""
+        camera = self.guess if self.camera is None else self.camera
+        camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
         start, confidence = (None, None) if self.start is None else read_start(self.start)
-        own = replace(entry, guess=self.guess, instances=self.instances)
-        return replace(own, start=start, start_confidence=confidence)
+        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
+        same |= {"start": start, "start_confidence": confidence, "prior": prior_from_limits(self.limits or {})}
+        return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -287,26 +256,19 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
     Raises:
         CurviregError: the file is missing, damaged or does not hold a rigid pose.
     """
-    import torch
-
     from ..geometry.cameras import transform
-    from ..utils.checks import check_rotation
+    from ..utils.checks import check_numbers, check_pose
 
     content = read_json(path, dict, "docs/guides/known-pose.md")
-    rows = content.get("rotation")
-    rotation = [finite_numbers(row, 3) for row in rows] if isinstance(rows, list) else []
-    translation = finite_numbers(content.get("translation"), 3)
-    if len(rotation) == 3 and None not in rotation and content.get("translation", ...) is None:
+    if "rotation" in content and content.get("translation", ...) is None:
         message = "a result without a translation, as of a photograph without a camera; register with --camera first"
         raise InvalidInputError(message, subject=path)
-    if len(rotation) != 3 or None in rotation or translation is None:
-        raise InvalidInputError("expected rotation (3 x 3 numbers) and translation (3 numbers)", subject=path)
-    R = torch.tensor([list(row or ()) for row in rotation], dtype=torch.float64)
     try:
-        check_rotation(R, "rotation")
+        numbers = [check_numbers(content.get(name), name, n) for name, n in (("rotation", 9), ("translation", 3))]
+        T = transform(numbers[0].view(3, 3), numbers[1])
+        check_pose(T, "rotation, translation")
     except InvalidInputError as error:
-        raise error.with_subject(str(path)) from error
-    T = transform(R, torch.tensor(translation, dtype=torch.float64))
+        raise error.with_subject(path) from error
     confidence = finite_numbers([content.get("confidence")], 1)
     return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
 

@@ -18,13 +18,12 @@ from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
-from ..registration import FailedRegistration, Registrar, Registration, detect
-from ..registration.inputs import ImageItem, image_items
-from ..registration.poses import projected_box
+from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.result import result_document
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .result_files import write_result
+from .runner import box_of_result, image_item_of, register_image
 
 __all__ = ["RegisteredPhotograph", "register"]
 
@@ -124,20 +123,11 @@ def register(
             path = Path(mesh)
             mesh = ViewBank.load(path) if path.suffix == ".safetensors" else load_mesh(path, unit=unit, up=up)
         registrar = Registrar(mesh, pipeline=pipeline, progress=progress)
-    boxes, masks = None if box is None else [box], None if mask is None else [mask]
-    item = image_items([image], boxes, camera, prior, masks)[0]
-    if not isinstance(item, ImageItem):
-        raise item.with_subject("")
-    if boxes is None and masks is None:
-        result = detect(registrar, [image], camera, prior=prior)[0][0]
-    else:
-        result = registrar([image], boxes, camera, prior=prior, masks=masks)[0]
+    item = image_item_of(image, box, camera, prior, mask, name="")
+    result = register_image(registrar, image, box, camera, prior, mask)[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject("")
-    found = item.box.double()
-    if boxes is None and masks is None:
-        describer = registrar.of_model(result.model).describer
-        found = result.detection.box if result.detection else projected_box(describer, result.projection)
+    found = box_of_result(result, registrar, item, given=box is not None or mask is not None).double()
     values = {field.name: getattr(result, field.name) for field in fields(Registration)}
     box = found if result.corrected_box is None else result.corrected_box
     return RegisteredPhotograph(**values, registrar=registrar, image=item.image, box=box)

@@ -12,8 +12,6 @@ from ..geometry import rotation_from_axis_angle, viewpoint_from_rotation
 from ..geometry.pose_prior import PosePrior
 from ..utils.checks import check_integer, check_option
 
-__all__ = ["Protocol", "hint_of_truth", "perturbed_box", "random_numbers"]
-
 CHOICES = {"cad": ("annotated", "any"), "pose": ("upright", "any")}
 
 

@@ -14,26 +14,17 @@ __all__ = ["DATASETS", "DatasetSpec"]
 
 @dataclass(frozen=True)
 class DatasetSpec:
-    """A dataset, its benchmark, and what the command line says about it.
+    """A dataset, its benchmark, and what the command line says about it."""
 
-    Attributes:
-        dataset, benchmark: "package.module:attribute" of an :class:`ObjectDataset` and its :class:`Benchmark`.
-        help, root, example: for the command line: what the dataset is, what ROOT must contain, and an example of ROOT.
-        pose: default of the protocol's ``pose``.
-        category: format string of the name of a sample's group.
-        options: keyword arguments of the dataset's class, each with the options of ``ArgumentParser.add_argument``.
-        whole: options that select objects that are neither occluded nor truncated.
-    """
-
-    dataset: str
-    benchmark: str
+    dataset: str  # "package.module:attribute" of an ObjectDataset
+    benchmark: str  # the same of its Benchmark
     help: str
-    root: str
-    example: str
-    pose: str = "any"
-    category: str = "{category}"
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    whole: Mapping[str, Any] = field(default_factory=dict)
+    root: str  # what ROOT must contain
+    example: str  # of ROOT
+    pose: str = "any"  # default of the protocol's pose
+    category: str = "{category}"  # format of the name of a sample's group
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of the class, as add_argument takes them
+    whole: Mapping[str, Any] = field(default_factory=dict)  # options for objects neither occluded nor truncated
 
     def add_arguments(self, parser: Any) -> None:
         """Add ROOT and the options to a parser."""

@@ -18,8 +18,6 @@ from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .store import to_json
 
-__all__ = ["write_lost", "write_pose_stamped", "write_result", "write_views"]
-
 MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
 
 

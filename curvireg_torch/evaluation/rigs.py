@@ -1,11 +1,8 @@
 """Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
 
-import csv
-import io
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,45 +10,23 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..data import load_camera, read_photo
+from ..data import load_camera
 from ..data.bop import bop_box, entry_at
 from ..errors import CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera, camera_matrix, undistorted
-from ..geometry.calibration import Undistorted
+from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.result import result_document
 from ..utils.checks import check_pose
 from ..utils.files import check_table_size, finite_numbers, read_json
+from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, csv_cells, numbers_of
+from .runner import View, register_views
 
-__all__ = ["RigView", "read_rig", "register_rig"]
-
-BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
-ROTATION, QUATERNION = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), ("qw", "qx", "qy", "qz")
-TRANSLATION = ("tx", "ty", "tz")
+ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
 COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
 
 
-@dataclass(frozen=True)
-class RigView:
-    """One photograph of a rig.
-
-    Attributes:
-        name: where the rig names it, such as "row 2: left.png".
-        photo: its file.
-        box: x0, y0, x1, y1 in px, or None.
-        camera: the camera, with its distortion.
-        T_cam_from_world: (4, 4) float64, lengths in the mesh's unit.
-    """
-
-    name: str
-    photo: Path
-    box: tuple[float, ...] | None
-    camera: Camera
-    T_cam_from_world: Tensor
-
-
-def read_rig(path: Path, mesh: Path | None = None) -> list[RigView]:
+def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
     """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a scene of a BOP set.
 
     Columns of the CSV are ``photo``, ``x0`` to ``y1`` (may be empty), ``fx fy cx cy`` or ``camera`` (a calibration
@@ -69,11 +44,10 @@ def read_rig(path: Path, mesh: Path | None = None) -> list[RigView]:
         raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
-    check_table_size(path)
     return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path))
 
 
-def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
+def _checked(path: Path, rows: Iterator[View]) -> list[View]:
     """The rows, whose errors name the file."""
     try:
         views = list(rows)
@@ -84,60 +58,44 @@ def _checked(path: Path, rows: Iterator[RigView]) -> list[RigView]:
     return views
 
 
-def _view(name: str, photo: Path, box: Any, camera: Any, rotation: Any, translation: Any) -> RigView:
-    """A row from plain values: ``camera`` a path or 4 numbers, ``rotation`` 9 numbers or 4 of a quaternion."""
+def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any) -> View:
+    """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
         t = finite_numbers(translation, 3)
         if numbers is None or t is None:
             raise InvalidInputError(f"a rotation and a translation are needed; expected columns {COLUMNS}")
+        if camera is None:
+            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
         R = torch.tensor(numbers, dtype=torch.float64)
         if len(numbers) == 4 and abs(float(R.norm()) - 1.0) > 1e-2:
             raise InvalidInputError(f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order")
         R = R.view(3, 3) if len(numbers) == 9 else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
-        if isinstance(camera, Path | str):
-            return RigView(name, photo, box, load_camera(camera), T)
-        return RigView(name, photo, box, Camera(camera_matrix(*camera)), T)
+        return View(name, photo, box, camera, T)
     except CurviregError as error:
         raise InvalidInputError(str(error), subject=name) from error
 
 
-def _table(path: Path) -> Iterator[RigView]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"not CSV in UTF-8 ({error}); expected columns {COLUMNS}") from error
-    for number, row in enumerate(rows, start=1):
-        photo = (row.get("photo") or "").strip()
-        name = f"row {number}: {photo}"
-        if not photo:
+def _table(path: Path) -> Iterator[View]:
+    header, *rows = csv_cells(path) or [[]]
+    names = [name.strip().lower() for name in header]
+    for number, cells in enumerate(rows, start=1):
+        row = dict(zip(names, map(str.strip, cells), strict=False))
+        name = f"row {number}: {row.get('photo', '')}"
+        if not row.get("photo"):
             raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
-        camera, file = _cells(row, CAMERA, name), (row.get("camera") or "").strip()
-        if (camera is None) == (not file):
-            raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)", subject=name)
-        rotation = _cells(row, ROTATION, name) or _cells(row, QUATERNION, name)
-        where = path.parent / photo, _cells(row, BOX, name), camera or str(path.parent / file)
-        yield _view(name, *where, rotation, _cells(row, TRANSLATION, name))
+        try:
+            box, camera = numbers_of(row, BOX), camera_of(row, path.parent)
+            rotation = numbers_of(row, ROTATION) or numbers_of(row, QUATERNION)
+            translation = numbers_of(row, TRANSLATION)
+        except CurviregError as error:
+            raise error.with_subject(": ".join(filter(None, (name, error.subject)))) from error
+        yield _view(name, path.parent / row["photo"], box, camera, rotation, translation)
 
 
-def _cells(row: Mapping[str, Any], names: tuple[str, ...], where: str) -> tuple[float, ...] | None:
-    """The numbers in some columns; None if all are empty."""
-    texts = [(row.get(name) or "").strip() for name in names]
-    if not any(texts):
-        return None
-    try:
-        numbers = finite_numbers(list(map(float, texts)), len(names))
-    except ValueError:
-        numbers = None
-    if numbers is None:
-        raise InvalidInputError(f"expected numbers in {' '.join(names)}, got {' '.join(texts)!r}", subject=where)
-    return numbers
-
-
-def _colmap(folder: Path) -> Iterator[RigView]:
+def _colmap(folder: Path) -> Iterator[View]:
     """Photographs of ``images.txt``, in which every second line lists points, that lie in the folder, in ``images`` in
     it, or beside it."""
     check_table_size(folder / "images.txt")
@@ -162,11 +120,11 @@ def _colmap(folder: Path) -> Iterator[RigView]:
             *(place / "images" / match[3] for place in (folder, *folder.resolve().parents[:3])),
         ]
         photo = next((place for place in places if place.is_file()), places[0])
-        camera = f"{folder / 'cameras.txt'}:{match[2]}"
+        camera = load_camera(f"{folder / 'cameras.txt'}:{match[2]}")
         yield _view(f"image {match[3]}", photo, None, camera, pose[:4], pose[4:])
 
 
-def _bop(folder: Path, mesh: Path | None) -> Iterator[RigView]:
+def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
         read_json(folder / name, dict, "datasets/README.md") if (folder / name).is_file() else {}
@@ -186,55 +144,29 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[RigView]:
         mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
-        yield _view(f"image {key}", photo, box, (K[0], K[4], K[2], K[5]), *pose)
-
-
-def _undistorted(path: Path, view: RigView) -> tuple[Undistorted | None, Camera]:
-    """The photograph without distortion, None if it cannot be read, which fails by itself; and its camera."""
-    try:
-        image = read_photo(view.photo).image
-    except (CurviregError, OSError):
-        return None, view.camera
-    try:
-        camera = view.camera.at((image.shape[-2], image.shape[-1]))
-        return undistorted(image, camera, None if view.box is None else torch.tensor(view.box)), camera
-    except CurviregError as error:
-        raise error.with_subject(f"{path}: {view.name}") from error
+        camera_of_image = Camera(camera_matrix(K[0], K[4], K[2], K[5]))
+        yield _view(f"image {key}", photo, box, camera_of_image, *pose)
 
 
 def register_rig(
-    path: Path, rig: Sequence[RigView], registrar: Registrar, *, bank_seconds: float
+    path: Path, rig: Sequence[View], registrar: Registrar, *, bank_seconds: float
 ) -> tuple[Registration, dict[str, Any], list[tuple[Tensor, Tensor, Tensor, str] | None]]:
-    """Register the photographs of a rig together, see :meth:`.Registrar.register_views`, without their distortion.
+    """Register the photographs of a rig together, see :func:`.runner.register_views`.
 
-    Returns:
-        The registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph, or
-        None for one that could not be read.
-
-    Raises:
-        CurviregError: no pose; the message names the row.
+    Returns the registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph,
+    or None for one that could not be read.
     """
     start = time.perf_counter()
-    seen = [_undistorted(path, view) for view in rig]
-    found = [
-        one and (one.image, camera.matrix, view.T_cam_from_world, view.name)
-        for view, (one, camera) in zip(rig, seen, strict=True)
-    ]
-    images = [view.photo if one is None else one.image for view, (one, _) in zip(rig, seen, strict=True)]
-    boxes = [None if one is None else one.box for one, _ in seen]
-    matrices = torch.stack([camera.matrix for _, camera in seen])
-    poses = torch.stack([view.T_cam_from_world for view in rig])
     try:
-        boxes_given = boxes if any(box is not None for box in boxes) else None
-        result = registrar.register_views(images, boxes_given, matrices, poses)
+        result, seen, cameras = register_views(rig, registrar)
     except CurviregError as error:
-        named = re.sub(r"\bimage (\d+)\b", lambda number: rig[int(number[1])].name, f"{error}")
-        raise InvalidInputError(named, subject=path) from error
-    seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
-    document = result_document(result, registrar, seconds)
+        raise InvalidInputError(f"{error}", subject=path) from error
+    document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["frame"] = "world"
     document["inputs"] = {"rig": str(path), "box": None}
-    for row, view, (_, camera) in zip(document["views"], rig, seen, strict=True):
+    found = []
+    for row, view, one, camera in zip(document["views"], rig, seen, cameras, strict=True):
         row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
         row["T_cam_from_world"] = view.T_cam_from_world.tolist()
+        found.append(one and (one.image, camera.matrix, view.T_cam_from_world, view.name))
     return result, document, found

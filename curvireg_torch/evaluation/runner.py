@@ -1,10 +1,12 @@
 """Objects in photographs, of lists and of datasets: their record, and the resumable loop that registers them."""
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import groupby
 from pathlib import Path
@@ -16,7 +18,8 @@ from tqdm import tqdm
 
 from ..data import Photo, read_photo
 from ..errors import BankError, CurviregError, InvalidInputError, MeshError, MissingFileError
-from ..geometry import Camera, camera_matrix, undistorted
+from ..geometry import Camera, undistorted
+from ..geometry.calibration import Undistorted
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
 from ..mesh.files import mesh_digest
@@ -28,19 +31,7 @@ from ..registration.result import SCHEMA, detection_document, result_document, u
 from ..utils.files import code_digest, file_digest, text_digest, write_file
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
-from .store import ResultStore, Row
-from .workers import workers
-
-__all__ = [
-    "POSE_SOURCES",
-    "Entry",
-    "OpenRegistrar",
-    "check_entry",
-    "failed_row",
-    "register_entry",
-    "run_entries",
-    "seen_image",
-]
+from .store import ResultStore, Row, workers
 
 POSE_SOURCES = (
     *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
@@ -48,7 +39,7 @@ POSE_SOURCES = (
 )
 """Parts of the package that results depend on."""
 
-REPORTS = ("summary.json", "predictions.csv", "results.csv", "bop.csv", "index.html")
+REPORTS = ("summary.json", "predictions.csv", "results.csv", "index.html")
 """Files that are written from all results at the end; older ones would not match newer results."""
 
 CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
@@ -59,66 +50,42 @@ OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
 
 
 @dataclass(frozen=True)
-class OtherView:
-    """Another photograph of the object of an :class:`Entry`, in the same pose.
+class View:
+    """One of several photographs of an object in one pose."""
 
-    Attributes:
-        photo, box, camera: as of an entry; the camera is needed.
-        T_cam_from_first: (4, 4) transform from the camera of the entry's photograph to that of this one, with lengths
-            in the unit of the mesh.
-    """
-
+    name: str  # as the user calls the photograph
     photo: Path
-    box: Sequence[float] | None
-    camera: Sequence[float]
-    T_cam_from_first: tuple[tuple[float, ...], ...]
+    box: Sequence[float] | None  # x0, y0, x1, y1 in px
+    camera: Camera
+    T_cam_from_world: Tensor  # (4, 4) float64, lengths in the mesh's unit
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One object in one photograph, to register.
+    """One object in one photograph, to register."""
 
-    Attributes:
-        cells: of a list: the texts of the row, one for each column.
-        name, photo: the photograph as the user names it, and its file.
-        meshes: mesh files; of several the best is found.
-        box: x0, y0, x1, y1 in px; None: the object is detected.
-        camera: fx, fy, cx, cy in px, or a calibrated camera; None if unknown.
-        mask: file of a mask of the object, instead of a box or beside it.
-        guess: replaces an unknown camera: "exif" takes the focal length in the photograph's file, a number is the
-            horizontal field of view in degrees; None: no camera.
-        instances: without a box, see :func:`curvireg_torch.registration.detect`.
-        prior: limits on the pose.
-        start, start_confidence: (4, 4) pose that is refined, nothing is searched for; and its confidence if known.
-        views: other photographs, with which the pose in ``photo`` is found together.
-        as_stored: boxes refer to the pixels as the file holds them; else the EXIF orientation is applied first.
-        label: of a dataset's object: a name that no other object has.
-        error: why the object cannot be registered; "" if it can.
-    """
-
-    cells: tuple[str, ...] = ()
-    name: str = ""
+    cells: Mapping[str, str] = field(default_factory=dict)  # of a list: the texts of the row by column
+    name: str = ""  # as the user calls the photograph
     photo: Path = Path()
-    meshes: tuple[Path, ...] = ()
-    box: Sequence[float] | None = None
-    camera: Sequence[float] | Camera | None = None
-    mask: Path | None = None
-    guess: str | float | None = None
-    instances: int = 1
+    meshes: tuple[Path, ...] = ()  # of several the best is found
+    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
+    camera: Camera | str | float | None = None  # "exif" and a horizontal field of view in degrees are guesses
+    mask: Path | None = None  # of the object, instead of a box or beside it
+    instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
-    start: tuple[tuple[float, ...], ...] | None = None
+    start: tuple[tuple[float, ...], ...] | None = None  # (4, 4) pose that is refined; nothing is searched for
     start_confidence: float | None = None
-    views: tuple[OtherView, ...] = ()
-    as_stored: bool = False
-    label: str = ""
-    error: str = ""
+    views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
+    as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    label: str = ""  # of a dataset's object: a name that no other object has
+    error: str = ""  # why the object cannot be registered
 
     def request(self) -> list[Any]:
         """All that the result depends on besides the content of files."""
         prior = None if self.prior is None else self.prior.to_dict()
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
-        given = [self.name, self.box, camera, self.guess, self.instances, prior]
-        views = [(view.box, view.camera, view.T_cam_from_first) for view in self.views]
+        given = [self.name, self.box, camera, self.instances, prior]
+        views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
         return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
 
@@ -138,15 +105,38 @@ def seen_image(entry: Entry, photo: Photo) -> Tensor:
     return undistorted(photo.image, entry.camera).image if isinstance(entry.camera, Camera) else photo.image
 
 
-def _item(entry: Entry, photo: Photo, camera: Tensor | Camera | None) -> ImageItem:
-    boxes = None if entry.box is None else [entry.box]
-    masks = None if entry.mask is None else [entry.mask]
+def _item(entry: Entry, photo: Photo, camera: Camera | None) -> ImageItem:
     if entry.mask is not None and not entry.mask.is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
-    item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
+    return image_item_of(photo.image, entry.box, camera, entry.prior, entry.mask, name=entry.name)
+
+
+def image_item_of(image: Any, box: Any, camera: Any, prior: PosePrior | None, mask: Any, *, name: str) -> ImageItem:
+    """One photograph and what is known about it, checked; errors begin with its name."""
+    boxes, masks = None if box is None else [box], None if mask is None else [mask]
+    item = image_items([image], boxes, camera, prior, masks)[0]
     if isinstance(item, CurviregError):
-        raise item.with_subject(entry.name)
+        raise item.with_subject(name)
     return item
+
+
+def register_image(
+    registrar: Registrar, image: Any, box: Any, camera: Any, prior: PosePrior | None, mask: Any, instances: int = 1
+) -> Sequence[Registration | FailedRegistration]:
+    """The pose in one photograph, or of its ``instances`` objects if they are detected, without box and mask."""
+    if box is None and mask is None:
+        return detect(registrar, [image], camera, instances=instances, prior=prior)[0]
+    boxes, masks = None if box is None else [box], None if mask is None else [mask]
+    return registrar([image], boxes, camera, prior=prior, masks=masks)
+
+
+def box_of_result(result: Registration, registrar: Registrar, item: ImageItem, *, given: bool) -> Tensor:
+    """(4,) in px: the box that was given or detected, or that of the mesh at the pose."""
+    if given:
+        return item.box
+    if result.detection is not None:
+        return result.detection.box
+    return projected_box(registrar.of_model(result.model).describer, projection_of(result, item.camera_matrix))
 
 
 def register_entry(
@@ -162,27 +152,21 @@ def register_entry(
     """
     start = time.perf_counter()
     camera, source = _camera(entry, photo)
-    item, images = _item(entry, photo, camera), [photo.image]
+    item = _item(entry, photo, camera)
+    results: Sequence[Registration | FailedRegistration]
     if entry.start is not None:
-        results = refine(registrar, images, camera, [entry.start], start_confidences=[entry.start_confidence])
+        results = refine(registrar, [photo.image], camera, [entry.start], start_confidences=[entry.start_confidence])
     elif entry.views:
-        results = [_registered_views(entry, photo, registrar)]
-    elif entry.box is None and entry.mask is None:
-        results = detect(registrar, images, camera, instances=entry.instances, prior=entry.prior)[0]
+        assert camera is not None  # of datasets with cameras only
+        first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))
+        results = [register_views([first, *entry.views], registrar, as_stored=entry.as_stored)[0]]
     else:
-        box = None if entry.box is None else torch.tensor(entry.box)[None]
-        masks = None if entry.mask is None else [entry.mask]
-        results = registrar(images, box, camera, prior=entry.prior, masks=masks)
+        results = register_image(registrar, photo.image, entry.box, camera, entry.prior, entry.mask, entry.instances)
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
-    if entry.box is not None or entry.mask is not None:
-        box = item.box
-    elif result.detection is not None:
-        box = result.detection.box
-    else:
-        box = projected_box(registrar.of_model(result.model).describer, projection_of(result, item.camera_matrix))
-    K = item.camera_matrix
+    K, given = item.camera_matrix, entry.box is not None or entry.mask is not None
+    box = box_of_result(result, registrar, item, given=given)
     document = {
         **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
         "mesh": str(entry.meshes[result.model]),
@@ -194,7 +178,7 @@ def register_entry(
             "camera_source": source,
             "picture": photo.facts(),
         },
-        "camera": None if K is None else (camera if isinstance(camera, Camera) else Camera(K)).at(item.size).describe(),
+        "camera": None if camera is None else camera.at(item.size).describe(),
     }
     if result.detection is not None:
         document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
@@ -203,21 +187,39 @@ def register_entry(
     return result, document
 
 
-def _registered_views(entry: Entry, photo: Photo, registrar: Registrar) -> Registration:
-    """The pose in the first of several photographs: the world is its camera."""
-    images: list[Any] = [photo.image]
-    for view in entry.views:
+def register_views(
+    views: Sequence[View], registrar: Registrar, *, as_stored: bool = False
+) -> tuple[Registration, list[Undistorted | None], list[Camera]]:
+    """Register several photographs together, see :meth:`.Registrar.register_views`, without their distortion.
+
+    Returns:
+        The registration; and the photographs without distortion, None for one that could not be read, and their
+        cameras.
+
+    Raises:
+        CurviregError: no pose; the message names the photograph.
+    """
+    seen, cameras = [], []
+    for view in views:
+        one, camera = None, view.camera
+        with suppress(CurviregError, OSError):  # the registrar reports what cannot be read, and goes on without it
+            one = read_photo(view.photo, as_stored=as_stored).image
         try:
-            images.append(read_photo(view.photo, as_stored=entry.as_stored).image)
-        except CurviregError:
-            images.append(view.photo)  # the registrar reports that it cannot be read, and goes on without it
-    boxes = [entry.box, *(view.box for view in entry.views)]
-    assert not isinstance(entry.camera, Camera)  # of datasets only
-    cameras = [entry.camera or (), *(view.camera for view in entry.views)]
-    K = torch.stack([camera_matrix(*camera, dtype=torch.float64) for camera in cameras])
-    first = torch.eye(4, dtype=torch.float64)
-    poses = [torch.tensor(view.T_cam_from_first, dtype=torch.float64) for view in entry.views]
-    return registrar.register_views(images, boxes, K, torch.stack([first, *poses]))
+            if one is not None:
+                camera = camera.at((one.shape[-2], one.shape[-1]))
+            box = None if view.box is None else torch.tensor(view.box)
+            seen.append(None if one is None else undistorted(one, camera, box))
+        except CurviregError as error:
+            raise error.with_subject(view.name) from error
+        cameras.append(camera)
+    images = [view.photo if one is None else one.image for view, one in zip(views, seen, strict=True)]
+    boxes = [None if one is None else one.box for one in seen]
+    matrices, poses = (torch.stack(each) for each in ([c.matrix for c in cameras], [v.T_cam_from_world for v in views]))
+    try:
+        return registrar.register_views(images, boxes, matrices, poses), seen, cameras
+    except CurviregError as error:
+        named = re.sub(r"\bimage (\d+)\b", lambda number: views[int(number[1])].name, f"{error}")
+        raise InvalidInputError(named) from error
 
 
 def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -225,23 +227,22 @@ def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tenso
     return (result.views[0].T_cam_from_model, K) if result.views and K is not None else result.projection
 
 
-def _camera(entry: Entry, photo: Photo) -> tuple[Tensor | Camera | None, str | None]:
-    """Camera or camera matrix, and its source."""
-    if isinstance(entry.camera, Camera):
-        return entry.camera, "file"
-    if entry.camera is not None:
-        return camera_matrix(*entry.camera, dtype=torch.float64), "given"
-    if entry.guess is None:
+def _camera(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
+    """The camera, and its source; that of a calibration has a size or distortion."""
+    given = entry.camera
+    if isinstance(given, Camera):
+        return given, "file" if given.size or given.distorts else "given"
+    if given is None:
         if entry.start is not None:
             raise InvalidInputError(f"--start: needs the camera; give {CAMERA_OPTIONS}", subject=entry.name)
         return None, None
-    if isinstance(entry.guess, float):
+    if given != "exif":
         H, W = photo.image.shape[-2:]
-        return camera_of_view(entry.guess, (H, W)), "fov"
+        return Camera(camera_of_view(float(given), (H, W))), "fov"
     K = photo.guessed_camera_matrix()
     if K is None:
         raise InvalidInputError(f"no focal length in its EXIF; give {CAMERA_OPTIONS}", subject=entry.name)
-    return K, "exif"
+    return Camera(K), "exif"
 
 
 def run_entries(
@@ -253,24 +254,16 @@ def run_entries(
     label: str,
     progress: bool = True,
 ) -> ResultStore | None:
-    """Register the entries whose results the store in ``out`` does not hold yet, in one process or several.
+    """Register the entries, without ``error`` and of different keys, whose results ``out`` does not hold yet.
 
     A stored row counts if its digests are the same: that of the photograph's content, and that of the request, which
-    covers ``settings``, the code of this library, the entry's own request and every file of its meshes. Entries of the
-    same meshes follow each other, so that only one bank is in memory, and are registered side by side on torch's
-    threads; each row is on disk as soon as it is known. An input that cannot be used makes a row with ``failed`` as
-    ``status`` and does not stop the others.
-
-    Args:
-        entries: without ``error``, of different keys.
-        out: folder of the store, and of the ``thumbnails`` of the results.
-        open_registrar: called once for each set of meshes.
-        settings: plain values, everything that all results depend on.
-        label: of the progress bar.
-        progress: show it.
+    covers ``settings`` (all that every result depends on), the code of this library, the entry's own request and every
+    file of its meshes. Entries of the same meshes follow each other, so that only one bank is in memory, and are
+    registered side by side on torch's threads; each row is on disk as soon as it is known. An input that cannot be used
+    makes a row with ``failed`` as ``status`` and does not stop the others.
 
     Returns:
-        The store, which holds all entries; None in processes that leave the report to another.
+        The store, which holds all entries; None in processes that leave the report to the first one.
 
     Raises:
         CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
@@ -285,7 +278,7 @@ def run_entries(
         return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
 
     with workers() as group:
-        if group.reports:
+        if group.leads:
             for name in REPORTS:
                 (out / name).unlink(missing_ok=True)
         group.wait()
@@ -298,12 +291,11 @@ def run_entries(
             for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
                 _register_some(list(same), meshes, store, open_registrar, bar)
         group.wait()
-        if not group.reports or not store.is_complete({entry.key: digests(entry) for entry in entries}):
-            if group.leads:
-                raise InvalidInputError(f"{out}: a photograph or mesh changed meanwhile; run the same command again")
+        if not group.leads:
             return None
-        if group.leads:
-            store.merge()
+        if not store.is_complete({entry.key: digests(entry) for entry in entries}):
+            raise InvalidInputError(f"{out}: a photograph or mesh changed meanwhile; run the same command again")
+        store.merge()
         return store
 
 
@@ -349,7 +341,7 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     except CurviregError as error:
         return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
     renderer = registrar.of_model(result.model).describer.renderer
-    K = camera_matrix(*entry.camera) if entry.views and isinstance(entry.camera, Sequence) else None
+    K = entry.camera.matrix if entry.views and isinstance(entry.camera, Camera) else None
     projection = projection_of(result, K)
     write_file(picture, thumbnail(renderer, projection, seen_image(entry, photo), used_box(document)))
     return {"status": "ok", "message": "", **document}

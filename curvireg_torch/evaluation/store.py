@@ -1,19 +1,83 @@
-"""Results on disk: JSON lines that several processes append to."""
+"""Results on disk: JSON lines that several processes append to; and these processes."""
 
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import torch.distributed as dist
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import write_file
-from .workers import Workers
-
-__all__ = ["ResultStore", "Row", "to_json"]
 
 Row = dict[str, Any]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Workers:
+    """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list."""
+
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process merges the store and writes the tables when all are done."""
+        return self.rank == 0
+
+    def wait(self) -> None:
+        """Wait for all processes."""
+        if self.size > 1:
+            dist.barrier()
+
+    def part(self, items: Sequence[T]) -> Sequence[T]:
+        """The items of this process: neighbours stay together."""
+        n = len(items)
+        return items[self.rank * n // self.size : (self.rank + 1) * n // self.size]
+
+
+@contextmanager
+def workers() -> Iterator[Workers]:
+    """The processes that ``torchrun`` started, or this one alone.
+
+    Example:
+        >>> with workers() as group:
+        ...     group.rank, group.size
+        (0, 1)
+    """
+    if not (dist.is_available() and dist.is_torchelastic_launched()):
+        yield Workers()
+        return
+    # Parts differ in cost, and the first process to finish waits for the last.
+    dist.init_process_group("gloo", timeout=timedelta(days=7))
+    try:
+        yield Workers(dist.get_rank(), dist.get_world_size())
+    finally:
+        dist.destroy_process_group()
+
+
+def run_processes(count: int, words: Sequence[str]) -> bool:
+    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes.
+
+    Raises:
+        InvalidInputError: a process failed.
+    """
+    if count <= 1 or "TORCHELASTIC_RUN_ID" in os.environ:
+        return False
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    environment = {"OMP_NUM_THREADS": "1", **os.environ}
+    done = subprocess.run([*torchrun, "-m", "curvireg_torch", *words], env=environment, check=False)
+    if done.returncode:
+        raise InvalidInputError(f"--jobs: a process ended with {done.returncode}; its message is above")
+    return True
 
 
 def finite(value: Any) -> Any:

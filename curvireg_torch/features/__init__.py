@@ -7,7 +7,6 @@ Descriptors keep the dtype (half types compute in float32). Wrong shapes, dtypes
 from .hog import HOG as HOG
 from .hog import field_points as field_points
 from .hog import hog as hog
-from .hog import orientation_cells as orientation_cells
 from .learned_field import FieldNetwork as FieldNetwork
 from .learned_field import LearnedCurvilinearSaliency as LearnedCurvilinearSaliency
 from .learned_field import doubled_angle as doubled_angle

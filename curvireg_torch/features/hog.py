@@ -59,7 +59,7 @@ def hog(
             raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
     def layer(field: Tensor) -> ops.Planes:
-        cells = _cell_histograms(field, (grid, grid), bins, voting)
+        cells = _cell_histograms(field, grid, bins, voting)
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
         return (_normalised_blocks(cells, block, clip),)
@@ -67,32 +67,10 @@ def hog(
     return ops.apply_in_blocks(layer, ops.at_least_float32(field)).to(field.dtype)
 
 
-def orientation_cells(field: Tensor, *, grid: tuple[int, int], bins: int = 9) -> Tensor:
-    """Cell histograms of :func:`hog` before block normalisation, on a grid that may be rectangular.
-
-    Args:
-        field, bins: as in :func:`hog`.
-        grid: rows and columns of cells, at most H and W.
-
-    Returns:
-        (B, bins, rows, columns) mean vector length per orientation in the unit of the field.
-
-    Example:
-        >>> orientation_cells(torch.randn(1, 2, 48, 64), grid=(6, 8)).shape
-        torch.Size([1, 9, 6, 8])
-    """
-    check_tensor(field, "field", (None, 2, None, None))
-    _check_options(min(grid), bins, 1, 1.0, "linear")
-    H, W = field.shape[-2:]
-    if grid[0] > H or grid[1] > W:
-        raise InvalidInputError(f"field: expected at least {grid[0]} x {grid[1]} px for {grid=}, got {H} x {W}")
-    return _cell_histograms(ops.at_least_float32(field), grid, bins, "linear").to(field.dtype)
-
-
-def _cell_histograms(field: Tensor, grid: tuple[int, int], bins: int, voting: str) -> Tensor:
-    """Mean votes per cell, (B, bins, rows, columns)."""
+def _cell_histograms(field: Tensor, grid: int, bins: int, voting: str) -> Tensor:
+    """Mean votes per cell, (B, bins, grid, grid)."""
     votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins, voting)
-    rows, columns = (_cell_weights(n, cells, voting, votes) for n, cells in zip(field.shape[-2:], grid, strict=True))
+    rows, columns = (_cell_weights(n, grid, voting, votes) for n in field.shape[-2:])
     with ops.full_precision(votes):
         return rows @ (votes @ columns.T)
 
@@ -190,13 +168,7 @@ class HOG(FunctionModule):
         return (self.grid - self.block + 1) ** 2 * self.block**2 * self.bins
 
     def rotated_by_180(self, descriptors: Tensor) -> Tensor:
-        """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged.
-
-        Example:
-            >>> field, layer = torch.randn(1, 2, 64, 64), HOG()
-            >>> torch.allclose(layer.rotated_by_180(layer(field)), layer(-field.rot90(2, (2, 3))), atol=1e-6)
-            True
-        """
+        """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged."""
         n = self.grid - self.block + 1
         cells = descriptors.view(-1, n, n, self.block, self.block, self.bins)
         return cells.flip(1, 2, 3, 4).flatten(1)

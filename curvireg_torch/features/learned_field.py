@@ -22,10 +22,8 @@ MAX_ASPECT = 8  # of the longer to the shorter side at which an image is still c
 
 
 def doubled_angle(field: Tensor) -> Tensor:
-    """Map vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t), (B, 2, H, W), so that v and -v become equal.
-
-    Opposite vectors then add up instead of cancelling, which averaging and learning need.
-    """
+    """Map vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t), (B, 2, H, W), so that v and -v become equal. Opposite
+    vectors then add up instead of cancelling, which averaging and learning need."""
     x, y = ops.at_least_float32(field).unbind(1)
     length = ops.safe_sqrt(x * x + y * y)
     scale = length.clamp(min=1e-12) ** -1.5

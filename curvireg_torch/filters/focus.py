@@ -81,15 +81,15 @@ def multiscale_focus_curves(
     sigma: float | Tensor = 1.0,
     mode: str = "reblur-image",
     saliency_weight: float = 1.0,
-    threshold: float | None = None,
 ) -> Tensor:
     r"""MFC (the paper's section "Multi Focus Curves"): edges in focus, the sharpest with the largest length.
 
-    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i` exceeds T at all n-1
-    scales and its saliency exceeds 0.1 % of the largest in the image, which rejects noise in flat regions. Its value is
-    :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint). The measured blur of a step edge
-    includes the pre-smoothing ``sigma``, so its value is at most 1/sigma. Noise, thin lines and corners are not step
-    edges; only the derivative kernel limits their value, to 1/0.6 = 1.67 per px at every sigma.
+    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i` exceeds
+    :math:`e^{-n}` at all n-1 scales and its saliency exceeds 0.1 % of the largest in the image, which rejects noise in
+    flat regions. Its value is :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint). The
+    measured blur of a step edge includes the pre-smoothing ``sigma``, so its value is at most 1/sigma. Noise, thin
+    lines and corners are not step edges; only the derivative kernel limits their value, to 1/0.6 = 1.67 per px at every
+    sigma.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
@@ -98,7 +98,6 @@ def multiscale_focus_curves(
         mode: of :func:`edge_blur`.
         saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
             :math:`|\nabla I|`; 1 ranks the views of real photographs best.
-        threshold: T >= 0 in 1/px; None is the paper's :math:`e^{-n}`.
 
     Returns:
         (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient.
@@ -110,7 +109,6 @@ def multiscale_focus_curves(
     check_option(mode, MODES, "mode")
     check_integer(scales, "scales", least=2)
     power = check_positive(saliency_weight, "saliency_weight", zero_ok=True)
-    limit = check_positive(math.exp(-scales) if threshold is None else threshold, "threshold", zero_ok=True)
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
 
     def layer(image: Tensor) -> ops.Planes:
@@ -121,7 +119,7 @@ def multiscale_focus_curves(
         blur = functools.reduce(torch.maximum, _edge_blur(x, saliency, [float(i) for i in range(1, scales)], mode))
         # Blur below that of the derivative kernel cannot be measured.
         focus = blur.clamp(min=DIFFERENCE_VARIANCE**0.5).reciprocal()
-        retained = (focus > limit) & (saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency))
+        retained = (focus > math.exp(-scales)) & (saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency))
         weight = saliency.clamp(min=ops.safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 
@@ -129,12 +127,7 @@ def multiscale_focus_curves(
 
 
 class EdgeBlur(FunctionModule, function=edge_blur):
-    """Module twin of :func:`edge_blur`.
-
-    Example:
-        >>> EdgeBlur(reblur_sigmas=(1.0, 2.0))(torch.rand(1, 1, 32, 32)).shape
-        torch.Size([1, 2, 32, 32])
-    """
+    """Module twin of :func:`edge_blur`."""
 
     def __init__(
         self, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
@@ -142,13 +135,7 @@ class EdgeBlur(FunctionModule, function=edge_blur):
 
 
 class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, learnable=("sigma",)):
-    """Module twin of :func:`multiscale_focus_curves`.
-
-    Example:
-        >>> from curvireg_torch import HOG
-        >>> torch.nn.Sequential(MultiScaleFocusCurves(), HOG())(torch.rand(2, 3, 64, 64)).shape
-        torch.Size([2, 1764])
-    """
+    """Module twin of :func:`multiscale_focus_curves`."""
 
     def __init__(
         self,
@@ -157,6 +144,5 @@ class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, le
         sigma: float = 1.0,
         mode: str = "reblur-image",
         saliency_weight: float = 1.0,
-        threshold: float | None = None,
         learnable: bool = False,
     ) -> None: ...

@@ -28,8 +28,8 @@ def _options(function: Callable[..., Any]) -> dict[str, Any]:
     return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY}
 
 
-def _twin_docstring(twin: str, function: Callable[..., Any], learnable: tuple[str, ...]) -> str:
-    """The docstring of a twin with the options, the input and the output from the docstring of its function."""
+def _twin_docstring(summary: str, function: Callable[..., Any], learnable: tuple[str, ...]) -> str:
+    """The docstring of a twin with the options, the input, the output and the example of its function."""
     sections = re.split(r"^(\w+):\n", inspect.getdoc(function) or "", flags=re.MULTILINE)
     texts = dict(zip(sections[1::2], sections[2::2], strict=True))
     options, shape = [], []
@@ -39,18 +39,14 @@ def _twin_docstring(twin: str, function: Callable[..., Any], learnable: tuple[st
         shape += [] if of_constructor and len(of_constructor) == len(names.split(", ")) else [f"    Input: {text}"]
     if learnable:
         options.append(f"    learnable: make {' and '.join(learnable)} trainable; they stay positive.")
-    summary, _, example = twin.partition("\n\n")
     output = f"    Output: {texts.get('Returns', '').strip()}"
-    return "\n".join([summary, "", "Args:", *options, "", "Shape:", *shape, output, "", example])
+    return "\n".join([summary, "", "Args:", *options, "", "Shape:", *shape, output, "", "Example:", texts["Example"]])
 
 
 class FunctionModule(nn.Module):
-    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``.
-
-    It holds the function's options, refuses what the function refuses, and has its documentation. A twin writes its
-    constructor only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive
-    parameters.
-    """
+    """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``. It holds
+    the function's options, refuses what the function refuses, and has its documentation. A twin writes its constructor
+    only as a signature, for type checkers and editors; the flag ``learnable`` makes options positive parameters."""
 
     _function: ClassVar[Callable[..., Tensor]]
 

@@ -49,14 +49,11 @@ def image_maximum(x: Tensor) -> Tensor:
     return x.amax(dim=(1, 2, 3), keepdim=True)
 
 
-def _in_func_transform(x: Tensor) -> bool:
-    # torch has no public test for this; code that branches on values or writes into a tensor would fail under vmap.
-    return torch._C._functorch.is_functorch_wrapped_tensor(x)
-
-
 def is_host_readable(x: Tensor) -> bool:
     """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a ``torch.func`` call."""
-    return not torch.compiler.is_compiling() and x.device.type == "cpu" and not _in_func_transform(x)
+    if torch.compiler.is_compiling() or x.device.type != "cpu":
+        return False
+    return not torch._C._functorch.is_functorch_wrapped_tensor(x)  # torch has no public test for this
 
 
 def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> float | Tensor:
@@ -74,11 +71,6 @@ def check_sigmas(sigmas: Sequence[float], name: str) -> list[float]:
     if not hasattr(sigmas, "__len__") or len(sigmas) == 0:
         raise InvalidInputError(f"{name}: expected a sequence of at least one sigma, got {sigmas!r:.40}")
     return [check_positive(sigma, name) for sigma in sigmas]
-
-
-def safe_reciprocal(value: float | Tensor) -> float | Tensor:
-    """1 / value; a tensor is clamped to [1e-6, 1e6], because its range cannot be checked while tracing."""
-    return 1.0 / (value.clamp(min=1e-6, max=1e6) if isinstance(value, Tensor) else value)
 
 
 Planes = tuple[Tensor, ...]  # channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all
@@ -171,16 +163,11 @@ MIN_TENSOR_SIGMA = 1e-3  # px, below which a kernel is a single 1 in every dtype
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
-    """Separable Gaussian smoothing with replicated borders.
+    """Separable Gaussian smoothing of (B, C, H, W) with replicated borders; NaN spreads.
 
     Args:
-        x: (B, C, H, W), as the result. NaN spreads.
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
             ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are clamped to 0.001 px, not checked.
-
-    Example:
-        >>> gaussian_smooth(torch.ones(1, 1, 5, 5), 1.0).shape
-        torch.Size([1, 1, 5, 5])
     """
     return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(x.dtype)
 

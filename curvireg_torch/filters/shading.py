@@ -191,10 +191,8 @@ def apparent_ridges(
         (B, 2, H, W): length :math:`q_1` in 1/px (0 off the ridges), direction :math:`t_1` with arbitrary sign.
 
     Example:
-        >>> x = (torch.arange(33.0) - 16).expand(1, 1, 33, 33)
-        >>> roof = 10 + x.abs()
-        >>> field = apparent_ridges(roof, sigma=1.0, depth_scale=1.0)
-        >>> int(field[0, :, 16].norm(dim=0).argmax())                              # its edge
+        >>> roof = 10 + (torch.arange(33.0) - 16).abs().expand(1, 1, 33, 33)
+        >>> int(apparent_ridges(roof, depth_scale=1.0)[0, :, 16].norm(dim=0).argmax())       # its edge
         16
     """
 
@@ -206,14 +204,7 @@ def apparent_ridges(
 
 
 class AverageShadingGradient(DepthModule, function=average_shading_gradient):
-    """Module twin of :func:`average_shading_gradient`.
-
-    Example:
-        >>> camera = torch.tensor([[50.0, 0.0, 15.5], [0.0, 50.0, 15.5], [0.0, 0.0, 1.0]])
-        >>> wall = torch.full((1, 1, 32, 32), 3.0)
-        >>> round(float(AverageShadingGradient(camera_matrix=camera)(wall).norm()), 3)
-        0.0
-    """
+    """Module twin of :func:`average_shading_gradient`."""
 
     def __init__(
         self, *, camera_matrix: Tensor | None = None, sigma: float = 1.0, depth_scale: float | None = None
@@ -221,23 +212,13 @@ class AverageShadingGradient(DepthModule, function=average_shading_gradient):
 
 
 class HessianFrobeniusNorm(DepthModule, function=hessian_frobenius_norm):
-    """Module twin of :func:`hessian_frobenius_norm`.
-
-    Example:
-        >>> HessianFrobeniusNorm()(torch.ones(1, 1, 32, 32)).shape
-        torch.Size([1, 2, 32, 32])
-    """
+    """Module twin of :func:`hessian_frobenius_norm`."""
 
     def __init__(self, *, sigma: float = 1.0, depth_scale: float | None = None) -> None: ...
 
 
 class ApparentRidges(DepthModule, function=apparent_ridges):
-    """Module twin of :func:`apparent_ridges`.
-
-    Example:
-        >>> ApparentRidges(depth_scale=1.0)(torch.rand(1, 1, 32, 32)).shape
-        torch.Size([1, 2, 32, 32])
-    """
+    """Module twin of :func:`apparent_ridges`."""
 
     def __init__(
         self,

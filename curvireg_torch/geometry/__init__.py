@@ -20,7 +20,6 @@ from .cameras import transform as transform
 from .conversions import axis_angle_from_rotation as axis_angle_from_rotation
 from .conversions import opencv_from_opengl as opencv_from_opengl
 from .conversions import opengl_from_opencv as opengl_from_opencv
-from .conversions import opengl_projection as opengl_projection
 from .conversions import rotation_from_axis_angle as rotation_from_axis_angle
 from .conversions import symmetry_transforms as symmetry_transforms
 from .crops import box_iou as box_iou

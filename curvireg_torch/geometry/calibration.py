@@ -17,17 +17,10 @@ from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
 
-__all__ = ["Camera", "Undistorted", "undistorted"]
-
+# Numbers of coefficients of each distortion model
 MODELS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
-"""Numbers of coefficients of each distortion model."""
-
-MAX_ANGLE = 1.55
-"""Radians from the optical axis up to which distortion is computed: 89 degrees."""
-
-MAX_REMAPPED_SIDE = 32766
-"""Pixels; ``cv2.remap`` counts with 16 bits."""
-
+MAX_ANGLE = 1.55  # Radians from the optical axis up to which distortion is computed: 89 degrees
+MAX_REMAPPED_SIDE = 32766  # Pixels; cv2.remap counts with 16 bits
 Array = NDArray[np.float64]
 
 
@@ -77,11 +70,7 @@ class Camera:
         return self.model == "fisheye" or any(self.distortion)
 
     def at(self, size: tuple[int, int]) -> "Camera":
-        """Return the camera of the same photographs, resized to (H, W).
-
-        Raises:
-            InvalidInputError: another aspect ratio than that of the calibration.
-        """
+        """Return the camera of the same photographs, resized to (H, W); another aspect ratio is refused."""
         (h, w), (H, W) = self.size or size, size
         if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:  # sides of resized pictures are rounded
             turned = abs(h * H / w - W) <= 1
@@ -104,8 +93,8 @@ class Undistorted(NamedTuple):
     """What a camera with the same matrix, but without distortion, shows.
 
     Attributes:
-        image: (C, H, W), of the dtype and on the device of the photograph. Pixels that were not recorded, or that lie
-            where the distortion is unknown, repeat the border of what is known, as pixels outside a photograph do.
+        image: (C, H, W); pixels that were not recorded, or whose distortion is unknown, repeat the border of what is
+            known.
         box: (4,) around the outline of the given box; None without one.
         mask: (H, W) float32; None without one.
         missing: (H, W) bool, True where the border is repeated.
@@ -186,10 +175,7 @@ def _distorted(rays: Array, K: Array, D: Array, model: str) -> Array:
 
 
 def _growing_radii(distortion: Sequence[float], model: str) -> tuple[Array, Array, float]:
-    """Radii of rays (x, y, 1), their distorted radii, as far as these grow, and the radius where they stop, or inf.
-
-    The radial part of the distortion only.
-    """
+    """Radii of rays (x, y, 1), their radially distorted radii, as far as these grow, and where they stop, or inf."""
     angle = np.linspace(0.0, MAX_ANGLE, 5000)
     radius = np.tan(angle)
     k = np.zeros(8)

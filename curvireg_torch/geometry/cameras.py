@@ -22,10 +22,8 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dt
 
 
 def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
-    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px.
-
-    Pixels are square, the principal point is in the centre.
-    """
+    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px, with
+    square pixels and the principal point in the centre."""
     if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):
         raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}")
     H, W = size
@@ -45,12 +43,9 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
-        T_cam_from_model: (N, 4, 4) or (4, 4), rigid.
+        T_cam_from_model: (N, 4, 4) or (4, 4), rigid and finite.
         K: (N, 3, 3) or (3, 3), without skew.
         orthographic: do not divide by z; focal lengths are in px per model unit.
-
-    Raises:
-        InvalidInputError: a pose is not rigid and finite, or the camera matrix is unusable.
 
     Example:
         >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
@@ -81,10 +76,8 @@ def boxes_around(pixels: Tensor) -> Tensor:
 
 
 def rotation_towards(rays: Tensor) -> Tensor:
-    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays of any length with z > 0.
-
-    They turn allocentric rotations into poses.
-    """
+    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z > 0: they turn
+    allocentric rotations into poses."""
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)
@@ -92,21 +85,17 @@ def rotation_towards(rays: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def pose_from_box(
-    points: Tensor, rotation: Tensor, box: Tensor, K: Tensor, *, allocentric: bool = True
-) -> tuple[Tensor, Tensor]:
+def pose_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Estimate the pose with which the projected points fill a box, with the object in front of the camera.
 
     Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance (least
-    squares over width and height), their centres the offset.
+    squares over width and height), their centres the offset, towards which the rotation turns.
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
-        rotation: (..., 3, 3) model -> camera.
+        rotation: (..., 3, 3) model -> camera, as seen by a camera that looks straight at the object's centre.
         box: (..., 4) x0, y0, x1, y1 in px.
         K: (..., 3, 3).
-        allocentric: the rotation is as seen by a camera that looks straight at the object's centre, and every step
-            turns it towards the ray of the current centre; otherwise it is kept.
 
     Returns:
         rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64, in model units.
@@ -116,8 +105,7 @@ def pose_from_box(
 
     Example:
         >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-        >>> K = torch.tensor([[100.0, 0, 50], [0, 100.0, 50], [0, 0, 1]])
-        >>> R, t = pose_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), K)
+        >>> R, t = pose_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), camera_matrix(100, 100, 50, 50))
         >>> [round(v, 3) for v in t.tolist()]
         [0.0, 0.0, 5.0]
     """
@@ -137,7 +125,7 @@ def pose_from_box(
     R, moving = view, torch.ones_like(z, dtype=torch.bool)
     for _ in range(MAX_BOX_ITERATIONS):
         # Each pose stops on its own: it does not depend on the others.
-        R = torch.where(moving[..., None, None], rotation_towards(position) @ view, R) if allocentric else view
+        R = torch.where(moving[..., None, None], rotation_towards(position) @ view, R)
         low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(2, dim=-1)
         zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
         offset = F.pad(middle - 0.5 * (low + high), (0, 1))

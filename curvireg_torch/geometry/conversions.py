@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..utils.checks import (
-    check_camera_matrix,
     check_fraction,
     check_last_axes,
     check_numbers,
@@ -26,8 +25,8 @@ from ..utils.checks import (
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
     """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera.
 
-    They are view matrices, as of ``gluLookAt``. The inverse of one is the camera's pose in the model frame, which
-    trimesh, pyrender and Blender expect.
+    They are view matrices; the inverse of one is the camera's pose in the model frame, as trimesh and Blender expect
+    it.
 
     Example:
         >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
@@ -41,46 +40,6 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
 def opencv_from_opengl(T_cam_from_model: Tensor) -> Tensor:
     """Inverse of :func:`opengl_from_opencv`: flipping two axes is its own inverse."""
     return opengl_from_opencv(T_cam_from_model)
-
-
-def opengl_projection(
-    K: Tensor, size: tuple[int, int], *, near: float, far: float, orthographic: bool = False
-) -> Tensor:
-    """OpenGL projection matrix of an OpenCV camera matrix, perspective or ``orthographic`` (parallel).
-
-    Args:
-        K: (..., 3, 3) in px; orthographic: fx, fy in px per model unit.
-        size: (H, W) of the image in px.
-        near, far: clip distances along the optical axis in model units; 0 < near < far (orthographic: near < far).
-
-    Returns:
-        (..., 4, 4) from the OpenGL camera to clip coordinates; row 0 of OpenGL is the last row of the image.
-
-    Example:
-        >>> K = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 31.5], [0, 0, 1]])
-        >>> opengl_projection(K, (64, 64), near=1.0, far=3.0).diagonal().tolist()
-        [2.0, 2.0, -2.0, 0.0]
-    """
-    check_camera_matrix(K)
-    H, W = size
-    if H < 1 or W < 1:
-        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
-    if not near < far or (near <= 0 and not orthographic):
-        raise InvalidInputError(f"near, far: expected 0 < near < far, got {near}, {far}")
-    fx, fy = K[..., 0, 0], K[..., 1, 1]
-    # OpenGL counts from the corner of a pixel, half a pixel from its centre.
-    x0, y0 = 2.0 * (K[..., 0, 2] + 0.5) / W - 1.0, 1.0 - 2.0 * (K[..., 1, 2] + 0.5) / H
-    P = K.new_zeros(*K.shape[:-2], 4, 4)
-    P[..., 0, 0], P[..., 1, 1] = 2.0 * fx / W, 2.0 * fy / H
-    if orthographic:
-        P[..., 0, 3], P[..., 1, 3] = x0, y0
-        P[..., 2, 2], P[..., 2, 3] = -2.0 / (far - near), -(far + near) / (far - near)
-        P[..., 3, 3] = 1.0
-    else:
-        P[..., 0, 2], P[..., 1, 2] = -x0, -y0
-        P[..., 2, 2], P[..., 2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
-        P[..., 3, 2] = -1.0
-    return P
 
 
 def axis_angle_from_rotation(R: Tensor) -> Tensor:
@@ -120,8 +79,7 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
     """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
 
     Each discrete symmetry is followed by each rotation about each continuous axis, in ``ceil(pi / max_step_fraction)``
-    steps: a vertex is at most half a diameter from an axis, so that a step moves it by at most ``max_step_fraction``
-    diameters. BOP prescribes 0.01 (315 steps).
+    steps: a vertex is at most half a diameter from an axis. BOP prescribes 0.01 (315 steps).
 
     Args:
         info: optional ``symmetries_discrete`` (lists of 16 numbers, row-major 4x4 matrices) and

@@ -39,12 +39,7 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty.
-
-    Example:
-        >>> box_iou(torch.tensor([[0.0, 0.0, 2.0, 2.0]]), torch.tensor([[1.0, 0.0, 3.0, 2.0]]))
-        tensor([[0.3333]])
-    """
+    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty."""
     common = torch.minimum(boxes[:, None, 2:], others[:, 2:]) - torch.maximum(boxes[:, None, :2], others[:, :2])
     overlap = common.clamp(min=0).prod(dim=-1)
     first, second = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(dim=-1) for box in (boxes, others))
@@ -110,9 +105,9 @@ def crop_images(
         InvalidInputError: wrong shapes, or a box is empty or entirely outside its image.
 
     Example:
-        >>> crops, A = crop_images(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]), size=32)
+        >>> crops, A = crop_images(torch.rand(1, 3, 48, 64), [[4, 4, 40, 30]], size=32)
         >>> crops.shape, A.shape
-        (torch.Size([2, 3, 32, 32]), torch.Size([2, 3, 3]))
+        (torch.Size([1, 3, 32, 32]), torch.Size([1, 3, 3]))
     """
     if isinstance(images, Tensor):
         check_tensor(images, "images", (None, None, None, None))
@@ -134,9 +129,7 @@ def crop_images(
 
 def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
     """(K, C, size, size) crops of K squares (K, 4) in px of one image (C, H, W), floating or uint8; at least float32.
-
-    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read.
-    """
+    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read."""
     # Half types cannot represent pixel coordinates: bfloat16 has eight bits.
     dtype = torch.promote_types(image.dtype, torch.float32)
     borders = squares.to("cpu", dtype)  # many small steps
@@ -154,11 +147,9 @@ def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
 
 
 class _Resampling:
-    """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K pairs of borders (K,).
-
-    The input from ``first`` to ``end`` is needed. Neighbouring samples, of whichever crop, are computed together, by
-    the product of a narrow matrix with the few inputs that they depend on.
-    """
+    """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K pairs of borders (K,),
+    from the input from ``first`` to ``end``. Neighbouring samples, of whichever crop, are computed together, by the
+    product of a narrow matrix with the few inputs that they depend on."""
 
     def __init__(self, low: Tensor, high: Tensor, size: int, length: int) -> None:
         scale = ((high - low) / size)[:, None]
@@ -169,10 +160,8 @@ class _Resampling:
         self.end = min(length, int((self._centres + self._widths).amax()) + 1)
 
     def __call__(self, x: Tensor, crop: int | None = None) -> Tensor:
-        """(C, samples, W) of one crop, or of all crops in sequence, from the (C, end - first, W) input.
-
-        Pixels are converted where they are used: a copy of a photograph would take more time than its resampling.
-        """
+        """(C, samples, W) of one crop, or of all in sequence, from the (C, end - first, W) input, converted where it is
+        used."""
         which = slice(None) if crop is None else slice(crop, crop + 1)
         centres, order = self._centres[which].flatten().sort(stable=True)
         widths = self._widths[which].flatten()[order]

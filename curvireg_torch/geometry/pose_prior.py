@@ -13,9 +13,8 @@ from ..utils.choices import SIDE_NAMES, UP_AXES
 from .conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from .viewpoint import rotation_error, rotation_from_viewpoint, up_rotation, viewpoint_from_rotation
 
+# Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front
 SIDES = {name: 45.0 * k for k, name in enumerate(SIDE_NAMES)}
-"""Azimuth in degrees from which a side of the object is seen; right and left as in a photograph of its front."""
-
 SIDE_WIDTH = 45.0  # degrees of azimuth to either side of the middle that a named side covers
 MAX_MOVES = 20  # alternating moves into limits that hold together
 
@@ -83,12 +82,7 @@ class PosePrior:
 
     @classmethod
     def side(cls, name: str) -> "PosePrior":
-        """The side of the object that faces the camera: one of ``SIDES``, 45 degrees to either side of it.
-
-        Example:
-            >>> PosePrior.side("front").azimuth
-            (315.0, 45.0)
-        """
+        """The side of the object that faces the camera: one of ``SIDES``, 45 degrees to either side of it."""
         check_option(name, SIDES, "side")
         return cls(azimuth=((SIDES[name] - SIDE_WIDTH) % 360.0, (SIDES[name] + SIDE_WIDTH) % 360.0))
 
@@ -98,10 +92,8 @@ class PosePrior:
         return {name: value for name, value in plain.items() if value is not None}
 
     def excess(self, rotations: Tensor, frame: Tensor | None = None) -> Tensor:
-        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations.
-
-        Negative within all limits: minus the distance to the nearest of them, at least -180.
-        """
+        """(...) degrees by which (..., 3, 3) rotations miss the worst of the limits on rotations. Negative within all
+        limits: minus the distance to the nearest of them, at least -180."""
         worst = torch.full_like(rotations[..., 0, 0], -180.0)
         if self.azimuth or self.elevation or self.theta:
             azimuth, elevation, theta = viewpoint_from_rotation(_in_object_frame(rotations, frame))
@@ -156,13 +148,9 @@ class PosePrior:
 def object_frame(up: str = "z", front: str | None = None) -> Tensor:
     """(3, 3) float64 rotation from a mesh file's axes to those of :class:`PosePrior`: z up, the front at azimuth 0.
 
-    Args:
-        up: the mesh's axis that points up, such as "z" or "-y".
-        front: the mesh's axis that points out of its front; default "-y" where z is up, as in PASCAL3D+, and what
-            :func:`up_rotation` turns to it where another axis is.
-
-    Raises:
-        InvalidInputError: an unknown axis, or front and up on the same axis.
+    ``up`` and ``front`` name axes of the mesh, such as "z" or "-y"; the default front is "-y" where z is up, as in
+    PASCAL3D+, and what :func:`up_rotation` turns to it where another axis is. Other names, and front and up on the same
+    axis, raise :class:`InvalidInputError`.
 
     Example:
         >>> (object_frame("y", "z") @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).round().tolist()
@@ -200,12 +188,10 @@ def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:
 
 
 def _outside(angle: Tensor, limits: tuple[float, ...], elevation: Tensor) -> Tensor:
-    r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range.
-
-    An azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
+    r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range. An
+    azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
     :math:`\sin d = \cos e \sin \delta`; beyond 90 degrees the nearest point is the pole. The same holds for theta and
-    the up axis, which :math:`e` tilts towards the camera.
-    """
+    the up axis, which :math:`e` tilts towards the camera."""
     beyond, width = _position(angle, limits)
     if width == 360.0:
         return torch.full_like(angle, -180.0)

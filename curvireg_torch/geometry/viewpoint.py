@@ -83,9 +83,9 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def up_rotation(up: str) -> Tensor:
-    """(3, 3) float64 rotation from a frame whose axis ``up`` points up to one whose z axis does.
+    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does.
 
-    ``up`` is "x", "y", "z", "-x", "-y" or "-z". glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
+    glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
 
     Example:
         >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)).tolist()
@@ -96,12 +96,9 @@ def up_rotation(up: str) -> Tensor:
 
 
 def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
-    """(...) geodesic distances of rotations, ``acos((tr(R1^T R2) - 1) / 2)`` in degrees in [0, 180].
+    """(...) geodesic distances of rotations (..., 3, 3), ``acos((tr(R1^T R2) - 1) / 2)`` in degrees in [0, 180].
 
-    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0, unlike ``acos``.
-
-    Args:
-        R1, R2: (..., 3, 3), broadcast against each other; NaN for a missing estimate, whose error is NaN.
+    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0; NaN for a missing estimate (NaN).
 
     Example:
         >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)
@@ -174,9 +171,6 @@ def sample_views(
     Returns:
         All combinations, distance fastest, then theta, azimuth, elevation. Duplicates at the poles stay.
 
-    Raises:
-        InvalidInputError: an empty range, a step that is not positive, or a distance <= 1.
-
     Example:
         >>> len(sample_views(azimuth_step=20, elevations=[0, 50], thetas=[-10, 0, 10]))
         108
@@ -201,11 +195,7 @@ def uniform_views(
 
     Args:
         count: number of view directions; each is combined with every theta and distance.
-        thetas: in-plane rotations in degrees.
-        distances: in units of the object's radius, > 1.
-
-    Raises:
-        InvalidInputError: count < 1, an empty option, or a distance <= 1.
+        thetas, distances: as in :func:`sample_views`.
 
     Example:
         >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))

@@ -1,21 +1,14 @@
 """Banks of described views, and the matcher that ranks them for photographs."""
 
-from .bank import ViewBank
-from .cache import CachedBank, bank_key, cache_folder, cached_bank, clear_cache, list_cache
-from .describe import DescribedViews, ViewDescriber
-from .matcher import Ranking, ViewMatcher, distinct_views
-
-__all__ = [
-    "CachedBank",
-    "DescribedViews",
-    "Ranking",
-    "ViewBank",
-    "ViewDescriber",
-    "ViewMatcher",
-    "bank_key",
-    "cache_folder",
-    "cached_bank",
-    "clear_cache",
-    "distinct_views",
-    "list_cache",
-]
+from .bank import ViewBank as ViewBank
+from .cache import CachedBank as CachedBank
+from .cache import bank_key as bank_key
+from .cache import cache_folder as cache_folder
+from .cache import cached_bank as cached_bank
+from .cache import clear_cache as clear_cache
+from .cache import list_cache as list_cache
+from .describe import DescribedViews as DescribedViews
+from .describe import ViewDescriber as ViewDescriber
+from .matcher import Ranking as Ranking
+from .matcher import ViewMatcher as ViewMatcher
+from .matcher import distinct_views as distinct_views

@@ -23,15 +23,9 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
-__all__ = ["FORMAT", "FORMAT_VERSION", "ViewBank", "colour_arrays"]
-
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
-RERANKING = "reranking."
-"""Prefix of the names of reranking features among a bank's tensors."""
-
-VIEWS_AT_A_TIME = 24
-"""Views that a thread holds in memory, about 60 bytes x image_size^2 each."""
-
+RERANKING = "reranking."  # Prefix of the names of reranking features among a bank's tensors
+VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
 
@@ -43,8 +37,6 @@ class ViewBank:
         views: the N viewpoints.
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool, unpacked on demand. For a large bank use :meth:`points_at` and
-            :meth:`silhouettes_at`, which unpack a few views at a time.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
         reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
             large bank. Meshes with colours have grey features followed by coloured ones.
@@ -85,16 +77,6 @@ class ViewBank:
         """(N,) float64 distances of the object's centre, in the mesh's unit."""
         return self.views.distance.to(self.device, torch.float64) * mesh_radius(self.mesh)
 
-    @property
-    def points(self) -> Tensor:
-        """(N, S, S) bool feature points of the views."""
-        return self.points_at(slice(None))
-
-    @property
-    def silhouettes(self) -> Tensor:
-        """(N, S, S) bool: pixels that show the object."""
-        return self.silhouettes_at(slice(None))
-
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""
         return _unpack(self._points[index], self.settings.image_size)
@@ -104,10 +86,8 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_compatible(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``.
-
-        Views that were passed by the caller (``pose="given"``) fit every view policy.
-        """
+        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``. Views that
+        were passed by the caller (``pose="given"``) fit every view policy."""
         mine, theirs = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
             mine |= self.pipeline.views.key_fields()

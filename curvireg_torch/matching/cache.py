@@ -24,25 +24,11 @@ from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 
-__all__ = ["CACHE_LIMIT", "CachedBank", "bank_key", "cache_folder", "cached_bank", "clear_cache", "list_cache"]
-
+#: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
 CACHE_LIMIT = 2_000_000_000
-"""Size limit of the cache in bytes; least recently used banks are removed. ``$CURVIREG_CACHE_LIMIT`` overrides it."""
-
-ABANDONED_SECONDS = 3600.0
-"""Age from which an incomplete file counts as the remains of a killed process."""
-
-_SOURCES = (
-    "features",
-    "filters",
-    "geometry",
-    "mesh",
-    "rendering",
-    "terms",
-    "pipeline.py",
-    "matching/describe.py",
-)
-"""Code that turns a mesh into described views: a bank that another version of it built is not found."""
+ABANDONED_SECONDS = 3600.0  # Age from which an incomplete file counts as the remains of a killed process
+# Code that turns a mesh into described views: a bank that another version of it built is not found
+_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms", "pipeline.py", "matching/describe.py")
 
 
 class CachedBank(NamedTuple):
@@ -54,11 +40,9 @@ class CachedBank(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``.
-
-    Banks are stored in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have
-    such a name are ever listed, overwritten or removed.
-    """
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Banks are stored
+    in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have such a name are
+    ever listed, overwritten or removed."""
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):
@@ -104,9 +88,8 @@ def cached_bank(
 
     Example:
         >>> import tempfile
-        >>> from curvireg_torch.geometry import sample_views
-        >>> folder, views = Path(tempfile.mkdtemp()), sample_views(azimuth_step=90, elevations=[20])
-        >>> bank = cached_bank(trimesh.creation.box(), views, folder=folder, progress=False)
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2], folder=folder, progress=False)
         >>> len(list_cache(folder)), clear_cache(folder)
         (1, 1)
     """

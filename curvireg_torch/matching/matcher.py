@@ -1,6 +1,6 @@
 """All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -8,7 +8,6 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from ..errors import InvalidInputError
 from ..features import field_points
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
@@ -26,16 +25,9 @@ from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
-__all__ = ["Ranking", "ViewMatcher", "distinct_views"]
-
-MAX_CACHED_VIEWS = 2048
-"""Views whose reranking features are cached, 35 kB each at 128 px."""
-
-NEAR_TRACE = 1.0 + 3.0**0.5
-"""Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it."""
-
-FEATURES_AT_A_TIME = 16
-"""Views whose reranking features are computed at a time."""
+MAX_CACHED_VIEWS = 2048  # Views whose reranking features are cached, 35 kB each at 128 px
+NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
+FEATURES_AT_A_TIME = 16  # Views whose reranking features are computed at a time
 
 
 @dataclass(frozen=True)
@@ -47,7 +39,7 @@ class Ranking:
         order: (B, N) view indices, best first; ties in the order of the bank.
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
-            S_box in [0, 1], similarity of the boxes' aspect ratios, best view 1.
+            similarity of the boxes' aspect ratios in [0, 1], best view 1.
         allowed: (B, N) bool, which views a pose prior leaves; None without one.
         outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
             without a prior.
@@ -67,47 +59,21 @@ class Ranking:
     def __len__(self) -> int:
         return self.scores.shape[0]
 
-    def __getitem__(self, index: slice) -> "Ranking":
-        """Rankings of some photographs, as copies that do not keep the batch in memory."""
-        return self._of(lambda *parts: parts[0][index].clone(), self)
-
     @property
     def hog(self) -> Tensor:
-        """``terms["hog"]``."""
         return self.terms["hog"]
 
     @property
     def repeatability(self) -> Tensor:
-        """``terms["repeatability"]``."""
         return self.terms["repeatability"]
 
     def top(self, k: int) -> Tensor:
         """(B, k) indices of the best views; fewer if the bank is smaller."""
         return self.order[:, :k]
 
-    @staticmethod
-    def cat(parts: Sequence["Ranking"]) -> "Ranking":
-        """Concatenate rankings of the same views."""
-        return Ranking._of(lambda *tensors: torch.cat(tensors), *parts)
-
-    @staticmethod
-    def _of(make: Callable[..., Tensor], *parts: "Ranking") -> "Ranking":
-        """The ranking each of whose tensors is made of that of the parts."""
-        terms = {name: make(*(part.terms[name] for part in parts)) for name in parts[0].terms}
-        columns = zip(*((p.scores, p.order, p.allowed, p.outside) for p in parts), strict=True)
-        scores, order, allowed, outside = (None if each[0] is None else make(*each) for each in columns)
-        assert scores is not None
-        assert order is not None
-        return Ranking(scores, order, terms, allowed, outside)
-
 
 def distinct_views(
-    order: Tensor,
-    rotations: Tensor,
-    *,
-    count: int,
-    angle: float = 30.0,
-    symmetries: Tensor | None = None,
+    order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0, symmetries: Tensor | None = None
 ) -> Tensor:
     """Best views that are more than ``angle`` degrees from every better selected one.
 
@@ -119,11 +85,6 @@ def distinct_views(
 
     Returns:
         (K,) view indices, best first, K <= count.
-
-    Example:
-        >>> R = torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))])     # 180 degrees about z
-        >>> distinct_views(torch.tensor([1, 0]), R, count=2, symmetries=R).tolist()
-        [1]
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
@@ -147,8 +108,8 @@ class ViewMatcher(nn.Module):
     The box of each photograph is cropped as the views are, filtered and described; each ranking term compares it with
     all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms take the best over a few jittered crops.
 
-    Photographs are described and compared in batches. The composition of a batch and the number of torch's threads
-    change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar` prevents that.
+    The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
+    :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
         bank: the views of a mesh.
@@ -156,9 +117,7 @@ class ViewMatcher(nn.Module):
             the bank, unless the bank's views were passed by the caller.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
             photographs as (B, 3, S, S).
-        box_jitter: instead of the pipeline's.
         renderer: for views that a :class:`RerankingTerm` needs.
-        chunk_size: photographs in memory at a time.
 
     Raises:
         BankError: the bank was built with other settings or for another pose prior than the pipeline's.
@@ -178,19 +137,13 @@ class ViewMatcher(nn.Module):
         *,
         pipeline: Pipeline | None = None,
         field: nn.Module | None = None,
-        box_jitter: float | None = None,
         renderer: str | DepthRenderer = "auto",
-        chunk_size: int = 16,
     ) -> None:
         super().__init__()
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
-        if box_jitter is not None:
-            pipeline = replace(pipeline, box_jitter=box_jitter)
-        if chunk_size < 1:
-            raise InvalidInputError(f"chunk_size: expected >= 1, got {chunk_size}")
-        self.bank, self.chunk_size, self._renderer = bank, chunk_size, renderer
+        self.bank, self._renderer = bank, renderer
         self._feature_cache: dict[str, dict[int, Tensor]] = {}
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
@@ -214,12 +167,7 @@ class ViewMatcher(nn.Module):
             InvalidInputError: wrong shape or dtype, another number of boxes than of images, or an unusable box.
             ImageError: pixels of the crop of a box are missing (NaN or infinite) or outside [0, 1].
         """
-        boxes = as_boxes(boxes, len(images))
-        parts = [
-            self.rank(self.query(images[i : i + self.chunk_size], boxes[i : i + self.chunk_size]))
-            for i in range(0, max(1, len(images)), self.chunk_size)
-        ]
-        return Ranking.cat(parts)
+        return self.rank(self.query(images, boxes))
 
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
@@ -250,10 +198,8 @@ class ViewMatcher(nn.Module):
         )
 
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
-        """Compare B described photographs with all views; errors as :meth:`forward`.
-
-        ``allowed`` (B, N) bool leaves views out, whose score is 0.
-        """
+        """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
+        views out, whose score is 0."""
         check_pixels(query.crops, "of the box")
         first = [t for t in self.terms if not isinstance(t, RerankingTerm)]
         terms = {t.name: self._terms[t.name](query) for t in first}
@@ -327,14 +273,8 @@ class ViewMatcher(nn.Module):
     def reranking_score(
         self, name: str, query: QueryFeatures, ranking: Ranking, pictures: Tensor, image_index: Tensor
     ) -> Tensor:
-        """(H,) float64 log scores of pictures of poses by a :class:`RerankingTerm`, as if they were ranked views.
-
-        Args:
-            name: of the term.
-            query, ranking: of B photographs.
-            pictures: (H, C, S, S), of :meth:`ViewDescriber.shaded`.
-            image_index: (H,) photograph that each picture is compared with.
-        """
+        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses by the :class:`RerankingTerm` called ``name``,
+        as if they were ranked views; ``image_index`` (H,) is the photograph of ``query`` and ``ranking`` of each."""
         module, term = cast(RerankingModule, self._terms[name]), next(t for t in self.terms if t.name == name)
         raw = module.compare(query, module.describe(pictures)).cpu().double()
         out = torch.zeros(len(pictures), dtype=torch.float64)

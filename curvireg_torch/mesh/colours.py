@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 
 from ..errors import MAX_IMAGE_PIXELS
 
-TEXTURE_SIDE = 512
-"""Textures are reduced to this longer side in px; views are smaller."""
-
-ROW = 1024
-"""Samples in a row of the map that OpenCV is given, whose sides are limited."""
-
+TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
+ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
 
@@ -90,23 +86,13 @@ def has_colours(mesh: Any) -> bool:
     return surface_colours(mesh) is not None
 
 
-def surface_colours(mesh: Any) -> SurfaceColours | None:
-    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white.
-
-    They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``.
-    """
-    return _surface_colours(mesh, _Textures())
-
-
 def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[SurfaceColours | None]:
-    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used.
-
-    A texture is decoded once, however many meshes share it. ``close`` frees its picture then.
-    """
+    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used. A texture is decoded once,
+    however many meshes share it. ``close`` frees its picture then."""
     textures, found = _Textures(close=close), []
     for mesh in meshes:
         try:
-            colours = _surface_colours(mesh, textures)
+            colours = surface_colours(mesh, textures)
             if colours is not None and len(colours) != len(mesh.faces):
                 raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
@@ -116,7 +102,9 @@ def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[Surf
     return found
 
 
-def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
+def surface_colours(mesh: Any, textures: "_Textures | None" = None) -> SurfaceColours | None:
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white. They come from
+    ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``."""
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
@@ -134,7 +122,7 @@ def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     image = getattr(material, "baseColorTexture", None) if image is None else image
     factor = getattr(material, "baseColorFactor", None)
     colour = material.main_color[:3] if factor is None else _encoded(factor[:3])
-    texture = None if image is None or visual.uv is None else textures(image)
+    texture = None if image is None or visual.uv is None else (textures or _Textures())(image)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]

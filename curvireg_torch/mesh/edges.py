@@ -54,7 +54,7 @@ class MeshEdges:
         owner = np.tile(np.arange(len(faces)), 3)
         sign = np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0)
         directed.sort(axis=1)
-        row, edge = trimesh.grouping.unique_rows(directed)
+        row, edge = _unique(directed)
         self.edges = directed[row]
         order = np.argsort(edge, kind="stable")
         first = np.searchsorted(edge[order], np.arange(len(self.edges)))
@@ -120,9 +120,18 @@ def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tup
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices at the same place joined, and each triangle once, without those of no area."""
     cell = np.ptp(vertices, axis=0).max() * WELD
-    index, inverse = trimesh.grouping.unique_rows(np.round(vertices / cell).astype(np.int64))
+    place = np.round(vertices / cell).astype(np.int64)
+    index, inverse = _unique(place - place.min(axis=0))
     vertices, faces = vertices[index], inverse[faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     first, _ = trimesh.grouping.unique_rows(np.sort(faces, axis=1))
     return vertices, faces[np.sort(first)]
+
+
+def _unique(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the distinct rows of whole numbers (N, K) >= 0, in lexical order, so that edges of one vertex are
+    neighbours, and the number of each row among them."""
+    keys = np.ravel_multi_index(tuple(rows.T), tuple(rows.max(axis=0, initial=0) + 1))
+    _, index, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    return index, inverse

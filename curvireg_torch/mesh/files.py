@@ -35,30 +35,24 @@ from ..errors import (
 from ..utils.files import file_digest, text_digest
 from .colours import colours_of_parts
 
+# Formats whose files may name buffers, material files or textures beside them
 _WITH_COMPANIONS = (".glb", ".gltf", ".obj", ".ply")
-"""Formats whose files may name buffers, material files or textures beside them."""
-
+# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or trimesh reads them
 _READ_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "KHR_animation_", "EXT_texture_webp")
-"""Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or trimesh reads them."""
-
-
-Triangles = list[list[list[int]]]
-"""For each face its triangles, as positions among its corners."""
-
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it would print tracebacks of files that it cannot read
+Triangles = list[list[list[int]]]  # For each face its triangles, as positions among its corners
+# Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than
+# three corners, with indices that count back from the end, or with index 0
 _UNUSUAL_OBJ = re.compile(
     rb"^(?:[ \t]+\S|(?:v|vt|vn|f)\t|f +(?:(?:[^ \t\r\n]+[ \t]+){3}[^ \t\r\n]"
     rb"|[^\r\n]*(?:[-#]|(?<=[ \t/])0+(?![^/ \t\r\n]))))",
     re.MULTILINE,
 )
-"""Lines that trimesh does not read, or reads wrongly: an indent, tabs, a comment after a face, and faces of more than
-three corners, with indices that count back from the end, or with index 0."""
 
 
 def mesh_files(path: Path) -> list[Path]:
-    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures.
-
-    They are found by reading the mesh; if that fails, those requested before are listed. Other files stand alone.
-    """
+    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures. They
+    are found by reading the mesh; if that fails, those requested before are listed. Other files stand alone."""
     folder = _Folder(path)
     if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
         with contextlib.suppress(MeshError):  # reported where the mesh is loaded
@@ -72,11 +66,8 @@ def mesh_digest(path: Path) -> str:
 
 
 def read_mesh(path: Path) -> Any:
-    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails.
-
-    Colours are in ``metadata["colours"]`` of each part. Missing material files and textures are a
-    :class:`CurviregWarning`.
-    """
+    """Read a mesh file, and the files that it names, with trimesh; :class:`MeshError` if that fails. Colours are in
+    ``metadata["colours"]`` of each part. Missing material files and textures are a :class:`CurviregWarning`."""
     folder = _Folder(path)
     content = _read(path, folder)
     if missing := sorted(file.name for file in folder.requested if not file.is_file()):
@@ -91,10 +82,7 @@ def read_mesh(path: Path) -> Any:
 
 def _read(path: Path, folder: "_Folder") -> Any:
     suffix = path.suffix.lower()
-    logger = logging.getLogger("trimesh")
-    level = logger.level
     try:
-        logger.setLevel(logging.CRITICAL)  # trimesh logs tracebacks of files that it cannot read
         if path.stat().st_size > MAX_MESH_BYTES:
             raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
         data = path.read_bytes()
@@ -118,8 +106,6 @@ def _read(path: Path, folder: "_Folder") -> Any:
         if "unexpected length" in reason:  # what trimesh says of both
             reason = "the file ends too early, or has binary faces with different numbers of corners: export triangles"
         raise MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path) from error
-    finally:
-        logger.setLevel(level)
 
 
 class _Folder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
@@ -227,11 +213,6 @@ def divide_faces(vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]) 
 
     Raises:
         ValueError: a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.errors`.
-
-    Example:
-        >>> dart = np.array([[0.0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]])
-        >>> [sorted(map(sorted, triangles)) for triangles in divide_faces(dart, [[0, 1, 2, 3]])]
-        [[[0, 1, 2], [0, 2, 3]]]
     """
     if sum(max(len(face) - 2, 0) for face in faces) > MAX_MESH_FACES:
         raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")

@@ -85,8 +85,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     return mesh
 
 
-MANY_POINTS = 4096
-"""Points of a hull: to project more of them in every view costs more than to cast the rays."""
+MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
 
 
 def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -118,14 +117,7 @@ def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int
 
 
 def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
-    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them.
-
-    Example:
-        >>> mesh = trimesh.creation.box()
-        >>> mesh.units = "millimeters"
-        >>> mesh_unit(mesh)
-        'mm'
-    """
+    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them."""
     if mesh.units in UNITS:
         return str(mesh.units)
     try:
@@ -176,11 +168,9 @@ def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColour
 
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
-    """(P, 3) float64 vertices of the convex hull, which determine projected boxes.
-
-    Of more than 4096 of them, those that are outermost in one of 2562 directions of the object scaled to equal extents:
-    sides of boxes move by about 0.1 % of their length at most.
-    """
+    """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than 4096 of them, those
+    that are outermost in one of 2562 directions of the object scaled to equal extents: sides of boxes move by about 0.1
+    % of their length at most."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.array(mesh.vertices, dtype=np.float64)

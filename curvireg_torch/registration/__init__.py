@@ -1,28 +1,17 @@
 """From a ranking of views to poses: registration, refinement, following, and detection without a box."""
 
-from .confidence import RELIABLE
-from .contour_fit import ContourFit, fit_contours
-from .detection import Detector, Proposals, detect
-from .following import Follower
-from .refinement import refine
-from .registrar import Registrar
-from .result import Detection, FailedRegistration, Hypothesis, PhotographPose, Registration
-from .several import register_views
-
-__all__ = [
-    "RELIABLE",
-    "ContourFit",
-    "Detection",
-    "Detector",
-    "FailedRegistration",
-    "Follower",
-    "Hypothesis",
-    "PhotographPose",
-    "Proposals",
-    "Registrar",
-    "Registration",
-    "detect",
-    "fit_contours",
-    "refine",
-    "register_views",
-]
+from .confidence import RELIABLE as RELIABLE
+from .contour_fit import ContourFit as ContourFit
+from .contour_fit import fit_contours as fit_contours
+from .detection import Detector as Detector
+from .detection import Proposals as Proposals
+from .detection import detect as detect
+from .following import Follower as Follower
+from .refinement import refine as refine
+from .registrar import Registrar as Registrar
+from .result import Detection as Detection
+from .result import FailedRegistration as FailedRegistration
+from .result import Hypothesis as Hypothesis
+from .result import PhotographPose as PhotographPose
+from .result import Registration as Registration
+from .several import register_views as register_views

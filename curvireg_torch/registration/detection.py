@@ -29,29 +29,13 @@ from .result import Detection, FailedRegistration, Registration
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["Detector", "Proposals", "detect"]
-
-TEMPLATE_SIDE = 96
-"""Side of the template views in px."""
-
-SIZE_STEP = 2.0**0.5
-"""Factor between successive sizes of the object."""
-
-SAME_OBJECT_OVERLAP = 0.5
-"""Intersection over union from which boxes show the same object."""
-
-MIN_OBJECT_SIDE = 32.0
-"""Longer side in px of the smallest object that can be recognised."""
-
-MAX_PEAKS = 500
-"""Best peaks of a photograph that boxes are selected from."""
-
-MAX_COMPARED_VIEWS = 1500
-"""Largest number of views, evenly spread over the bank, whose pairwise distances are computed."""
-
-MEDOID_ROUNDS = 10
-"""Largest number of rounds of k-medoids."""
-
+TEMPLATE_SIDE = 96  # Side of the template views in px
+SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
+SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
+MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
+MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
+MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
+MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
 Results = list[Registration | FailedRegistration]
 
 
@@ -88,7 +72,8 @@ def detect(
 
     def detect_in(item: ImageItem, _: int) -> list[Registration]:
         registrar.report_progress("detection")
-        check_crop(_extremes(item.image))
+        extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
+        check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
         limits: dict[str, Any] = {}
         if item.prior is not None:
             limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
@@ -111,12 +96,6 @@ def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
     return Limits(item, registrar.bank).allowed(off_centre=off_centre)
-
-
-def _extremes(image: Tensor) -> Tensor:
-    """(C, 2) smallest and largest value of each channel, NaN where one is missing; as :func:`check_crop` takes them."""
-    pair = torch.stack([image.flatten(1).amin(dim=1), image.flatten(1).amax(dim=1)], dim=1)
-    return pair.float() / 255.0 if image.dtype == torch.uint8 else pair
 
 
 @dataclass(frozen=True)
@@ -156,22 +135,25 @@ class Candidate:
         similarity = float(ranking.hog[0, ranking.order[0, 0]])
         return cls(box, response, query, ranking, detection_probability(response, similarity))
 
-    def register(self, registrar: "Registrar", item: ImageItem) -> Registration:
-        """Register the box; the result's box is the one around its pose."""
+    def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
+        """Register the box."""
         result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
-        box = projected_box(registrar.describer, result.projection)
-        none = torch.zeros(0, 4, dtype=torch.float64), torch.zeros(0)
-        return replace(result, detection=Detection(box, self.score, self.response, *none))
+        return Found(result, projected_box(registrar.describer, result.projection), self.response, self.score)
 
 
-def _register_candidates(
-    registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int
-) -> list[Registration]:
-    """The most certain objects, at most ``instances``, whose boxes do not overlap.
+@dataclass(frozen=True)
+class Found:
+    """A registration, the ``box`` (4,) around its pose, and ``response`` and ``score`` of the box that led to it."""
 
-    Raises:
-        CurviregError: of the best candidate, if none can be registered.
-    """
+    registration: Registration
+    box: Tensor
+    response: float
+    score: float
+
+
+def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int) -> list[Found]:
+    """The most certain objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
+    none."""
     count = max(registrar.pipeline.detection.candidates, instances + 1)
     candidates, failed = [], None
     for box, response in zip(proposals.boxes[:count], proposals.responses[:count].tolist(), strict=True):
@@ -182,65 +164,50 @@ def _register_candidates(
     if not candidates and failed is not None:
         raise failed
     boxes, scores = torch.stack([c.box for c in candidates]), torch.tensor([c.score for c in candidates])
-    results: list[Registration] = []
+    found: list[Found] = []
     for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
-        if len(results) < instances:
-            _add(results, _refined(registrar, item, candidates[k].register(registrar, item)))
-    return sorted(results, key=_score, reverse=True)
+        if len(found) < instances:
+            _add(found, _refined(registrar, item, candidates[k].register(registrar, item)))
+    return sorted(found, key=lambda one: one.score, reverse=True)
 
 
-def _refined(registrar: "Registrar", item: ImageItem, result: Registration) -> Registration:
-    """The more certain one of a result and of the registration of the box around its pose."""
-    where = detection_of(result)
+def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
+    """The more certain one of a registration and of that of the box around its pose."""
     try:
-        candidate = Candidate.ranked(registrar, item, where.box, where.response)
+        candidate = Candidate.ranked(registrar, item, found.box, found.response)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
-        return replace(result, detection=replace(where, score=0.0))
-    return result if candidate.score <= where.score else candidate.register(registrar, item)
+        return replace(found, score=0.0)
+    return found if candidate.score <= found.score else candidate.register(registrar, item)
 
 
-def _add(results: list[Registration], new: Registration) -> None:
-    """Add a result. Of results whose boxes overlap the most certain is kept: proposals may lead to the same object."""
-    boxes = torch.stack([detection_of(new).box, *(detection_of(result).box for result in results)])
-    overlap = box_iou(boxes[:1], boxes[1:])[0].tolist()
-    same = [result for result, iou in zip(results, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
-    if all(_score(new) > _score(result) for result in same):
-        results[:] = [result for result in results if not any(result is other for other in same)]
-        results.append(new)
+def _add(found: list[Found], new: Found) -> None:
+    """Add ``new``. Of those whose boxes overlap the most certain is kept: proposals may lead to the same object."""
+    overlap = box_iou(new.box[None], torch.stack([new.box, *(one.box for one in found)]))[0, 1:].tolist()
+    same = [one for one, iou in zip(found, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
+    if all(new.score > one.score for one in same):
+        found[:] = [one for one in found if not any(one is other for other in same)]
+        found.append(new)
 
 
-def _with_proposals(results: list[Registration], proposals: Proposals) -> list[Registration]:
-    """Results with all proposals, their own boxes first, and the score as a factor of their probabilities."""
-    boxes = torch.cat([torch.stack([detection_of(r).box for r in results]), proposals.boxes.double()])
-    responses = torch.cat([torch.tensor([detection_of(r).response for r in results]), proposals.responses])
+def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registration]:
+    """Registrations with all proposals, their own boxes first, and the score as a factor of their probabilities."""
+    boxes = torch.cat([torch.stack([one.box for one in found]), proposals.boxes.double()])
+    responses = torch.cat([torch.tensor([one.response for one in found]), proposals.responses])
     kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
     return [
         replace(
-            result,
-            detection=replace(detection_of(result), boxes=boxes[kept], responses=responses[kept]),
-            probabilities=tuple(p * _score(result) for p in result.probabilities),
+            one.registration,
+            detection=Detection(one.box, one.score, one.response, boxes[kept], responses[kept]),
+            probabilities=tuple(p * one.score for p in one.registration.probabilities),
         )
-        for result in results
+        for one in found
     ]
-
-
-def detection_of(result: Registration) -> Detection:
-    """``detection`` of a result that has one."""
-    assert result.detection is not None
-    return result.detection
-
-
-def _score(result: Registration) -> float:
-    return detection_of(result).score
 
 
 @dataclass(frozen=True)
 class _Templates:
-    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading.
-
-    ``boxes`` (K, 4) are in px of the templates, from the outer border; at the distances ``unit`` (K,) a camera with a
-    focal length of 1 px sees the object at this size.
-    """
+    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading; ``boxes`` (K, 4) in px of the
+    templates, from the outer border; ``unit`` (K,) distances at which a focal length of 1 px shows this size."""
 
     views: Tensor
     weights: list[list[Tensor]]
@@ -251,14 +218,13 @@ class _Templates:
 class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
-    A few representative views (``representative_views``) are compared with every position of the photograph, at
-    sizes in steps of :math:`\sqrt 2`. A view's similarity is the mean cosine of the backbone's features of the view,
-    shaded grey and, where the mesh has colours, in colour, and of the photograph over the cells that the view covers;
-    its response is the similarity in standard deviations above its mean over the photograph. Peaks over position, size
-    and view are boxes.
+    A few representative views are compared with every position of the photograph, at sizes in steps of :math:`\sqrt 2`.
+    A view's similarity is the mean cosine of the backbone's features of the view, shaded grey and, where the mesh has
+    colours, in colour, and of the photograph over the cells that the view covers; its response is the similarity in
+    standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
 
     Args:
-        matcher: of the bank; ``locate`` of its pipeline holds the settings.
+        matcher: of the bank; ``detection`` of its pipeline holds the settings.
 
     Example:
         >>> import trimesh
@@ -291,10 +257,9 @@ class Detector(nn.Module):
         distance: tuple[float, float] | None = None,
         allowed: Tensor | None = None,
     ) -> Proposals:
-        """Boxes of a photograph.
+        """Boxes of a photograph (1 or 3, H, W), floating in [0, 1] or uint8.
 
         Args:
-            image: (C, H, W), C = 1 or 3, floating in [0, 1] or uint8.
             focal: focal length in px, for ``distance``.
             distance: range of the distance of the object's centre, in the mesh's unit.
             allowed: (N,) bool; views that stand for none of these views of the bank are not compared.
@@ -417,12 +382,9 @@ def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def representative_views(bank: ViewBank, count: int) -> Tensor:
-    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``.
-
-    The distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their
-    boxes' aspect ratios. The first medoid is the most central view, each further one the farthest from those before;
-    views are then assigned to their nearest medoid, and medoids recomputed, until nothing changes.
-    """
+    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``. The
+    distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their boxes'
+    aspect ratios. The first medoid is the most central view, each further one the farthest from those before."""
     views = torch.arange(len(bank))
     if len(views) > MAX_COMPARED_VIEWS:
         views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS

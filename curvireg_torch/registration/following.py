@@ -21,13 +21,10 @@ from .registrar import Registrar
 from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
-__all__ = ["Follower"]
-
+# Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better
 TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
-"""Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better."""
-
+# Confidence from which a pose is followed; while it is lower, each frame is registered to check it
 BELIEVED_CONFIDENCE = 0.5
-"""Confidence from which a pose is followed; while it is lower, each frame is registered to check it."""
 
 
 class Follower:
@@ -39,17 +36,13 @@ class Follower:
     Where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the last pose that a registration confirmed. It never exceeds the
-    latter, nor that of a doubtful pose that was kept: no pose gains confidence from being followed, unless a further
-    registration is reliable.
+    of the truth: the tracker's own, times that of the last pose that a registration confirmed, which it never exceeds.
+    No pose gains confidence from being followed, unless a further registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
         camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
         prior: limits on the pose in frames that are registered.
-
-    Raises:
-        InvalidInputError: a registrar of several meshes.
 
     Example:
         >>> import curvireg_torch as cr
@@ -81,15 +74,6 @@ class Follower:
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
-
-        Example:
-            >>> import curvireg_torch as cr
-            >>> from curvireg_torch.synthetic import example_mesh
-            >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), progress=False)
-            >>> follow = Follower(cr.Registrar(bank), cr.camera_matrix(150.0, 150.0, 79.5, 59.5))
-            >>> pose = torch.eye(4)
-            >>> pose[2, 3] = 8.0
-            >>> follow.start(torch.rand(3, 120, 160), pose)
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,31 +34,12 @@ from ..utils.checks import (
     type_and_shape,
 )
 
-__all__ = [
-    "ImageItem",
-    "camera_warnings",
-    "check_box_side",
-    "check_crop",
-    "image_item",
-    "image_items",
-    "is_missing",
-    "rig_cameras",
-]
-
-MIN_BOX_SIDE = 12
-"""Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98."""
-
-SMALL_BOX_SIDE = 24
-"""Pixels; of a smaller box a result carries a warning."""
-
+MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
+SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
+# Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
-"""Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees."""
-
-SAME_PICTURE = 0.8
-"""Correlation of small copies of two photographs from which they may come from the same place."""
-
-MISSING_SHARE = 0.2
-"""Part of a box without pixels of the photograph, from which a result carries a warning."""
+SAME_PICTURE = 0.8  # Correlation of small copies of two photographs from which they may come from the same place
+MISSING_SHARE = 0.2  # Part of a box without pixels of the photograph, from which a result carries a warning
 
 
 @dataclass(frozen=True)
@@ -108,9 +89,8 @@ def image_items(
 ) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
 
-    Arguments are those of ``Registrar``. A :class:`Camera` is scaled to the photograph, and its distortion removed.
-
-    Each is read and checked whenever it is asked for, so that many large files need the memory of few. A box of which
+    Arguments are those of ``Registrar``; each is read and checked whenever it is asked for, so that many large files
+    need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed. A box of which
     too little lies inside its photograph is refused, see :func:`check_box_side`.
 
     Raises:
@@ -158,12 +138,8 @@ def is_missing(box: Any) -> bool:
 
 
 def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
-    """Poses of the cameras of photographs from the world as (V, 4, 4) float64; errors name the photograph.
-
-    Raises:
-        InvalidInputError: another number of poses, one that is not rigid and finite, or photographs that show different
-            things though camera and pose are the same.
-    """
+    """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the photograph: a pose
+    that is not rigid and finite, or that of another photograph by the same camera which shows something else."""
     T = as_numbers(poses, "T_cam_from_world", dtype=torch.float64).detach().cpu().double()
     check_tensor(T, "T_cam_from_world", (len(items), 4, 4))
     for i, pose in enumerate(T):
@@ -216,8 +192,11 @@ def image_item(
     pixels, notes = _pixels(image), []
     box = None if box is None else box.detach().float().cpu()
     mask = None if mask is None else _object_mask(mask, pixels)
-    if mask is not None and _looks_inverted(mask):
-        notes.append("the mask covers most of the photograph and of its border; the object must be white, not black")
+    if mask is not None:
+        white = mask >= 0.5
+        border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
+        if min(float(border.float().mean()), float(white.float().mean())) > 0.5:
+            notes.append("the mask covers most of the photograph and its border; the object must be white, not black")
     missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
     if isinstance(camera, Camera):
         camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
@@ -249,12 +228,6 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
     return x
 
 
-def _looks_inverted(mask: Tensor) -> bool:
-    white = mask >= 0.5
-    border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
-    return bool(border.float().mean() > 0.5 and white.float().mean() > 0.5)
-
-
 def _box_of_mask(mask: Tensor, box: Tensor | None) -> Tensor:
     """The (4,) box, or that around the white pixels of (H, W); refuses a mask without any, or without any in it."""
     white = mask >= 0.5
@@ -274,7 +247,7 @@ def _inside(pixels: Tensor, box: Tensor) -> Tensor:
 
 
 class OnDemand(Sequence[ImageItem | CurviregError]):
-    """``item(0)`` to ``item(count - 1)``, computed at each access."""
+    """``item(0)`` to ``item(count - 1)``, computed at each access, one at a time."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:
         self._item, self._indices = item, range(count)
@@ -282,13 +255,8 @@ class OnDemand(Sequence[ImageItem | CurviregError]):
     def __len__(self) -> int:
         return len(self._indices)
 
-    @overload
-    def __getitem__(self, index: int) -> ImageItem | CurviregError: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[ImageItem | CurviregError]: ...
-    def __getitem__(self, index: int | slice) -> Any:
-        found = self._indices[index]
-        return self._item(found) if isinstance(found, int) else [self._item(i) for i in found]
+    def __getitem__(self, index: Any) -> Any:
+        return self._item(self._indices[index])
 
 
 def _pixels(image: Any) -> Tensor:
@@ -333,15 +301,8 @@ def check_box_side(box: Tensor, size: tuple[int, int]) -> None:
 
 
 def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
-    """What is questionable about a valid (3, 3) camera matrix of an (H, W) photograph.
-
-    Example:
-        >>> swapped = torch.tensor([[325.0, 0, 572], [0, 325, 573], [0, 0, 1]])
-        >>> camera_warnings(swapped, (480, 640))[0].rpartition("; ")[-1]
-        'FX FY and CX CY seem to be swapped'
-        >>> camera_warnings(torch.tensor([[572.0, 0, 325], [0, 573, 242], [0, 0, 1]]), (480, 640))
-        []
-    """
+    """What is questionable about a valid (3, 3) camera matrix of an (H, W) photograph; each names the likely
+    mistake."""
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     H, W = size
     found = []

@@ -13,30 +13,10 @@ from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
 from .confidence import COVARIANCE_SCALE
 
-__all__ = [
-    "Measurements",
-    "PointMatches",
-    "apply_twist",
-    "fit_points",
-    "least_squares_step",
-    "nearest_rigid",
-    "pixels",
-    "pose_covariance",
-    "project",
-    "step_fraction",
-]
-
-MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1
-"""Longest step: radians, and fraction of the object's distance."""
-
-INLIER_SCALE = 2.0
-"""Distance in px at which a point match counts a quarter."""
-
-MIN_MATCHES = 8
-"""Point matches that a pose needs."""
-
-POINT_DAMPING = 1e-5
-"""Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J."""
+MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1  # Longest step: radians, and fraction of the object's distance
+INLIER_SCALE = 2.0  # Distance in px at which a point match counts a quarter
+MIN_MATCHES = 8  # Point matches that a pose needs
+POINT_DAMPING = 1e-5  # Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J
 
 
 @dataclass(frozen=True)
@@ -98,24 +78,7 @@ def _geman_mcclure(residual: Tensor, scale: float) -> Tensor:
 
 def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scales: Sequence[float]) -> Tensor:
     """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4); ``T`` if there are few.
-
-    Args:
-        matches: points and where they were found.
-        T, K, centre: start, camera (1, 3, 3) in px, and centre (3,) of the object.
-        scales: of the robust weights in px, one a step: at first all matches count, in the end those that agree.
-
-    Example:
-        >>> K = torch.tensor([[[200.0, 0, 128], [0, 200.0, 128], [0, 0, 1]]], dtype=torch.float64)
-        >>> start, zero = torch.eye(4, dtype=torch.float64)[None], torch.zeros(3, dtype=torch.float64)
-        >>> start[0, 2, 3] = 5.0
-        >>> truth = apply_twist(start, torch.tensor([[0.05, -0.04, 0.03, 0.1, -0.1, 0.2]]).double(), zero)
-        >>> points = torch.rand(1, 40, 3, dtype=torch.float64) - 0.5
-        >>> uv = pixels(points, truth, K, zero)
-        >>> uv[:, :12] += 30.0                                                        # matches of something else
-        >>> found = fit_points(PointMatches(points, uv, torch.ones(1, 40)), start, K, zero, (24, 12, 6, 3, 2, 2, 2))
-        >>> bool((found - truth).abs().max() < 1e-3)
-        True
-    """
+    ``scales`` of the robust weights in px are one a step: at first all matches count, in the end those that agree."""
     if int((matches.weight > 0).sum()) < MIN_MATCHES:
         return T
     for scale in scales:
@@ -177,24 +140,18 @@ def nearest_rigid(T: Tensor) -> Tensor:
     return transform(U @ V, T[:, :3, 3])
 
 
+# Side in px of the square cells within which errors of contour points are correlated, and cells per side
 CELL_SIDE, CELLS_PER_SIDE = 32.0, 16
-"""Side in px of the square cells within which errors of contour points are correlated, and cells per side."""
-
+# Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
+# the surface turns away)
 NORMAL_ERROR, SIGHT_ERROR = 0.05, 0.05
-"""Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
-the surface turns away)."""
-
+# Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common
 POINT_ERROR, SHARED_ERROR = 0.6, 6.0
-"""Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common."""
-
+# A direction counts as known if this fraction of its information does not come from such errors
 OBSERVABLE_FRACTION = 0.75
-"""A direction counts as known if this fraction of its information does not come from such errors."""
-
+# Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance
 UNKNOWN_ROTATION = math.pi
-"""Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance."""
-
-MIN_TOTAL_WEIGHT = 6.0
-"""Sum of weights that a covariance needs."""
+MIN_TOTAL_WEIGHT = 6.0  # Sum of weights that a covariance needs
 
 
 def pose_covariance(
@@ -210,13 +167,12 @@ def pose_covariance(
     where g_c is the sum of r_i w_i J_i over a cell of 32 px, whose points have correlated errors, and s^2 the mean of
     r_i^2.
 
-    Errors produce information as well: normals that are off by 0.05 rad and points that are off by 0.05 radii along
-    the line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x count as unknown: the rotations of a
-    sphere, or that of a cylinder about its axis. Their standard deviation is pi (rotation) or the distance.
+    Errors produce information as well: normals that are off by 0.05 rad and points that are off by 0.05 radii along the
+    line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x count as unknown, such as the rotation of a
+    cylinder about its axis. Their standard deviation is pi (rotation) or the distance.
 
     Args:
-        measured: edges near the contour ``points`` of N poses.
-        T, K: (N, 4, 4) and (N, 3, 3) of the crops.
+        measured: edges near the contour ``points`` of N poses ``T`` (N, 4, 4) in crops with cameras ``K`` (N, 3, 3).
         centre, radius: of the object, (3,) and model units.
 
     Returns:

@@ -13,30 +13,19 @@ from ..mesh.mesh import mesh_centre, mesh_radius
 from .inputs import ImageItem
 from .poses import Poses, placed
 
-__all__ = ["Limits"]
-
+# Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next
 VIEW_SPACING = 7.5
-"""Degrees by which the limits are widened for views of a bank: each stands for the poses up to halfway to the next."""
-
+# Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known
 FIT_TOLERANCE = 3.0
-"""Degrees by which the contour fit may leave the limits: it measures more precisely than limits are usually known."""
-
-AT_LIMIT_ANGLE = 1.0
-"""Degrees from a limit within which a result is reported to lie at the limit."""
-
-DISTANCE_TOLERANCE, AT_LIMIT_DISTANCE = 0.03, 0.01
-"""The same two for the distance, as fractions of its limits."""
-
+AT_LIMIT_ANGLE = 1.0  # Degrees from a limit within which a result is reported to lie at the limit
+DISTANCE_TOLERANCE, AT_LIMIT_DISTANCE = 0.03, 0.01  # The same two for the distance, as fractions of its limits
+# Fraction of a limit by which the distance at which the mesh fills the box may miss it: boxes are not exact
 BOX_DISTANCE_TOLERANCE = 0.1
-"""Fraction of a limit by which the distance at which the mesh fills the box may miss it: boxes are not exact."""
 
 
 class Limits:
-    """The limits of a photograph's ``prior``.
-
-    They hold for rotations in the photograph's own camera; without a camera matrix, in one that looks straight at the
-    box. Views are allocentric, and are rotated towards the ray through the centre of the box.
-    """
+    """The limits of a photograph's ``prior``, for rotations in its own camera; without a camera matrix, in one that
+    looks straight at the box. Views are allocentric, and are rotated towards the ray through the centre of the box."""
 
     def __init__(self, item: ImageItem, bank: ViewBank) -> None:
         assert item.prior is not None
@@ -50,11 +39,7 @@ class Limits:
 
     def allowed(self, *, off_centre: float = 0.0) -> Tensor:
         """(N,) bool: views of the bank within the limits; the object may lie ``off_centre`` degrees from the ray
-        through its box.
-
-        Raises:
-            InvalidInputError: no view lies within the limits, or all distances are inside the object.
-        """
+        through its box. Refuses limits that leave no view, or only distances inside the object."""
         radius, distance = mesh_radius(self._bank.mesh), self.prior.distance
         if distance is not None and distance[1] < radius:
             raise InvalidInputError(
@@ -86,13 +71,9 @@ class Limits:
         return (self._excess(poses) <= FIT_TOLERANCE) & (self._distance_excess(poses) <= DISTANCE_TOLERANCE)
 
     def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
-        """How the best pose contradicts the limits, see :attr:`Registration.prior_contradiction`.
-
-        Args:
-            best: one pose.
-            filling: the same, at the distance at which the mesh fills the box.
-            better_outside: whether a pose outside the limits has a higher score.
-        """
+        """How the best pose contradicts the limits, see :attr:`Registration.prior_contradiction`; ``filling`` is the
+        same at the distance at which the mesh fills the box, ``better_outside`` whether a pose outside has a higher
+        score."""
         if better_outside or bool(self._distance_excess(filling) > BOX_DISTANCE_TOLERANCE):
             return "better outside"
         at_limit = self._excess(best) > -AT_LIMIT_ANGLE, self._distance_excess(best) > -AT_LIMIT_DISTANCE

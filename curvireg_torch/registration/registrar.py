@@ -456,7 +456,7 @@ class Registrar:
         return Registration(
             tuple(hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported),
             probabilities,
-            ranking[:1],
+            ranking,
             measured,
             prior=work.item.prior,
             prior_contradiction=contradiction,

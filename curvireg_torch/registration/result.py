@@ -3,10 +3,10 @@
 import html
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -25,41 +25,14 @@ from .confidence import RELIABLE
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = [
-    "SCHEMA",
-    "Detection",
-    "FailedRegistration",
-    "Hypothesis",
-    "PhotographPose",
-    "Registration",
-    "ambiguity",
-    "corners",
-    "detection_document",
-    "pose_in_words",
-    "remarks",
-    "result_document",
-    "used_box",
-    "verdict",
-]
+Value = TypeVar("Value")
 
-UNKNOWN_ROTATION = 1.0
-"""Radians of standard deviation from which the rotation about an axis counts as unknown."""
-
-RIVAL_FRACTION = 0.5
-"""Fraction of the first pose's probability from which another one makes the answer ambiguous."""
-
-HALF_TURN = 150.0
-"""Degrees from which the rotation between two poses counts as a half turn."""
-
-MIRROR_ANGLE = 30.0
-"""Degrees within which two directions of view count as mirror images of each other."""
-
-STEEP_ELEVATION = 70
-"""Degrees of elevation beyond which an object is seen from above or below."""
-
-SCHEMA = 3
-"""Version of the keys of ``result.json``; raised when a key is removed or changes its meaning."""
-
+UNKNOWN_ROTATION = 1.0  # Radians of standard deviation from which the rotation about an axis counts as unknown
+RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which another one makes the answer ambiguous
+HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
+MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
+STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
+SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
 CONVENTIONS = {
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
     "translation": "in the mesh file's unit; null without a camera",
@@ -95,17 +68,16 @@ class Hypothesis:
         translation: (3,) float64 in model units, None without a camera matrix.
         score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose, how clearly and how
             near to its outline the object's colours end.
-        evidence: the features that the hypotheses are ordered by, see :data:`.poses.POSE_FEATURES`; of a tracked
-            pose, those of its confidence.
+        evidence: the features that the hypotheses are ordered by; of a tracked pose, those of its confidence.
         allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
-        distance: distance of the object's centre in model units.
+        distance: of the object's centre in model units.
         projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto
             the photograph; without a camera matrix, those of a camera that looks straight at the object.
         view: index of the bank's view that the hypothesis started from.
         edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
         covariance: (6, 6) float64 of rotation (rad) about the camera's x, y, z axes and translation (model units) along
-            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose; None without a camera matrix,
-            without contour fit, and where too few edges were found. It assumes that the camera matrix is right.
+            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose and camera matrix; None
+            without a camera matrix, without contour fit, and where too few edges were found.
     """
 
     rotation: Tensor
@@ -127,10 +99,8 @@ class Hypothesis:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance.
-
-        ``inf`` marks what the contours do not determine: deviations from a radian, or from half the distance.
-        """
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance. ``inf`` marks
+        what the contours do not determine: deviations from a radian, or from half the distance."""
         if self.covariance is None:
             return None
         rotation, translation = self.covariance.diagonal().sqrt().split(3)
@@ -146,7 +116,7 @@ class Hypothesis:
         """``rotation``, ``translation`` and ``viewpoint`` as JSON values."""
         return {
             "rotation": self.rotation.tolist(),
-            "translation": None if self.translation is None else self.translation.tolist(),
+            "translation": _plain(self.translation),
             "viewpoint": dict(zip(("azimuth", "elevation", "theta"), self.viewpoint, strict=True)),
         }
 
@@ -171,15 +141,13 @@ class Detection:
 
 @dataclass(frozen=True)
 class PhotographPose:
-    """The pose of an object that was registered in several photographs, in one of them.
+    """The pose in one of the photographs that an object was registered in together.
 
     Attributes:
         T_cam_from_model: (4, 4) float64.
-        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared: the given one, one that replaced
-            it, or one around the pose; None for a photograph that was not read.
+        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it was not read.
         edge_support, similarity: of the pose in this photograph; None where it was not compared.
-        contribution: score by which the photograph prefers the pose to its best rival: negative if it prefers the
-            rival, 0 if it does not count.
+        contribution: score by which the photograph prefers the pose to its best rival, 0 if it does not count.
         failure: why the photograph does not count, in words; None if it does.
     """
 
@@ -192,24 +160,27 @@ class PhotographPose:
 
     def to_dict(self) -> dict[str, Any]:
         """All attributes as JSON values, the pose as ``rotation`` and ``translation``."""
-        T, box = self.T_cam_from_model, self.box
-        return {
-            "rotation": T[:3, :3].tolist(),
-            "translation": T[:3, 3].tolist(),
-            "box": None if box is None else box.tolist(),
-            "edge_support": self.edge_support,
-            "similarity": self.similarity,
-            "contribution": self.contribution,
-            "failure": self.failure,
-        }
+        rest = dict(vars(self))
+        T, box = rest.pop("T_cam_from_model"), rest.pop("box")
+        pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
+        return {**pose, "box": _plain(box), **rest}
+
+
+class _OfBest(Generic[Value]):
+    """An attribute of a registration that is one of its best hypothesis."""
+
+    def __init__(self, get: Callable[[Hypothesis], Value]) -> None:
+        self._get = get
+
+    def __get__(self, result: "Registration", owner: type) -> Value:
+        return self._get(result.hypotheses[0])
 
 
 @dataclass(frozen=True)
 class Registration:
     """Poses of one object in one photograph, best first.
 
-    The attributes of the best :class:`Hypothesis` (``rotation``, ``translation``, ``score``, ``viewpoint``,
-    ``edge_support``, ``projection``, ...) are attributes of the registration too; ``covariance`` and
+    The attributes of the best :class:`Hypothesis` are attributes of the registration too; ``covariance`` and
     ``standard_deviations`` are None where it is not reliable.
 
     Attributes:
@@ -221,11 +192,9 @@ class Registration:
         detection: where the object was found; None if its box was given.
         corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
         prior: the limits on the pose that were given.
-        prior_contradiction: "better outside": a pose outside the limits fits better by the same evidence, or the box
-            asks for a distance outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a
-            limit. None otherwise.
-        warnings: what is questionable about the box, the camera and the mesh, in words; a result with one is not
-            reliable.
+        prior_contradiction: "better outside": a pose outside the limits fits better, or the box asks for a distance
+            outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None otherwise.
+        warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
         model: number of the mesh, of several.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
             ``T_world_from_model``, along the world's axes.
@@ -246,41 +215,15 @@ class Registration:
     ok = True
     """False of a :class:`FailedRegistration`."""
 
-    @property
-    def rotation(self) -> Tensor:
-        return self.hypotheses[0].rotation
-
-    @property
-    def translation(self) -> Tensor | None:
-        return self.hypotheses[0].translation
-
-    @property
-    def transform(self) -> Tensor | None:
-        return self.hypotheses[0].transform
-
-    @property
-    def viewpoint(self) -> tuple[float, float, float]:
-        return self.hypotheses[0].viewpoint
-
-    @property
-    def score(self) -> float:
-        return self.hypotheses[0].score
-
-    @property
-    def edge_support(self) -> float | None:
-        return self.hypotheses[0].edge_support
-
-    @property
-    def allocentric_rotation(self) -> Tensor:
-        return self.hypotheses[0].allocentric_rotation
-
-    @property
-    def distance(self) -> float:
-        return self.hypotheses[0].distance
-
-    @property
-    def projection(self) -> tuple[Tensor, Tensor]:
-        return self.hypotheses[0].projection
+    rotation = _OfBest(lambda best: best.rotation)
+    translation = _OfBest(lambda best: best.translation)
+    transform = _OfBest(lambda best: best.transform)
+    viewpoint = _OfBest(lambda best: best.viewpoint)
+    score = _OfBest(lambda best: best.score)
+    edge_support = _OfBest(lambda best: best.edge_support)
+    allocentric_rotation = _OfBest(lambda best: best.allocentric_rotation)
+    distance = _OfBest(lambda best: best.distance)
+    projection = _OfBest(lambda best: best.projection)
 
     @property
     def confidence(self) -> float | None:
@@ -304,17 +247,14 @@ class Registration:
         """Whether the confidence is at least ``RELIABLE``, without ``warnings``, the photograph does not contradict the
         prior by a better pose outside, and the contours determine at least one axis of rotation; if False, the pose is
         a guess."""
+        best = self.hypotheses[0]
         if self.confidence is None or self.confidence < RELIABLE or self.warnings:
             return False
-        return self.prior_contradiction != "better outside" and self._is_determined
-
-    @property
-    def _is_determined(self) -> bool:
-        """Whether a pose with a camera has a covariance, in which not all rotations are unknown."""
-        best = self.hypotheses[0]
-        deviations = best.standard_deviations
-        if best.translation is None or best.edge_support is None:
+        if self.prior_contradiction == "better outside":
+            return False
+        if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
+        deviations = best.standard_deviations
         return deviations is not None and bool(deviations[0].isfinite().any())
 
     @property
@@ -357,12 +297,12 @@ class Registration:
 
     def to_dict(self) -> dict[str, Any]:
         """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
-        deviations, covariance = self.standard_deviations, self.covariance
+        deviations = self.standard_deviations
         prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
         return {
             **self.hypotheses[0].pose_dict(),
             "quaternion": self.quaternion.tolist(),
-            "T_cam_from_model": None if self.T_cam_from_model is None else self.T_cam_from_model.tolist(),
+            "T_cam_from_model": _plain(self.T_cam_from_model),
             "score": self.score,
             "confidence": self.confidence,
             "reliable": self.reliable,
@@ -375,8 +315,8 @@ class Registration:
             "standard_deviations": None
             if deviations is None
             else {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
-            "covariance": None if covariance is None else covariance.tolist(),
-            "corrected_box": None if self.corrected_box is None else self.corrected_box.tolist(),
+            "covariance": _plain(self.covariance),
+            "corrected_box": _plain(self.corrected_box),
             **({} if prior is None else {"prior": prior}),
             "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
             **({"views": [view.to_dict() for view in self.views]} if self.views else {}),
@@ -391,6 +331,10 @@ class Registration:
             "view": hypothesis.view,
             "terms": {name: value for name, value in terms.items() if math.isfinite(value)},
         }
+
+
+def _plain(values: Tensor | None) -> list[Any] | None:
+    return None if values is None else values.tolist()
 
 
 def _finite(deviations: Tensor) -> list[float | None]:
@@ -413,13 +357,10 @@ class FailedRegistration:
 
 
 def ambiguity(rotations: Tensor) -> str | None:
-    """How poses differ, in words; None for a single one.
+    """How poses (K, 3, 3) differ, in words; None for a single one.
 
-    "half turn": the second differs from the first by a rotation of nearly 180 degrees. "mirror": they are seen from
-    directions that are mirror images at a coordinate plane of the mesh. "several": anything else, or more than two.
-
-    Args:
-        rotations: (K, 3, 3).
+    "half turn": by a rotation of nearly 180 degrees; "mirror": they are seen from directions that are mirror images at
+    a coordinate plane of the mesh; "several": anything else, or more than two.
 
     Example:
         >>> ambiguity(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))]))
@@ -465,21 +406,12 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
     found = [(result, result.detection) for result in results if result.detection is not None]
     first = found[0][1]
-    return {
-        "score": first.score,
-        "proposals": [
-            {"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)
-        ],
-        "instances": [
-            {
-                "box": at.box.tolist(),
-                "score": at.score,
-                "confidence": result.confidence,
-                **result.hypotheses[0].pose_dict(),
-            }
-            for result, at in found
-        ],
-    }
+    proposals = [{"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)]
+    instances = [
+        {"box": at.box.tolist(), "score": at.score, "confidence": result.confidence, **result.hypotheses[0].pose_dict()}
+        for result, at in found
+    ]
+    return {"score": first.score, "proposals": proposals, "instances": instances}
 
 
 def used_box(document: Mapping[str, Any]) -> list[float]:
@@ -507,23 +439,17 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
-    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else "unsure".
-
-    Example:
-        >>> verdict(0.95, 0.03, True), verdict(0.6, 0.1, False), verdict(None, None, False)
-        ('likely', 'unsure', 'unsure')
-    """
+    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else
+    "unsure"."""
     if reliable:
         return "likely"
     return "no match" if probability is not None and none is not None and none > probability else "unsure"
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which the object is seen, in degrees that the option ``--azimuth`` takes.
+    """The side from which a (3, 3) rotation shows the object, in degrees that the option ``--azimuth`` takes.
 
-    Args:
-        rotation: (3, 3), from the mesh file's axes to the camera.
-        up, front: axes of the mesh, see :func:`.object_frame`.
+    ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`.
 
     Example:
         >>> from curvireg_torch.geometry import rotation_from_viewpoint

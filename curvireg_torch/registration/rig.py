@@ -40,32 +40,21 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["Answer", "Found", "Rig", "RigPhotograph", "RigProblem"]
-
+# World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size
 FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
-"""World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size."""
-
+# Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
+# pose stands for it
 SAME_ANGLE, SAME_SHIFT = 15.0, 0.5
-"""Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
-pose stands for it."""
-
+# Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
+# distance, and across it in object radii
 DEPTH_ERROR, RIG_ERROR, CENTRE_ERROR = 0.08, 0.01, 0.1
-"""Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
-distance, and across it in object radii."""
-
-MAX_PLACE_DISTANCE = 16.0
-"""Squared Mahalanobis distance up to which two photographs see the object in the same place."""
-
-MIN_OVERLAP = 0.3
-"""Overlap (IoU) with the box of a photograph below which a pose lies elsewhere."""
-
+MAX_PLACE_DISTANCE = 16.0  # Squared Mahalanobis distance up to which two photographs see the object in the same place
+MIN_OVERLAP = 0.3  # Overlap (IoU) with the box of a photograph below which a pose lies elsewhere
+# Degrees within which two photographs show partly the same; the weights of equal ones add up to one
 SAME_DIRECTION = 30.0
-"""Degrees within which two photographs show partly the same; the weights of equal ones add up to one."""
-
+# Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
+# distance from the object's size that is a mistake in the unit
 MIN_PARALLAX, MAX_UNIT_FACTOR = 0.03, 30.0
-"""Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
-distance from the object's size that is a mistake in the unit."""
-
 ELSEWHERE = "where the other photographs have the object, it lies outside this one or its box"
 
 
@@ -122,8 +111,8 @@ def in_frames(axes: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RigPhotograph:
-    """A registered photograph ``index`` of a rig: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the
-    ``box`` (4,) in which poses are compared, the crops of it, and the registration of it alone."""
+    """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the ``box``
+    (4,) in which poses are compared, the crops of it, and the registration of it alone."""
 
     index: int
     camera: Tensor
@@ -175,14 +164,13 @@ class RigPhotograph:
         return visible & (box_iou(boxes, self.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
 
 
-Found = dict[int, RigPhotograph | CurviregError]
-"""Photographs of a rig by their index, or why they failed."""
+Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by their index, or why they failed
 
 
 @dataclass(frozen=True)
 class Answer:
     """M candidate poses in the world, best first, with ``evidence`` (V, M, 4) and ``scores`` (V, M) in V photographs,
-    and covariances (M, 6, 6), NaN for those that are not finished."""
+    and covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
     evidence: Tensor
@@ -346,10 +334,8 @@ class Rig:
         return T, C
 
     def fitted(self, problem: RigProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
-        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state.
-
-        If the fit does not improve the support of all photographs together, the initial pose is kept.
-        """
+        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If the fit does not
+        improve the support of all photographs together, the initial pose is kept."""
         (each, cams), V = self.tied(problem, T), len(self.photographs)
         start = each.state(cams)
         found = each.descend(start, radii)
@@ -388,11 +374,9 @@ class Rig:
         return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
-        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone.
-
-        They are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
-        cameras' poses have errors.
-        """
+        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone. They
+        are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
+        cameras' poses have errors."""
         each, cams = self.tied(self.problems[0], T)
         measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
         seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)

@@ -9,33 +9,18 @@ from ..geometry import rotation_error, rotation_from_axis_angle
 from ..matching import ViewDescriber
 from .poses import Poses, similarities
 
-__all__ = ["search"]
-
-STOP_MOTION = 0.05
-"""|T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)."""
-
-SEARCH_ANGLE = 15.0
-"""Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees."""
-
+STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)
+SEARCH_ANGLE = 15.0  # Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees
+# Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel
 FIRST_STEP, FINEST_STEP = 5.0, 1.0
-"""Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel."""
-
-MAX_ROUNDS = 8
-"""Largest number of rounds of six poses each."""
+MAX_ROUNDS = 8  # Largest number of rounds of six poses each
 
 
 @torch.no_grad()
 def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tensor:
-    """Return (H, 3, 3) allocentric rotations whose views match the photographs best, near those of the starts.
-
-    Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is halved where
-    none of them is better, and the search ends where the pose stops moving at the finest step.
-
-    Args:
-        describer: of the mesh.
-        descriptors: (B, D) of the photographs' fields, computed by the describer.
-        starts: poses in those photographs.
-    """
+    """Return (H, 3, 3) allocentric rotations whose views match (B, D) photographs' ``descriptors`` best, near the
+    starts. Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is
+    halved where none of them is better, and the search ends where the pose stops moving at the finest step."""
     axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
     best, score = starts.rotation, similarities(describer, descriptors, starts)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)

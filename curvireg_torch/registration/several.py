@@ -25,16 +25,9 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["register_views"]
-
 
 def _contradicted(confidence: float, others: Sequence[float | None]) -> float:
-    """A confidence after photographs that were left out, in so far as they alone are confident of another pose.
-
-    Example:
-        >>> round(_contradicted(0.9, [0.3, 0.5]), 2), round(_contradicted(0.9, [0.8]), 2)
-        (0.9, 0.69)
-    """
+    """A confidence after photographs that were left out, in so far as they alone are confident of another pose."""
     odds = confidence / max(1.0 - confidence, 1e-9)
     for other in others:
         odds *= min(1.0, (1.0 - (other or 0.0)) / max(other or 0.0, 1e-9))
@@ -49,23 +42,22 @@ def register_views(
 
     Each photograph is registered alone. The hypotheses of all become poses in the world, which are moved to where the
     photographs agree that the object is, fitted to the contours in all photographs at once, and ordered by the sum of
-    their scores: a half turn that one photograph cannot see is decided by another. One photograph lowers a pose by at
-    most five points, and those from nearly the same side share one vote. A photograph that does not show the best pose
-    is left out, and the others decide again.
+    their scores. One photograph lowers a pose by at most five points, and those from nearly the same side share one
+    vote. A photograph that does not show the best pose is left out, and the others decide again.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
         images: V photographs, see :class:`Registrar`.
-        boxes: (V, 4), or a list with None where there is no box: the poses that the others suggest say where the object
-            is. None for no boxes at all: the object is searched for in each photograph.
+        boxes: (V, 4), or a list with None where the poses of the others say where the object is. None: the object is
+            searched for in each photograph.
         camera_matrices: see :class:`Registrar`; needed.
         T_cam_from_world: (V, 4, 4) rigid poses of the cameras, with lengths in the mesh's unit.
 
     Returns:
         A registration whose poses are ``T_world_from_model``, whose covariance is along the world's axes, and whose
         ``views`` have the pose in each photograph. ``projection`` and ``ranking`` are those of the first photograph
-        that counts. The covariance does not know the errors of the cameras; it grows where
-        photographs contradict each other.
+        that counts. The covariance does not know the errors of the cameras; it grows where photographs contradict
+        each other.
 
     Raises:
         InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two photographs that differ

@@ -17,58 +17,34 @@ from ..rendering.contours import ContourPoints, MeshContours
 from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, ContourState, full_size_problem
 from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
 
-__all__ = ["fit_texture", "surface_corners", "turned"]
-
+# Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
+# one's
 MAX_CORNERS, CORNER_SPACING, CORNER_QUALITY = 160, 5, 0.005
-"""Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the
-strongest one's."""
-
-HALF_PATCH = 7
-"""Patches around corners are 15 px wide, and lie within the silhouette."""
-
+HALF_PATCH = 7  # Patches around corners are 15 px wide, and lie within the silhouette
+# Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal
 MIN_CORRELATION = 0.4
-"""Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal."""
-
+# A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along an
+# edge
 RIVAL_DISTANCE, CLEAR_MARGIN = 4, 0.1
-"""A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along
-an edge."""
-
+# Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step
 FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
-"""Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step."""
-
+# Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and after
+# the second: patches seen from another side are found less exactly than those of the next frame, and correlate less
 PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.03, 0.15
-"""Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and
-after the second: patches seen from another side are found less exactly than those of the next frame, and correlate
-less."""
-
+# Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
+# the first round reaches
 TURN = 16.0
-"""Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
-the first round reaches."""
-
-JOINT_STEPS = 3
-"""Steps of the fit to both corners and edges."""
-
-MAX_SUPPORT_LOSS = 0.03
-"""Edge support that a fit may lose."""
-
+JOINT_STEPS = 3  # Steps of the fit to both corners and edges
+MAX_SUPPORT_LOSS = 0.03  # Edge support that a fit may lose
 Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
 
 
 def surface_corners(
     grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
 ) -> tuple[np.ndarray, Tensor]:
-    """Corners inside the object's outline, and the points of the surface that they show.
-
-    Args:
-        grey: (S, S) uint8.
-        depth: (1, 1, S, S) of the mesh at the pose.
-        T, K: (1, 4, 4) pose and (1, 3, 3) camera.
-        quality: least strength as a fraction of the strongest corner's.
-        inside: least distance from the outline in px.
-
-    Returns:
-        uv (C, 2) px, whole numbers in float32, and points of the model (1, C, 3).
-    """
+    """uv (C, 2) px, whole numbers in float32, of corners of ``grey`` (S, S) uint8, and the points (1, C, 3) of the
+    model there. They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4,
+    4) with camera ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest."""
     side = 2 * inside + 1
     mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
     found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, quality, CORNER_SPACING, mask=mask)
@@ -97,17 +73,12 @@ def fit_texture(
 
     The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
     correlation, which the strength of the light does not change. Robust least squares move the pose to where most of
-    them are found, then to the edges as well; a second round searches nearer. The fit counts if in the end more corners
-    are in place than at the start, and enough of them, and the edge support is as before.
+    them are found, then to the edges as well; a second round searches nearer. The fit counts, and is not None, if in
+    the end more corners are in place than at the start, and enough of them, and the edge support is as before.
 
-    Args:
-        draw: (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
-        renderer, contours: of the mesh.
-        images, boxes, camera_matrices, image_index, margin: see :func:`fit_contours`; one photograph.
-        starts: (N, 4, 4) the pose whose contours are fitted, and others that may be better (:func:`turned`).
-
-    Returns:
-        The fit, with the covariance from edges and patches; None where it does not count.
+    ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
+    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and others that may be better (:func:`turned`); the
+    other arguments are those of :func:`fit_contours`, for one photograph.
     """
     crops, _, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
     texture = _TextureRounds(draw, renderer, problem, _as_array(crops[0]))
@@ -196,13 +167,8 @@ def _as_array(picture: Tensor) -> np.ndarray:
 def match_patches(
     view: np.ndarray, photograph: np.ndarray, corners: np.ndarray, radius: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (C, 2) in px to where patches of a view correlate most, and weights (C,) in [0, 1] of these matches.
-
-    Args:
-        view, photograph: (S, S, 3) float32.
-        corners: (C, 2) whole numbers, x and y of the middles of the patches, which lie within the view.
-        radius: of the search in px.
-    """
+    """Offsets (C, 2) in px to where patches of a view correlate most within a ``radius`` of the photograph, both (S, S,
+    3) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of these matches."""
     border = HALF_PATCH + radius
     padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
     offset, weight = np.zeros((len(corners), 2)), np.zeros(len(corners))

@@ -8,6 +8,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import LostObjectError
@@ -30,59 +31,136 @@ from .least_squares import (
     pose_covariance,
     project,
 )
-from .region_colours import RegionModel, colour_bins, line_posterior
 from .texture_fit import surface_corners
 
-__all__ = ["OUTSIDE", "TrackedPose", "Tracker", "boxes_at"]
+COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
+SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
+LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors
+MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3  # Added to probabilities, so that a colour never seen is not proof
+MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
+LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
+HALF_RATE_COUNT = 20.0  # Pixels of a sector with which it learns at half of the rate
 
-WINDOW_SIZE = 256
-"""Side in px of the part of a frame around the object, which all measurements share."""
 
+def colour_bins(colours: Tensor) -> Tensor:
+    """(S, S) int64 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
+    red, green, blue = (colours[0] * COLOUR_LEVELS).long().clamp(0, COLOUR_LEVELS - 1)
+    bins: Tensor = (red * COLOUR_LEVELS + green) * COLOUR_LEVELS + blue
+    return bins
+
+
+def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
+    """Mean (P,) px and variance (P,) px² of where P lines leave the object, from the colours along them.
+
+    If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
+    r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
+    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius.
+
+    Args:
+        log_ratio: (P, L) r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1.
+        radius: in px, at most h.
+
+    Example:
+        >>> ends = torch.tensor([[2.0, 2.0, 2.0, 2.0, 2.0, -2.0, -2.0]])              # after the pixel at offset 1
+        >>> bool(1.4 < line_posterior(ends, 3)[0] < 1.5)
+        True
+    """
+    half = log_ratio.shape[-1] // 2
+    log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
+    d = torch.arange(-radius, radius, dtype=log_ratio.dtype) + 0.5  # between two pixels
+    p = log_likelihood.softmax(dim=-1)
+    mean = (p * d).sum(dim=-1)
+    return mean, (p * (d - mean[..., None]).square()).sum(dim=-1)
+
+
+class RegionModel:
+    """Colour histograms of the object and of the background, a pair for each direction from the object's centre.
+    Directions are angles in rad of the image's x, y axes; between the middles of two sectors both count."""
+
+    def __init__(self) -> None:
+        self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
+        self._log_ratio = torch.zeros(SECTORS * COLOUR_LEVELS**3)
+
+    def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor, *, rate: float) -> None:
+        """Move the histograms towards the colours at ``uv`` (M, 2) px of ``bins`` (S, S), in ``directions`` (M,) rad
+        from the object's centre, ``inside`` (M,) bool the object; ``rate`` in [0, 1] is their weight, but empty
+        histograms take all."""
+        index, seen = _indices(bins, uv)
+        colour = bins.view(-1)[index[seen]]
+        low, high, fraction = _sectors(directions[seen])
+        side = (~inside[seen]).long()
+        new = torch.zeros_like(self._histograms)
+        for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
+            new.view(-1).index_add_(0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float())
+        count = new.sum(dim=-1, keepdim=True)
+        new = new / count.clamp(min=1e-9)
+        step = rate * count / (count + HALF_RATE_COUNT)
+        empty = self._histograms.sum(dim=-1, keepdim=True) == 0
+        self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
+        p = _smoothed(self._histograms)
+        p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
+        self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).view(-1)
+
+    def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
+        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of
+        lines in ``directions`` (P,); 0 outside the window."""
+        index, seen = _indices(bins, uv)
+        colour = bins.view(-1)[index]
+        low, high, fraction = (x[:, None] for x in _sectors(directions))
+        of_low, of_high = (self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high))
+        return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
+
+
+def _indices(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices (...) of the flattened pixels nearest to ``uv`` (..., 2), and whether they lie in the window."""
+    side = bins.shape[-1]
+    x, y = uv.round().long().unbind(-1)
+    seen = (x >= 0) & (x < side) & (y >= 0) & (y < side)
+    return y.clamp(0, side - 1) * side + x.clamp(0, side - 1), seen
+
+
+def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The two sectors beside each direction, and the weight of the second."""
+    place = (directions / (2.0 * math.pi) % 1.0) * SECTORS
+    low = place.floor()
+    return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
+
+
+def _smoothed(histograms: Tensor) -> Tensor:
+    """Histograms (2, SECTORS, COLOUR_LEVELS^3) after a binomial-like filter along each colour channel."""
+    kernel = torch.tensor([0.2, 0.6, 0.2])
+    cube = histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
+    for axis in range(3):
+        shape, pad = [1, 1, 1], [0] * 6
+        shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
+        cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel.view(1, 1, *shape))
+    return cube.view_as(histograms)
+
+
+WINDOW_SIZE = 256  # Side in px of the part of a frame around the object, which all measurements share
+# Added around the object's box, as a fraction of its longer side: room for motion that was not predicted
 WINDOW_MARGIN = 0.3
-"""Added around the object's box, as a fraction of its longer side: room for motion that was not predicted."""
-
+# Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
-"""Message of a :class:`LostObjectError`."""
-
-SEARCH_RADII = (6.0, 4.0, 2.5)
-"""Search radius in px of edges and of the end of the object's colours, one a round."""
-
-STEPS_PER_ROUND = 2
-"""Least-squares steps per round."""
-
+SEARCH_RADII = (6.0, 4.0, 2.5)  # Search radius in px of edges and of the end of the object's colours, one a round
+STEPS_PER_ROUND = 2  # Least-squares steps per round
+# Weights, relative to edges, of colours and of points from the last frame and from a keyframe
 REGION_WEIGHT, POINT_WEIGHT, KEYFRAME_WEIGHT = 2.0, 0.3, 0.5
-"""Weights, relative to edges, of colours and of points from the last frame and from a keyframe."""
-
-REGION_VARIANCE = 0.5
-"""Variance in px² added to that of the end of the object's colours."""
-
-LEARNING_RATE = 0.2
-"""Weight of a new frame in the colour histograms."""
-
-LEARNED_BAND = (2, 24)
-"""Nearest and farthest distance in px from the outline at which colours are learned."""
-
-REGION_FEATURE_RADIUS = 8
-"""Radius in px of the posterior from which :attr:`TrackedPose.features` are computed."""
-
+REGION_VARIANCE = 0.5  # Variance in px² added to that of the end of the object's colours
+LEARNING_RATE = 0.2  # Weight of a new frame in the colour histograms
+LEARNED_BAND = (2, 24)  # Nearest and farthest distance in px from the outline at which colours are learned
+REGION_FEATURE_RADIUS = 8  # Radius in px of the posterior from which TrackedPose.features are computed
+# Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another
 MAX_KEYFRAMES, KEYFRAME_ANGLE = 30, 8.0
-"""Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another."""
-
+# Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place
 PYRAMID_LAST, PYRAMID_KEYFRAME = 3, 1
-"""Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place."""
-
-FLOW_PATCH = 15
-"""Side of the patches of the optical flow in px."""
-
-MAX_RETURN_ERROR = 1.5
-"""Largest distance in px between a corner and where the flow back from its match ends."""
-
+FLOW_PATCH = 15  # Side of the patches of the optical flow in px
+MAX_RETURN_ERROR = 1.5  # Largest distance in px between a corner and where the flow back from its match ends
+# Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree
 FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
-"""Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree."""
-
+# Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
+# outline: nearer to it, patches show the background
 CORNER_QUALITY, CORNER_INSET = 0.01, 3
-"""Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
-outline: nearer to it, patches show the background."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +176,10 @@ class Frame:
 
     @classmethod
     def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
-        """The square around a mesh, ``WINDOW_SIZE`` px wide.
+        """The square around a mesh at ``T`` (1, 4, 4), of an image (1 or 3, H, W) in [0, 1] or uint8 with camera ``K``
+        (3, 3).
 
-        Args:
-            image: (C, H, W), C = 1 or 3, in [0, 1] or uint8; missing pixels are filled from their neighbours.
-            K: (3, 3) float64 camera matrix in px.
-            hull, contours: (V, 3) float64 points, and contours, of the mesh.
-            T: (1, 4, 4) float64 pose.
+        Missing pixels are filled from their neighbours.
 
         Raises:
             LostObjectError: the mesh lies behind the camera, or outside the image.
@@ -133,10 +208,8 @@ class Frame:
 
 
 def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W).
-
-    And (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing.
-    """
+    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W). And
+    (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing."""
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
     boxes = projected_boxes(hull, T, K)
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
@@ -156,11 +229,9 @@ class Keyframe:
 
 
 def track_points(keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
-    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them.
-
-    Matches from which the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets
-    the search reach further.
-    """
+    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them. Matches from which
+    the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets the search reach
+    further."""
     if len(keyframe.uv) == 0:
         return PointMatches(keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double())
     guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
@@ -188,14 +259,10 @@ def _optical_flow(
 
 @dataclass(frozen=True)
 class TrackedPose:
-    """A pose in a frame.
-
-    Attributes:
-        features: what the confidence is computed from, all in [0, 1]: ``edge_support`` as of a contour fit; ``region``,
-            how clearly and how near to the outline the object's colours end; ``flow`` and ``keyframe``, the fraction
-            of the corners of the last frame, and of a keyframe, that are found where the pose has them.
-        frame, state: the frame, and the pose (1, 4, 4) with its contours.
-    """
+    """A pose (1, 4, 4) in a frame, with its contours, as ``state``. Its ``features``, all in [0, 1]: ``edge_support``
+    as of a contour fit; ``region``, how clearly and how near to the outline the object's colours end; ``flow`` and
+    ``keyframe``, the fraction of the corners of the last frame, and of a keyframe, that are found where the pose has
+    them."""
 
     features: Mapping[str, float]
     frame: Frame
@@ -208,7 +275,7 @@ class TrackedPose:
 
 
 class Tracker:
-    """Follows an object from a known pose.
+    """Follows an object from a known pose, by the ``contours`` of its mesh and the points ``hull`` (V, 3) around it.
 
     Each frame is searched around the pose that a constant velocity predicts, and if that is not convincing, around the
     last pose. Optical flow of corners on the surface gives a first pose; robust least squares then fits jointly edges
@@ -216,10 +283,6 @@ class Tracker:
     frame and of the keyframe that was seen from the most similar direction.
 
     A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
-
-    Args:
-        renderer, contours: of the mesh.
-        hull: (V, 3) points of the mesh that span its convex hull.
     """
 
     def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
@@ -232,30 +295,21 @@ class Tracker:
 
     def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
         """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
-
-        Raises:
-            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
-        """
+        Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
         first = self.measure(image, K, T)
         self._poses, self._keyframes, self._regions = [], [], RegionModel()
         self.accept(first)
 
     def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
-        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is.
-
-        Raises:
-            LostObjectError: at that pose the mesh lies behind the camera, or outside the image.
-        """
+        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is; errors as
+        :meth:`start`."""
         start = T.detach().cpu().double()[None]
         frame = self._frame(image, K, start)
         return self._tracked(frame, frame.problem.state(start), [])
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
-        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3).
-
-        Raises:
-            LostObjectError: the object has left the image.
-        """
+        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3); :class:`LostObjectError` if it left the
+        image."""
         found: list[TrackedPose] = []
         for T in self.predictions():
             try:

@@ -1,6 +1,7 @@
 """Depth images of meshes behind one protocol; every backend samples the pixel's centre."""
 
-from .colour import render_colour, shade
-from .depth import DepthRenderer, make_renderer, render_depth
-
-__all__ = ["DepthRenderer", "make_renderer", "render_colour", "render_depth", "shade"]
+from .depth import DepthRenderer as DepthRenderer
+from .depth import make_renderer as make_renderer
+from .depth import render_colour as render_colour
+from .depth import render_depth as render_depth
+from .depth import shade as shade

@@ -15,18 +15,12 @@ from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .depth import NEAREST, check_render_arguments
 
-__all__ = ["EmbreeRenderer", "RasterRenderer", "RayScene"]
-
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
-
+# Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws
 BESIDE = 1e-3
-"""Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws."""
-
-
-FARTHEST = 1000.0
-"""Depth, in object radii, beyond which single precision does not separate object and background."""
+FARTHEST = 1000.0  # Depth, in object radii, beyond which single precision does not separate object and background
 
 
 class RayScene:
@@ -57,9 +51,8 @@ def _float32(x: np.ndarray) -> np.ndarray:
 
 class EmbreeRenderer:
     """Casts one ray through each pixel's centre inside the outline of the object's hull, views in parallel on threads.
-
-    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled: a spawned process builds its own.
-    """
+    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled: a spawned process builds its
+    own."""
 
     name = "embree"
 
@@ -89,11 +82,9 @@ class EmbreeRenderer:
     def faces_at(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
-        """The face that each pixel shows, the point on that face, and the depth of :meth:`render`.
-
-        (N, H, W) int32 face indices, -1 for none; (N, H, W) float32 u and v of the point (1 - u - v) a + u b + v c,
-        with the face's corners a, b, c; (N, 1, H, W) depth.
-        """
+        """The face that each pixel shows, the point on that face, and the depth of :meth:`render`. (N, H, W) int32 face
+        indices, -1 for none; (N, H, W) float32 u and v of the point (1 - u - v) a + u b + v c, with the face's corners
+        a, b, c; (N, 1, H, W) depth."""
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
@@ -160,15 +151,10 @@ def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: f
 
 
 class RasterRenderer:
-    """Draws into OpenCV's z-buffer, views in parallel on threads; rays take over where OpenCV is slower or wrong.
-
+    """Draws into OpenCV's z-buffer, views in parallel on threads; ``rays`` take over where OpenCV is slower or wrong.
     The time of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer
     faces than the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and
-    knows no parallel projection.
-
-    Attributes:
-        rays: a renderer of the same mesh by ray casting, built on first use.
-    """
+    knows no parallel projection."""
 
     name = "auto"
 

@@ -17,11 +17,9 @@ from ..geometry.conversions import opencv_from_opengl
 from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
 from .depth import NEAREST, check_render_arguments
 
-__all__ = ["PyrenderRenderer"]
-
 _lock = threading.Lock()
+# The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none survives a fork
 _context: tuple[int, Any] | None = None
-"""The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none survives a fork."""
 
 
 def _offscreen() -> Any:
@@ -61,12 +59,10 @@ def _release() -> None:
 
 
 class PyrenderRenderer:
-    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it thread-safe.
-
-    It works around a defect of pyrender 0.1.45: the framebuffer takes four samples per pixel and resolves depth to one
-    that is off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both
-    orientations. Depth has 24 bits: for a camera inside the object's box, the far end is less exact than elsewhere.
-    """
+    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it thread-safe. It works
+    around a defect of pyrender 0.1.45: the framebuffer takes four samples per pixel and resolves depth to one that is
+    off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both orientations.
+    Depth has 24 bits: for a camera inside the object's box, the far end is less exact than elsewhere."""
 
     name = "pyrender"
 

@@ -9,14 +9,10 @@ from ..mesh.mesh import mesh_centre, mesh_radius
 from ..utils.threads import map_on_threads
 from .depth import NEAREST, check_render_arguments
 
-__all__ = ["TorchRenderer"]
-
+# Pairs of triangle and pixel in memory at a time, about 60 bytes each: on a CPU, whose caches are small, and on other
+# devices
 PAIRS = 2**20, 2**24
-"""Pairs of triangle and pixel in memory at a time, about 60 bytes each: on a CPU, whose caches are small, and on other
-devices."""
-
-TOLERANCE = 1e-5
-"""Barycentric tolerance outside a triangle, which closes seams that rounding opens."""
+TOLERANCE = 1e-5  # Barycentric tolerance outside a triangle, which closes seams that rounding opens
 
 
 class TorchRenderer:

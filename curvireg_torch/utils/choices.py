@@ -63,7 +63,7 @@ def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | N
             other = next((str(mesh) for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS), "")
             advice = f"it and {other} seem to be swapped: {_ORDER}" if other else f"{_ORDER}, several by --mesh each"
             raise InvalidInputError(f"a mesh where {kind} is expected; {advice}", subject=path)
-        if kind == "a photograph" and path.suffix.lower() in (".csv", ".json"):
+        if kind == "a photograph" and path.suffix.lower() == ".csv":
             raise InvalidInputError(f"a list where a photograph is expected; give it as --list {path}", subject=path)
     for mesh in meshes:
         is_picture = is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)

@@ -14,7 +14,6 @@ and group and form of each object for scripts/calibration.
 
 import argparse
 import json
-import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -28,6 +27,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from scripts._shared import write_json
 from scripts.scenes.materials import random_colour, random_texture
 from scripts.scenes.packages import package
 from scripts.scenes.scene import Scene, camera_path, shelf, simulate_camera, single
@@ -251,13 +251,6 @@ def write_targets(options: argparse.Namespace) -> int:
                     targets.append(row | {"inst_count": 1})
     write_json(options.out / "test_targets_bop19.json", targets)
     return len(targets)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write ``content`` so that an interrupted run leaves no half of a file."""
-    part = path.with_name(f"{path.name}.{os.getpid()}")
-    part.write_text(json.dumps(content))
-    part.replace(path)
 
 
 _state: list[Any] = []

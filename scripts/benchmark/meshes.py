@@ -11,7 +11,6 @@ copies of held-out meshes are excluded), licence, and the symmetries of shape an
 
 import argparse
 import hashlib
-import json
 import re
 import subprocess
 import sys
@@ -25,6 +24,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from scripts._shared import write_json
 from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
@@ -260,9 +260,7 @@ def main() -> None:
                 continue
             clouds[row["id"]] = np.ptp(cloud, axis=0), cKDTree(cloud)
             listing["meshes"].append({**row, "half": half, "like": like or row["id"]})
-        part = arguments.out / "meshes.json.part"
-        part.write_text(json.dumps(listing, indent=1))
-        part.replace(arguments.out / "meshes.json")
+        write_json(arguments.out / "meshes.json", listing)
         count = sum(mesh["half"] == half for mesh in listing["meshes"])
         print(f"{half}: {count} meshes; left out {len(listing['left_out'])}")
 

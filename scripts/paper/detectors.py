@@ -1,12 +1,11 @@
-"""The 2D detectors that the paper compares: photograph in, response map and feature points out.
+"""The 2D detectors that the paper compares.
 
-``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns a
-:class:`Detection`.
+``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns
+the feature points, (B, 1, H, W) bool: at most the fraction of the pixels except for ties.
 """
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -29,47 +28,28 @@ from curvireg_torch.filters.operations import (
     central_derivatives,
     image_maximum,
     replicate_pad,
-    safe_sqrt,
     smooth,
     to_grey,
 )
 
-__all__ = ["DETECTORS", "Detection"]
-
-Function = TypeVar("Function", bound=Callable[..., "Detection"])
+__all__ = ["DETECTORS"]
 
 
-class Detection(NamedTuple):
-    """Response map and feature points of a detector."""
-
-    response: Tensor
-    """(B, 1, H, W) float32 or float64 >= 0, in a unit that depends on the detector."""
-
-    points: Tensor
-    """(B, 1, H, W) bool feature points, at most the requested fraction of the pixels except for ties."""
-
-
-def detector(function: Function) -> Function:
+def detector(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Decorator that lets a detector on grey levels accept RGB and half types."""
 
     @functools.wraps(function)
-    def on_photograph(image: Tensor, **options: float) -> Detection:
+    def on_photograph(image: Tensor, **options: float) -> Tensor:
         return function(to_grey(at_least_float32(image)), **options)
 
-    return cast(Function, on_photograph)
+    return on_photograph
 
 
-def detection_from_field(field: Tensor, fraction: float) -> Detection:
-    """Length of a vector field, and its maxima across the direction of the field."""
-    response = safe_sqrt(field.square().sum(dim=1, keepdim=True))
-    return Detection(response, field_points(field, fraction=fraction))
-
-
-def detection_from_peaks(response: Tensor, fraction: float) -> Detection:
-    """The positive part of a response map, and its maxima over 3 x 3 px."""
+def peaks(response: Tensor, fraction: float) -> Tensor:
+    """The strongest positive maxima over 3 x 3 px of a response map."""
     response = response.clamp(min=0.0)
-    peaks = response == F.max_pool2d(response, 3, stride=1, padding=1)
-    return Detection(response, strongest_points(response, peaks & (response > 0), fraction))
+    largest = response == F.max_pool2d(response, 3, stride=1, padding=1)
+    return strongest_points(response, largest & (response > 0), fraction)
 
 
 def sobel_gradient(image: Tensor) -> Tensor:
@@ -82,17 +62,17 @@ def sobel_gradient(image: Tensor) -> Tensor:
 
 
 @detector
-def sobel(image: Tensor, *, fraction: float = 0.04) -> Detection:
+def sobel(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Gradient by the Sobel kernels per px, borders replicated."""
-    return detection_from_field(sobel_gradient(image), fraction)
+    return field_points(sobel_gradient(image), fraction=fraction)
 
 
 @detector
-def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Detection:
+def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Zero crossings of the Laplacian of the image smoothed by 2 px (Marr and Hildreth 1980).
 
-    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the lower neighbour. The
-    response is the larger of these steps in grey levels per px^2, and 0 elsewhere.
+    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the lower neighbour; the
+    larger of these steps is its strength.
     """
     _, _, xx, yy, _ = central_derivatives(smooth(image, 2.0))
     laplacian = F.pad(xx + yy, (0, 1, 0, 1), mode="replicate")
@@ -101,39 +81,36 @@ def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Detection
         torch.where(here * x < 0, (here - x).abs(), 0.0) for x in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1])
     ]
     response = torch.maximum(*steps)
-    return Detection(response, strongest_points(response, response > 0, fraction))
+    return strongest_points(response, response > 0, fraction)
 
 
 @detector
-def canny(image: Tensor, *, fraction: float = 0.04) -> Detection:
+def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels exceed the upper
-    threshold, and the lower one is 0.4 times as high.
-
-    The response is the length of the Sobel gradient of the smoothed image per px.
-    """
+    threshold, and the lower one is 0.4 times as high."""
     response = torch.linalg.vector_norm(sobel_gradient(smooth(image, 1.4, margin=0)), dim=1, keepdim=True)
     points = torch.zeros_like(response, dtype=torch.bool)
     for grey, length, mask in zip(image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True):
         high = 4.0 * float(np.quantile(length.numpy(), 0.7))  # scikit-image divides its Sobel sums by 4
         edges = skimage.feature.canny(grey, 1.4, 0.4 * high, high, mode="nearest")
         mask.copy_(torch.from_numpy(edges))
-    return Detection(response, strongest_points(response, points, fraction))
+    return strongest_points(response, points, fraction)
 
 
 @detector
-def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) -> Detection:
+def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) -> Tensor:
     r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the image.
 
     With "zero" as :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))` and AND as min, a pixel is uniform (0) if I_x is
-    zero and I_y is zero, and an edge (1) otherwise. The response is the mean of 0 and 1 weighted by the truth of each
-    rule (Sugeno), :math:`1 - \min(\mu(I_x), \mu(I_y))`. Points are its maxima along the gradient.
+    zero and I_y is zero, and an edge (1) otherwise. Points are the maxima along the gradient of the mean of 0 and 1
+    weighted by the truth of each rule (Sugeno), :math:`1 - \min(\mu(I_x), \mu(I_y))`.
     """
     gradient = image_gradient(image, sigma=1.0)
     peak = image_maximum(gradient.abs())
     relative = gradient / torch.where(peak > 0, peak, 1.0)
     zero = torch.exp(-0.5 * (relative / width).square()).amin(dim=1, keepdim=True)
     length = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return detection_from_field((1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction)
+    return field_points((1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction=fraction)
 
 
 SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
@@ -141,11 +118,10 @@ SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
 
 
 @detector
-def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Detection:
+def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Tensor:
     """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box filters by scikit-image.
 
-    The response is the largest positive determinant over all filter sides up to the image's. Points are maxima above
-    ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
+    Points are maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
     """
     sides = [side for side in SIDES if side <= max(21, *image.shape[-2:])]
     H, W = image.shape[-2:]
@@ -155,43 +131,40 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.
     volume = volume[..., 49 : 49 + H, 49 : 49 + W]  # scikit-image's result is one pixel too far up and left
     inner, largest = volume[:, :, 1:-1], F.max_pool3d(volume, 3, stride=1, padding=(0, 1, 1))
     best = torch.where((inner == largest) & (inner > threshold), inner, 0.0).amax(dim=2)
-    return Detection(volume.amax(dim=2).clamp(min=0.0), strongest_points(best, best > 0, fraction))
+    return strongest_points(best, best > 0, fraction)
 
 
 @detector
-def harris(image: Tensor, *, k: float = 0.04, fraction: float = 0.04) -> Detection:
+def harris(image: Tensor, *, k: float = 0.04, fraction: float = 0.04) -> Tensor:
     """Harris and Stephens (1988): det - k trace^2 of the structure tensor (Sobel, Gaussian window), where positive."""
-    return detection_from_peaks(harris_response(image, k=k) if len(image) else image, fraction)
+    return peaks(harris_response(image, k=k), fraction)
 
 
 @detector
-def minimum_eigenvalue(image: Tensor, *, fraction: float = 0.04) -> Detection:
+def minimum_eigenvalue(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Shi and Tomasi (1994): the smaller eigenvalue of the structure tensor (Sobel, Gaussian window)."""
-    return detection_from_peaks(gftt_response(image) if len(image) else image, fraction)
+    return peaks(gftt_response(image), fraction)
 
 
 @detector
-def sift(image: Tensor, *, fraction: float = 0.04) -> Detection:
-    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the nearest pixel.
-
-    The response is the contrast of the strongest keypoint at each pixel, as OpenCV computes it, and 0 elsewhere.
-    """
-    response = torch.zeros(image.shape, dtype=torch.float32)
+def sift(image: Tensor, *, fraction: float = 0.04) -> Tensor:
+    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the nearest pixel."""
+    points = torch.zeros(image.shape, dtype=torch.bool)
     H, W = image.shape[-2:]
     sift_detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
     for i, grey in enumerate((255.0 * image[:, 0].clamp(0.0, 1.0)).round().byte()):
         for keypoint in sift_detector.detect(grey.numpy(), None):
             x, y = (min(max(round(c), 0), n - 1) for c, n in zip(keypoint.pt, (W, H), strict=True))
-            response[i, 0, y, x] = max(float(response[i, 0, y, x]), keypoint.response)
-    return Detection(response, response > 0)
+            points[i, 0, y, x] |= keypoint.response > 0
+    return points
 
 
-def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Detection]:
+def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
     """The detector of a filter of the library."""
-    return detector(lambda image, fraction=0.04: detection_from_field(field(image), fraction))
+    return detector(lambda image, fraction=0.04: field_points(field(image), fraction=fraction))
 
 
-DETECTORS: dict[str, Callable[..., Detection]] = {
+DETECTORS: dict[str, Callable[..., Tensor]] = {
     "mfc": of_field(multiscale_focus_curves),
     "mcs": of_field(multiscale_curvilinear_saliency),
     "ig": of_field(image_gradient),

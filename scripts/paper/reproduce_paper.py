@@ -9,7 +9,7 @@ TABLE is one of
 - curve: repeatability in 40 views around the right one
 - precision: {CS, ASG, AR} x {MFC, MCS, IG}, per category
 - angles: errors of elevation, azimuth and in-plane angle, of the estimate and of the closest view
-- ranks: precision at rank 1, 3, 5, 10, 20, in both readings
+- ranks: precision at rank 1, 3, 5, 10, 20
 - all
 
 Every table states what was measured and the number of photographs. Only objects that are neither occluded nor
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
         rankings = paper.rank_views(cases, views, settings, progress)
         tables += [paper.precision_table(rankings)] if "precision" in wanted else []
         tables += [paper.angle_table(rankings)] if "angles" in wanted else []
-        tables += paper.rank_tables(rankings) if "ranks" in wanted else []
+        tables += [paper.rank_table(rankings)] if "ranks" in wanted else []
     for table in tables:
         paper.write_table(table, arguments.out)
         print(table.markdown())

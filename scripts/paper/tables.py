@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -20,16 +20,10 @@ from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
-from curvireg_torch.evaluation.metrics import accuracy
+from curvireg_torch.evaluation.metrics import average_recall
 from curvireg_torch.features import field_points
 from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
-from curvireg_torch.geometry import (
-    ViewSphere,
-    crop_images,
-    rotation_error,
-    rotation_towards,
-    viewpoint_from_rotation,
-)
+from curvireg_torch.geometry import ViewSphere, crop_images, rotation_error, rotation_towards, viewpoint_from_rotation
 from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.matching.describe import depth_filter
@@ -38,13 +32,7 @@ from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.utils.files import write_csv, write_file
 from scripts._shared import table_lines
 from scripts.paper.detectors import DETECTORS
-from scripts.paper.measures import (
-    hausdorff_distance,
-    intersection_percentage,
-    pose_parameter_errors,
-    rank_precision,
-    view_repeatability,
-)
+from scripts.paper.measures import angle_errors, hausdorff_distance, intersection_percentage, rank_precision
 
 Cell = str | float
 
@@ -186,7 +174,6 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
             values = {
                 "ip": intersection_percentage(photo, view, eps_px=eps_px),
                 "hausdorff": hausdorff_distance(photo, view),
-                "hausdorff_95": hausdorff_distance(photo, view, percentile=95.0),
                 "points": photo.sum().float(),
             }
             for table, value in values.items():
@@ -197,7 +184,6 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
     definitions = {
         "ip": ("Intersection percentage", hits),
         "hausdorff": ("Hausdorff distance", "in px of the crop"),
-        "hausdorff_95": ("Hausdorff distance, 95th percentile", "in px of the crop"),
         "points": ("Number of points", "in the photograph's crop"),
     }
     tables = []
@@ -209,7 +195,7 @@ def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, pr
 
 def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> Table:
     """Repeatability of each depth filter's points in each photograph filter's points."""
-    detectors = _photo_detectors(settings, [*PHOTO_FIELDS])
+    detectors = _photo_detectors(settings, PHOTO_FIELDS)
     depths = ("CS", "ASG", "HFN")
     scores = _no_scores()
     for category, depth, crop in _views(cases, settings, "repeatability", progress):
@@ -217,7 +203,7 @@ def repeatability_table(cases: list[Case], settings: BankSettings, eps_px: float
         for name in depths:
             view = _view_points(depth, replace(settings, depth_field=name))
             for photo_name, photo in photos.items():
-                value = view_repeatability(view, photo, eps_px=eps_px)
+                value = intersection_percentage(view, photo, eps_px=eps_px)
                 if bool(value.isfinite().all()):
                     scores[category][f"{name}/{photo_name}"].append(float(value))
     text = (
@@ -239,7 +225,9 @@ def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progre
     for _, depth, crop in _views(cases, settings, "curve", progress, rotations):
         views = _view_points(depth, settings)
         for k, detect in enumerate(detectors.values()):
-            sums[k] += view_repeatability(views, detect(crop).expand_as(views), eps_px=eps_px).nan_to_num().double()
+            sums[k] += (
+                intersection_percentage(views, detect(crop).expand_as(views), eps_px=eps_px).nan_to_num().double()
+            )
     means = (sums / len(cases)).T.tolist()
     text = (
         f"Fraction of the points of the view with a point of the photograph within {eps_px:g} px, with the object "
@@ -270,26 +258,16 @@ def _views(
 def _view_points(depth: Tensor, settings: BankSettings) -> Tensor:
     """(N, S, S) bool."""
     with torch.no_grad():
-        return _field_points(depth_filter(settings), settings.point_fraction, depth)
+        return field_points(depth_filter(settings)(depth), fraction=settings.point_fraction)[:, 0]
 
 
-def _photo_detectors(settings: BankSettings, names: Any = ()) -> dict[str, Callable[[Tensor], Tensor]]:
-    """Detectors (B, 1, H, W) -> bool (B, H, W) of the paper's filters and the classical ones; ``names`` selects."""
-    fraction = settings.point_fraction
-    found = {name: partial(_field_points, make(), fraction) for name, make in PHOTO_FIELDS.items()}
-    known = {name.lower() for name in found}
-    classical = {n: partial(_detected_points, d, fraction) for n, d in DETECTORS.items() if n.lower() not in known}
-    wanted = {name.lower() for name in names}
-    return {name: detect for name, detect in (found | classical).items() if not wanted or name.lower() in wanted}
+def _photo_detectors(settings: BankSettings, names: Iterable[str] = DETECTORS) -> dict[str, Callable[[Tensor], Tensor]]:
+    """Detectors (B, 1, H, W) -> bool (B, H, W) of the paper's filters and the classical ones, by name in capitals."""
 
+    def points(detect: Callable[..., Tensor], image: Tensor) -> Tensor:
+        return detect(image, fraction=settings.point_fraction)[:, 0]
 
-def _field_points(field: nn.Module, fraction: float, x: Tensor) -> Tensor:
-    return field_points(field(x), fraction=fraction)[:, 0]
-
-
-def _detected_points(detect: Callable[..., Any], fraction: float, image: Tensor) -> Tensor:
-    points: Tensor = detect(image, fraction=fraction).points
-    return points[:, 0]
+    return {name.upper(): partial(points, DETECTORS[name.lower()]) for name in names}
 
 
 def _table(name: str, title: str, text: str, scores: Scores, columns: list[str]) -> Table:
@@ -313,7 +291,7 @@ class Rankings:
     Attributes:
         views: of all banks.
         categories: (B) of the photographs.
-        truth: (B, 4) azimuth, elevation, theta in degrees, and distance 0, as banks have one distance.
+        truth: (B, 3) azimuth, elevation, theta in degrees.
         errors: (B, N) rotation errors of the views, degrees.
         orders: pair such as "CS/MFC" -> (B, 20) indices of the best views.
     """
@@ -343,14 +321,14 @@ def rank_views(cases: list[Case], views: ViewSphere, settings: BankSettings, pro
         for case in group:
             R, _ = case.view(mesh)
             categories.append(case.category)
-            truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R)), 0.0]))
+            truth.append(torch.tensor([*map(float, viewpoint_from_rotation(R))]))
             errors.append(rotation_error(R[None].float(), views.rotations))
         for depth in depths:
             pipeline = replace(Pipeline(), bank=replace(settings, depth_field=depth))
             bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
             for photo, field in photos.items():
                 matcher = ViewMatcher(bank, field=field)
-                for chunk in crops.split(matcher.chunk_size):
+                for chunk in crops.split(16):
                     orders[f"{depth}/{photo}"].append(matcher.rank(matcher.features(chunk)).top(max(RANKS)))
     found = {name: torch.cat(parts) for name, parts in orders.items()}
     return Rankings(views, categories, torch.stack(truth), torch.stack(errors), found)
@@ -362,7 +340,7 @@ def precision_table(rankings: Rankings) -> Table:
     for category in [*sorted(set(rankings.categories)), "all"]:
         mask = torch.tensor([category in (c, "all") for c in rankings.categories])
         best = [rankings.errors.gather(1, order[:, :1])[mask, 0] for order in rankings.orders.values()]
-        rows.append([category, *(accuracy(errors, THRESHOLD_DEG) for errors in best)])
+        rows.append([category, *(average_recall(errors, (THRESHOLD_DEG,)) for errors in best)])
     text = (
         f"Precision: fraction of the photographs whose best view is within {THRESHOLD_DEG:g} degrees of the true one. "
         f"{rankings.definition}"
@@ -370,34 +348,31 @@ def precision_table(rankings: Rankings) -> Table:
     return Table("precision", "Precision, depth filter / photograph filter", text, ["category", *rankings.orders], rows)
 
 
-def rank_tables(rankings: Rankings) -> list[Table]:
-    """Precision at rank 1, 3, 5, 10, 20, in two readings of a definition that the paper leaves open."""
-    readings = (
-        ("ranks", f"a view within {THRESHOLD_DEG:g} degrees of the true one", THRESHOLD_DEG),
-        ("ranks_nearest", "the view of the bank that is nearest to the true one", None),
+def rank_table(rankings: Rankings) -> Table:
+    """Precision at rank 1, 3, 5, 10, 20."""
+    columns = [
+        rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=THRESHOLD_DEG)
+        for order in rankings.orders.values()
+    ]
+    rows: list[list[Cell]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
+    text = (
+        f"Fraction of the photographs with a view within {THRESHOLD_DEG:g} degrees of the true one among the best k. "
+        f"{rankings.definition}"
     )
-    names = ["k", *rankings.orders]
-    tables = []
-    for name, reading, limit in readings:
-        orders = rankings.orders.values()
-        columns = [rank_precision(order, rankings.errors, ks=RANKS, threshold_deg=limit) for order in orders]
-        rows: list[list[Cell]] = [[float(k), *(column[k] for column in columns)] for k in RANKS]
-        text = f"Fraction of the photographs with {reading} among the best k. {rankings.definition}"
-        tables.append(Table(name, f"Precision at rank k: {reading}", text, names, rows))
-    return tables
+    return Table("ranks", "Precision at rank k", text, ["k", *rankings.orders], rows)
 
 
 def angle_table(rankings: Rankings) -> Table:
     """Mean errors of elevation, azimuth and in-plane angle: of the estimate and of the closest view of the bank."""
     v = rankings.views
-    views = torch.stack([v.azimuth, v.elevation, v.theta, torch.zeros(len(v))], dim=1)
+    views = torch.stack([v.azimuth, v.elevation, v.theta], dim=1)
     rows: list[list[Cell]] = []
     for name, order in rankings.orders.items():
-        means = pose_parameter_errors(views[order[:, 0]], rankings.truth, views)
+        means = angle_errors(views[order[:, 0]], rankings.truth, views)
         rows.append([name, *(means[k][a] for a in ("elevation", "azimuth", "theta") for k in ("est", "clo"))])
     text = (
         "Mean absolute errors in degrees: Est. of the best-ranked view, Clo. of the view that is closest to the true "
-        f"one. Distance is omitted: banks have one. {rankings.definition}"
+        f"one. {rankings.definition}"
     )
     columns = [f"{angle} {kind}" for angle in ("elevation", "azimuth", "in-plane") for kind in ("Est.", "Clo.")]
     return Table("angles", "Errors of angles", text, ["filters", *columns], rows)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from scripts.scenes.materials import random_rotation
 from scripts.scenes.surfaces import (
@@ -16,7 +15,6 @@ from scripts.scenes.surfaces import (
     extrude,
     join,
     lathe,
-    loft,
     rounded_box,
     superquadric,
     torus,
@@ -264,68 +262,8 @@ def _bed(length: float, width: float, start: float, heights: tuple[float, float,
     return [(part, 0) for part in (base, gate, *sides)]
 
 
-def bicycle(rng: Rng) -> list[Part]:
-    radius, base = rng.uniform(0.28, 0.36), rng.uniform(0.9, 1.1)
-    rod, tyre = rng.uniform(0.012, 0.03), rng.uniform(0.015, 0.04)
-    across = rotation(1, np.pi / 2)
-    back, front = np.array([0, base / 2, radius]), np.array([0, -base / 2, radius])
-    crank, seat, head = np.array([0, 0.08, 0.28]), np.array([0, 0.2, 0.78]), np.array([0, -0.32, 0.78])
-    low_head = 0.75 * head + 0.25 * front
-    parts: list[Part] = []
-    for hub in (back, front):
-        parts.append((torus(radius, tyre).moved(hub, across), 1))
-        if rng.random() < 0.7:
-            t = np.pi * np.arange(int(rng.integers(3, 9))) / 8
-            rim = radius * np.stack([0 * t, np.cos(t), np.sin(t)], -1)
-            parts += [(bar(hub - r, hub + r, 0.004), 2) for r in rim]
-    edges = [(back, crank), (back, seat), (seat, crank), (crank, low_head), (seat, head), (head, front)]
-    parts += [(bar(a, b, rod), 0) for a, b in edges]
-    if rng.random() < 0.35:  # engine and tank
-        parts.append((rounded_box(rng, (0.2, 0.4, 0.3)).moved((0, 0, 0.4)), 3))
-        parts.append((superquadric((0.12, 0.28, 0.1), (0.8, 0.8)).moved((0, -0.1, 0.75)), 0))
-        parts.append((rounded_box(rng, (0.2, 0.5, 0.1)).moved((0, 0.3, 0.75)), 4))
-    else:
-        saddle = seat + np.array((0, 0, 0.08))
-        parts.append((superquadric((0.05, 0.13, 0.03), (0.6, 0.8)).moved(saddle), 4))
-        parts.append((bar(seat, saddle, rod), 0))
-        parts.append((torus(0.08, 0.01).moved(crank, across), 2))
-    grip, wide = head + np.array((0, -0.03, rng.uniform(0.1, 0.25))), rng.uniform(0.2, 0.35)
-    parts.append((bar(head, grip, rod), 0))
-    parts.append((tube(np.array([grip + np.array((-wide, 0.1, 0)), grip, grip + np.array((wide, 0.1, 0))]), rod), 2))
-    return parts
-
-
-def aircraft(rng: Rng) -> list[Part]:
-    r, span = rng.uniform(0.07, 0.13), rng.uniform(0.6, 1.1)
-    y = np.array([-1, -0.97, -0.85, -0.5, 0.4, 0.8, 1.0])
-    body = lathe(r * np.array([0.05, 0.4, 0.85, 1, 1, 0.6, 0.15]), y).moved(rotation=rotation(0, np.pi / 2))
-    parts: list[Part] = [(body.moved(scale=(1, -1, 1)), 0)]
-
-    def wings(root: float, tip: float, half: float, sweep: float, at: ArrayLike, rise: float) -> list[Part]:
-        outline = np.array([(-0.5, -0.3), (0.5, -0.3), (0.5, 0.3), (-0.5, 0.3)]) * (1, 0.15)
-        solid = loft(np.stack([outline * root, outline * tip + (sweep, rise)]), np.array([0, half]))
-        x, y, z = solid.vertices.T
-        return [(Surface(np.stack([s * z, x, y], -1), solid.faces).moved(at), 1) for s in (-1, 1)]
-
-    height, sweep = rng.choice([-0.5, 0.0, 0.9]) * r, rng.uniform(0, 0.5)
-    root, tip, rise = rng.uniform(0.25, 0.45), rng.uniform(0.08, 0.25), rng.uniform(0, 0.1)
-    parts += wings(root, tip, span, sweep, (0, -0.05, height), rise)
-    parts += wings(0.2, 0.1, 0.35 * span, 0.6 * sweep, (0, 0.85, rng.choice([0.3, 2.0]) * r), 0.02)
-    fin, _ = wings(0.25, 0.12, rng.uniform(0.2, 0.35), 0.15, (0, 0.85, 0), 0.0)[1]
-    parts.append((fin.moved((0, 0, 0.5 * r), rotation(1, -np.pi / 2)), 2))
-    n = int(rng.integers(0, 3))
-    pod = lathe(0.4 * r * np.array([0.7, 1, 1, 0.6]), [-0.15, -0.1, 0.05, 0.15])
-    for k in range(n):
-        for s in (-1, 1):
-            at = (s * span * (k + 1) / (n + 1.5), 0.5 * sweep * (k + 1) / n - 0.2, height - 0.5 * r)
-            parts.append((pod.moved(at, rotation(0, np.pi / 2)), 3))
-    if n == 0 and rng.random() < 0.6:
-        parts.append((box((0.5, 0.02, 0.05)).moved((0, -1.0, 0), rotation(1, rng.uniform(0, np.pi))), 3))
-    return parts
-
-
 FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
-    family.__name__: family for family in (compound, stack, vessel, chair, table, sofa, screen, car, bicycle, aircraft)
+    family.__name__: family for family in (compound, stack, vessel, chair, table, sofa, screen, car)
 }
 
 

@@ -231,13 +231,7 @@ class Picture(NamedTuple):
 
 
 def render(
-    shapes: list[Placed],
-    R: Array,
-    t: Array,
-    K: Array,
-    size: tuple[int, int],
-    light: Light,
-    background: Array,
+    shapes: list[Placed], R: Array, t: Array, K: Array, size: tuple[int, int], light: Light, background: Array
 ) -> Picture:
     """Ray-trace shapes as the camera ``K [R | t]`` sees them, before a square linear picture that fills the rest."""
     H, W = size

@@ -3,7 +3,7 @@
     python scripts/training/train_learned_field.py --out runs/field --minutes 90
 
 A batch consists of fresh scenes and of earlier ones, with new colours and mirrored. The losses are those of
-field_dataset.py; one of them is backpropagated through HOG. A second start with the same --out resumes.
+field_dataset.py; one of them is backpropagated through HOG.
 """
 
 import argparse
@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file
 from torch import Tensor
 from torch.utils.data import DataLoader
 from tqdm import tqdm
@@ -25,7 +24,6 @@ from curvireg_torch.features.learned_field import save_weights
 from curvireg_torch.geometry import rotation_error, sample_views
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.matching.describe import depth_filter, hog_layer
-from curvireg_torch.utils.files import write_tensors
 from scripts.training.field_dataset import SETTINGS, FieldDataset, ReplayBuffer, augment, losses
 from scripts.training.generated import GeneratedScenes
 
@@ -75,32 +73,10 @@ class _Field(torch.nn.Module):
         return F.interpolate(halved_angle(self.network(image)[:, :2]), scale_factor=2.0, mode="bilinear")
 
 
-def save_state(
-    path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer, **counts: float
-) -> None:
-    state = {f"network.{k}": v for k, v in network.state_dict().items()}
-    state |= {f"average.{k}": v for k, v in average.state_dict().items()}
-    for k, moments in optimizer.state_dict()["state"].items():
-        state |= {f"optimizer.{k}.{name}": value for name, value in moments.items()}
-    write_tensors(path, state, {k: str(v) for k, v in counts.items()})
-
-
-def load_state(path: Path, network: FieldNetwork, average: FieldNetwork, optimizer: torch.optim.Optimizer) -> None:
-    state = load_file(path)
-    for prefix, module in (("network.", network), ("average.", average)):
-        module.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-    moments: dict[int, dict[str, Tensor]] = {}
-    for k, v in state.items():
-        if k.startswith("optimizer."):
-            _, index, name = k.split(".")
-            moments.setdefault(int(index), {})[name] = v
-    optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints and log")
-    parser.add_argument("--minutes", type=float, default=90.0, help="training time, over all starts")
+    parser.add_argument("--out", type=Path, required=True, help="folder of weights and log")
+    parser.add_argument("--minutes", type=float, default=90.0, help="training time")
     parser.add_argument("--batch", type=int, default=32, help="scenes in a step")
     parser.add_argument("--fresh", type=int, default=8, help="fresh scenes among them")
     parser.add_argument("--replay", type=int, default=15_000, help="scenes stored for reuse, 100 kB each")
@@ -119,24 +95,18 @@ def main() -> None:
     average.eval().requires_grad_(False)
     network.to(options.device, memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=options.rate, weight_decay=0.02)
-    spent, step, scenes = 0.0, 0, 0
-    checkpoint, log = options.out / "state.safetensors", options.out / "log.jsonl"
-    if checkpoint.exists():
-        load_state(checkpoint, network, average, optimizer)
-        last = json.loads(log.read_text().splitlines()[-1])
-        spent, step, scenes = last["minutes"], last["step"], last["scenes"]
+    log = options.out / "log.jsonl"
+    log.unlink(missing_ok=True)
     validation = Validation(options.validate)
     generated = GeneratedScenes(10**9, seed=options.seed)
-    fresh = range(scenes, len(generated))
     workers = {"num_workers": options.workers, "multiprocessing_context": "spawn" if options.workers else None}
-    loader = iter(DataLoader(FieldDataset(generated), options.fresh, sampler=fresh, **workers))
+    loader = iter(DataLoader(FieldDataset(generated), options.fresh, **workers))
     replay = ReplayBuffer(options.replay)
-    generator = torch.Generator().manual_seed(options.seed + step)
+    generator = torch.Generator().manual_seed(options.seed)
     totals: dict[str, float] = {}
-    start, earlier, validated, step_at_mark = time.monotonic(), spent, spent, step
+    start, spent, validated, step, step_at_mark = time.monotonic(), 0.0, 0.0, 0, 0
     while spent < options.minutes:
         replay.add(next(loader))
-        scenes += options.fresh
         batch = augment(replay.draw(options.fresh, options.batch, generator), generator)
         batch = {name: values.to(options.device) for name, values in batch.items()}
         rate = options.rate * min(1.0, (step + 1) / 200) * 0.5 * (1 + math.cos(math.pi * spent / options.minutes))
@@ -157,17 +127,16 @@ def main() -> None:
                 mean.lerp_(now.float().to(mean.device), 1 - keep)
         for name, value in parts.items():
             totals[name] = totals.get(name, 0.0) + float(value.detach())
-        spent = earlier + (time.monotonic() - start) / 60
+        spent = (time.monotonic() - start) / 60
         if spent - validated > options.every or spent >= options.minutes:
-            entry = {"step": step, "minutes": round(spent, 2), "scenes": scenes}
+            entry = {"step": step, "minutes": round(spent, 2), "scenes": step * options.fresh}
             entry |= {name: round(value / (step - step_at_mark), 4) for name, value in totals.items()}
             entry |= {name: round(value, 4) for name, value in validation(_Field(average)).items()}
-            save_state(checkpoint, network, average, optimizer, **entry)
+            save_weights(average, options.out / "field.safetensors")
             with log.open("a") as lines:
                 lines.write(json.dumps(entry) + "\n")
             print(json.dumps(entry), flush=True)
             totals, validated, step_at_mark = {}, spent, step
-    save_weights(average, options.out / "field.safetensors")
     print(f"weights: {options.out / 'field.safetensors'}")
 
 

@@ -63,11 +63,6 @@ def test_fov_is_the_horizontal_field_of_view(register):
     torch.testing.assert_close(torch.tensor(guessed["rotation"]), torch.tensor(known["rotation"]), atol=1e-3, rtol=0)
 
 
-def test_exif_is_ignored_by_default(register):
-    result, _ = register("exif.jpg")
-    assert result["translation"] is result["inputs"]["camera"] is result["inputs"]["camera_source"] is None
-
-
 def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     rows = [["exif.png", *CAMERA], ["exif.png", *[""] * 4], ["photos/0.png", *[""] * 4]]
     path = written(folder / "cameras.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *[[*row, *box_of(0)] for row in rows])
@@ -173,13 +168,6 @@ def test_lists_take_calibration_files_and_masks(folder, distorted, tmp_path):
     assert masked["inputs"]["box"] == pytest.approx(boxed["inputs"]["box"], abs=3.0)
     assert "none.yaml: no such file" in failed[0]["message"]
     assert "none.png" in failed[1]["message"]
-
-
-@pytest.mark.usefixtures("distorted")
-def test_mask_replaces_the_box(folder, tmp_path):
-    files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", str(folder / "cam.yaml")]
-    assert main(["register", *files, "--mask", str(folder / "mask.png"), "--out", str(tmp_path), "--quiet"]) == 0
-    check_truth(json.loads((tmp_path / "result.json").read_text()))
 
 
 @pytest.mark.usefixtures("distorted")

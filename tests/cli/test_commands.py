@@ -30,11 +30,6 @@ def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
     assert register_one("--no-refine", mesh=out) == 0
 
 
-def test_bank_refuses_an_output_that_cannot_be_written(folder, refused):
-    out = folder / "flat.png" / "bank.safetensors"
-    refused(main(["bank", str(folder / "truck.ply"), "--quiet", "--out", str(out)]), "flat.png", "--out")
-
-
 def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
     pipeline = replace(PRESETS["fast"], views=ViewPolicy(pose="upright", azimuth_step=180.0, elevations=(10.0,)))
@@ -76,16 +71,6 @@ def test_show_stages_updates_one_line_of_a_terminal_and_removes_it(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert screen.getvalue() == "".join(f"\r\033[K{line}" for line in ("rendering views 20 of 288", "search", ""))
-
-
-def test_show_stages_prints_one_line_a_stage_elsewhere_and_nothing_if_disabled(capsys):
-    with show_stages(enabled=True) as report:
-        for count in range(3):
-            report("bank", count, 3)
-        report("contours", 0, 1)
-    assert capsys.readouterr().err == "rendering views\nfitting contours\n"
-    with show_stages(enabled=False) as report:
-        assert report is None
 
 
 def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):

@@ -1,4 +1,4 @@
-"""Other files of ``curvireg register``: the page of a list, GLB and BOP CSV; and pipes that nobody reads."""
+"""Other files of ``curvireg register``: the page of a list, GLB and pipes that nobody reads."""
 
 import base64
 import html
@@ -16,11 +16,11 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation.result_files import write_pose_stamped
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
-from tests._support.lists import CAMERA, bop_poses, box_of, lines, table, written
+from tests._support.lists import CAMERA, box_of, table, written
 
 
 def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
@@ -34,24 +34,17 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     assert "<h1>4 photographs: 3 ok, 1 failed" in page
     assert not re.search(r'<script>alert|(src|href)="(?!data:)|http', page)
     figures = re.findall(r'<figure class="(\w+)">(.*?)</figure>', page, flags=re.DOTALL)
-    found = table(out)
-    assert {row["confidence"] for row in found} == {""}, "not calibrated: in the order of the list"
-    order = [1, 2, 3]
-    numbers = [int(re.search(r"<b>(\d+)</b>", text)[1]) for _, text in figures]
-    assert numbers == [k + 1 for k in order] + [1]
-    kinds = ["reliable" if found[number - 1]["reliable"] == "true" else "doubtful" for number in numbers[:-1]]
-    assert [kind for kind, _ in figures] == [*kinds, "failed"]
-    for number, (_, text) in zip(numbers, figures, strict=True):
-        assert html.escape(found[number - 1]["photo"]) in text
+    # Nothing is calibrated: the order is that of the list.
+    assert [int(re.search(r"<b>(\d+)</b>", text)[1]) for _, text in figures] == [2, 3, 4, 1]
+    assert [kind for kind, _ in figures][-1] == "failed"
+    for row, (_, text) in zip(np.roll(table(out), -1), figures, strict=True):
+        assert html.escape(row["photo"]) in text
         pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', text)
-        assert len(pictures) == (number != 1)
+        assert len(pictures) == (row["status"] == "ok")
         for picture in pictures:
             pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
             assert max(pixels.shape) <= sheet.SIDE
     assert "no such file" in figures[-1][1]
-    # A second run computes nothing and writes the same page.
-    assert register("--list", path, folder / "truck.safetensors") == 0
-    assert (out / "index.html").read_text(encoding="utf-8") == page
 
 
 def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkeypatch):
@@ -67,8 +60,9 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     np.testing.assert_allclose([points.min(0), points.max(0)], [expected.min(0), expected.max(0)], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
+    (tmp_path / "out" / "pose.yaml").write_text("of an older result")
     assert register(*words) == 0
-    assert not (tmp_path / "out" / "pose.glb").exists()
+    assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -87,24 +81,13 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, 
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
 
 
-def test_list_writes_bop_csv(folder, register, tmp_path):
-    header = "photo,x0,y0,x1,y1,fx,fy,cx,cy,scene_id,im_id,obj_id"
-    rows = [
-        ["photos/0.png", *box_of(0), *CAMERA, "1", "7", "3"],
-        ["photos/1.png", *box_of(1), *[""] * 4, "1", "8", "3"],
-        ["none.png", *box_of(1), *CAMERA, "1", "9", "3"],
-    ]
-    path = written(folder / "bop.csv", header, *rows)
-    assert register("--list", path, folder / "truck.safetensors", "--unit", "mm") == 0
-    (row,) = bop_poses(tmp_path / "out" / "bop.csv")
-    found = lines(tmp_path / "out")[0]
-    assert (row["scene_id"], row["im_id"], row["obj_id"], row["score"]) == (1, 7, 3, 0.0)
-    assert row["R"].tolist() == found["rotation"]
-    metres = torch.tensor(found["translation"], dtype=torch.float64)
-    assert found["unit"] == "m"  # of the bank
-    np.testing.assert_allclose(row["t"], metres * 1000)
-    K = camera_matrix(*map(float, CAMERA), dtype=torch.float64)
-    assert float((K @ metres)[2]) > 0
+def test_pose_for_ros_is_in_metres(tmp_path):
+    document = {"translation": [1000.0, -2000.0, 500.0], "quaternion": [0.5, 0.1, 0.2, 0.3], "unit": "mm", "views": 9}
+    write_pose_stamped(tmp_path / "pose.yaml", document)
+    text = (tmp_path / "pose.yaml").read_text()
+    assert "position: {x: 1, y: -2, z: 0.5}" in text
+    assert "orientation: {x: 0.1, y: 0.2, z: 0.3, w: 0.5}" in text
+    assert "frame_id: camera_optical_frame" in text
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -3,7 +3,6 @@
 import csv
 import json
 import re
-import time
 
 import cv2
 import pytest
@@ -11,8 +10,8 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.data import Video
-from curvireg_torch.geometry import rotation_error, viewpoint_from_rotation
-from curvireg_torch.registration import Follower
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
@@ -111,49 +110,6 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
     assert names[-1] == "frame-000002"
 
 
-class Camera:
-    """Delivers the frames of a sequence, each once the one before was taken, then waits for Ctrl-C."""
-
-    def __init__(self, frames, taken):
-        self.frames, self.taken, self.number = frames, taken, 0
-
-    def isOpened(self):  # noqa: N802
-        return True
-
-    def get(self, _):
-        return 0.0
-
-    def release(self):
-        pass
-
-    def read(self):
-        while len(self.taken) < self.number:
-            time.sleep(0.01)
-        self.number += 1
-        return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
-
-
-def test_follow_live_ends_cleanly_with_ctrl_c(frames, follow, tmp_path, monkeypatch, capsys):
-    folder, scenes = frames
-    taken, call = [], Follower.__call__
-
-    def interrupted(self, *args):
-        if len(taken) == 2:
-            raise KeyboardInterrupt
-        result = call(self, *args)
-        taken.append(args)
-        return result
-
-    monkeypatch.setattr(Follower, "__call__", interrupted)
-    pictures = [cv2.imread(str(folder / "shots" / f"{k}.png")) for k in range(3)]
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Camera(pictures, taken))
-    assert follow("--camera", *CAMERA, "--out", tmp_path, source="0") == 0
-    assert "2 frames: 2 of 2 believed" in capsys.readouterr().out
-    rows = table(tmp_path)
-    assert [row["photo"] for row in rows] == ["frame-000000", "frame-000001"]
-    check_poses(rows, scenes)
-
-
 @pytest.mark.parametrize("words", [("--camera", "exif"), ("--fov", "49.55")])
 def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path, words):
     assert follow(*words, "--out", tmp_path) == 0
@@ -173,15 +129,6 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
     assert rows[0]["status"] == status
 
 
-def test_follow_takes_hints(frames, follow, tmp_path):
-    azimuth = float(viewpoint_from_rotation(frames[1][0][2][:3, :3])[0])
-    low, high = (azimuth + 140) % 360, (azimuth + 220) % 360
-    assert follow("--camera", *CAMERA, "--azimuth", low, high, "--out", tmp_path) in (0, 2)
-    row = table(tmp_path)[0]
-    R = torch.tensor([float(row[f"r{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)]).double().view(3, 3)
-    assert (float(viewpoint_from_rotation(R)[0]) - low) % 360 <= 81
-
-
 @pytest.mark.parametrize(
     ("words", "source", "message"),
     [
@@ -199,17 +146,16 @@ def test_follow_refuses_what_it_cannot_follow(follow, tmp_path, capsys, words, s
     assert message in capsys.readouterr().err
 
 
-def test_follow_keeps_the_poses_before_an_interruption(follow, tmp_path, monkeypatch):
-    call, seen = Follower.__call__, []
+@pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
+def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
+    """Ctrl-C is the usual end of a live video."""
 
-    def interrupted(self, *args):
-        seen.append(args)
-        if len(seen) == 2:
-            raise KeyboardInterrupt
-        return call(self, *args)
+    def interrupted(*_):
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr(Follower, "__call__", interrupted)
-    assert follow("--camera", *CAMERA, "--out", tmp_path) == 130
+    capture, file = cv2.VideoCapture, str(frames[0] / "turn.avi")
+    if source == "0":
+        monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
+    monkeypatch.setattr(OverlayVideo, "add", interrupted)
+    assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == code
     assert [row["status"] for row in table(tmp_path)] == ["ok"]
-    assert len(list(Video(tmp_path / "overlay.mp4"))) == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["overlay.mp4", "results.csv"]

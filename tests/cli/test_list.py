@@ -7,7 +7,6 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation import runner
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
@@ -26,23 +25,6 @@ def register_list(folder, register):
         return register("--list", path, *([folder / mesh] if mesh else []), *words, out=out)
 
     return run
-
-
-@pytest.fixture
-def registered(monkeypatch):
-    """Names of the photographs that are registered; ``stop_after`` of them, Ctrl-C is simulated."""
-    names = []
-    register_one = runner.register_entry
-
-    def register_entry(entry, *rest, **options):
-        if len(names) == register_entry.stop_after:
-            raise KeyboardInterrupt
-        names.append(entry.name)
-        return register_one(entry, *rest, **options)
-
-    register_entry.stop_after = None
-    monkeypatch.setattr(runner, "register_entry", register_entry)
-    return names, register_entry
 
 
 def rotation(row):
@@ -115,65 +97,6 @@ def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
         assert [line[name] for name in keys] == [alone[name] for name in keys]
 
 
-def test_list_resumes_after_an_interruption(register_list, tmp_path, registered):
-    names, spy = registered
-    photos = [f"photos/{seed}.png" for seed in range(3)]
-    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
-    rows.append(rows[0])
-    assert register_list("resumed.csv", HEADER, *rows, out="whole") == 0
-    out = tmp_path / "out"
-    for k in (1, 2):
-        names.clear()
-        spy.stop_after = 1
-        assert register_list("resumed.csv", HEADER, *rows) == 130
-        content = (out / "results.jsonl").read_bytes()
-        stored = [json.loads(line)["inputs"]["photo"] for line in content.splitlines()]
-        assert len(stored) == len(set(stored)) == k  # threads take them in any order
-        assert not (out / "results.csv").exists()
-        (out / "results.jsonl").write_bytes(content + content.splitlines()[0][:500])  # killed while it wrote
-    names.clear()
-    spy.stop_after = None
-    assert register_list("resumed.csv", HEADER, *rows) == 0
-    assert names == sorted(set(photos) - set(stored))
-    assert (out / "results.csv").read_bytes() == (tmp_path / "whole" / "results.csv").read_bytes()
-    assert [line["row"] for line in lines(out)] == [1, 2, 3, 4]
-
-
-def test_list_registers_again_what_has_changed(folder, register_list, tmp_path, registered, capsys):
-    names, _ = registered
-    photos = [f"photos/{seed}.png" for seed in range(3)]
-    rows = [[name, *box_of(seed)] for seed, name in enumerate(photos)]
-    assert register_list("changed.csv", HEADER, *rows) == 0
-    names.clear()
-    # The order of rows and columns, and other columns, do not matter.
-    reordered = [[*row[1:], row[0], "7"] for row in rows[::-1]]
-    assert register_list("changed.csv", "x0,y0,x1,y1,photo,id", *reordered) == 0
-    assert names == []
-    found = [(line["row"], line["columns"]["photo"]) for line in lines(tmp_path / "out")]
-    assert found == list(enumerate(photos[::-1], start=1))
-    # Another photograph of the same name, another box, other options.
-    original = (folder / "photos" / "2.png").read_bytes()
-    (folder / "photos" / "2.png").write_bytes((folder / "photos" / "1.png").read_bytes())
-    rows[0][1] = "1"
-    assert register_list("changed.csv", HEADER, *rows) == 0
-    (folder / "photos" / "2.png").write_bytes(original)
-    assert sorted(names) == ["photos/0.png", "photos/2.png"]
-    names.clear()
-    assert register_list("changed.csv", HEADER, *rows, words=["--top", "2"]) == 0
-    assert names == photos
-    assert "3 photographs: 3 ok" in capsys.readouterr().out
-
-
-def test_list_retries_a_missing_photograph(folder, register_list, tmp_path):
-    rows = [["photos/0.png", *box_of(0)], ["late.png", *box_of(1)]]
-    assert register_list("again.csv", HEADER, *rows) == 0
-    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "failed"]
-    (folder / "late.png").write_bytes((folder / "photos" / "1.png").read_bytes())
-    assert register_list("again.csv", HEADER, *rows) == 0
-    (folder / "late.png").unlink()
-    assert [row["status"] for row in table(tmp_path / "out")] == ["ok", "ok"]
-
-
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
     opened, load = [], ViewBank.load
@@ -212,40 +135,35 @@ def test_list_names_what_failed(register_list, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "messages"),
+    ("content", "messages"),
     [
-        ("csv", None, ["no such file"]),
-        ("csv", b"", ["no column"]),
-        ("csv", b"photo,x0,y0,x1,y1\n\n", ["no photographs"]),
-        ("csv", b"a.png,1,2,3,4\n", ["no column photo"]),
-        ("csv", b"photo;x0;y0;x1;y1\na.png;1;2;3;4\n", ["no column", "commas"]),
-        ("csv", b"photo,x0,y0,x1\na.png,1,2,3\n", ["no column y1"]),
-        ("csv", b"photo,x0,y0,x1,y1,x0\na.png,1,2,3,4,5\n", ["two columns x0"]),
-        ("csv", b"photo,x0,y0,x1,y1,status\na.png,1,2,3,4,5\n", ["status", "rename"]),
-        ("csv", b"photo,x0,y0,x1,y1\n\xff.png,1,2,3,4\n", ["UTF-8"]),
-        ("csv", b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["not CSV"]),
-        ("csv", b"photo,x0,y0,x1,y1\n" + b"a" * 140_000 + b",1,2,3,4\n", ["not CSV", "field larger"]),
-        ("json", b"photo,x0,y0,x1,y1\na.png,1,2,3,4\n", ["not JSON", "named .csv"]),
-        ("json", b"[1, 2]", ["list of objects"]),
-        ("json", b"{", ["not JSON"]),
-        ("json", b"[" * 100_000, ["not JSON"]),
-        ("json", b"[]", ["no photographs"]),
-        ("json", b'{"images": [], "annotations": [{"image_id": 3, "bbox": [1, 2, 3, 4]}]}', ["COCO", "3"]),
-        ("json", b'{"images": 3, "annotations": []}', ["COCO"]),
+        (None, ["no such file"]),
+        (b"", ["no column"]),
+        (b"photo,x0,y0,x1,y1\n\n", ["no photographs"]),
+        (b"a.png,1,2,3,4\n", ["no column photo"]),
+        (b"photo;x0;y0;x1;y1\na.png;1;2;3;4\n", ["no column", "commas"]),
+        (b"photo,x0,y0,x1\na.png,1,2,3\n", ["no column y1"]),
+        (b"photo,x0,y0,x1,y1,x0\na.png,1,2,3,4,5\n", ["two columns x0"]),
+        (b"photo,x0,y0,x1,y1,status\na.png,1,2,3,4,5\n", ["status", "rename"]),
+        (b"photo,x0,y0,x1,y1,found_mesh\na.png,1,2,3,4,5\n", ["found_mesh", "rename"]),
+        (b"photo,x0,y0,x1,y1\n\xff.png,1,2,3,4\n", ["UTF-8"]),
+        (b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["not CSV"]),
+        (b"photo,x0,y0,x1,y1\n" + b"a" * 140_000 + b",1,2,3,4\n", ["not CSV", "field larger"]),
     ],
 )
-def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, name, content, messages):
-    path = tmp_path / f"list.{name}"
+def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, content, messages):
+    path = tmp_path / "list.csv"
     if content is not None:
         path.write_bytes(content)
-    line = refused(register("--list", path, "truck.ply"), path.name, *messages)
-    assert ("not JSON" in line) == ("not JSON" in messages)
+    refused(register("--list", path, "truck.ply"), path.name, *messages)
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--list", "a.csv", "a.stl", "b.stl"], "at most one MESH"),
+        (["--views", "rig.csv", "a.stl", "--list", "a.csv"], "neither --list nor --start"),
+        (["--views", "rig.csv", "a.stl", "--fov", "50"], "the rig holds the cameras"),
         (["--list", "a.csv", "a.stl", "--box", "1", "2", "3", "4"], "leave --box"),
         (["a.jpg"], "expected PHOTO MESH"),
         (["--mesh", "a.stl"], "expected PHOTO MESH"),
@@ -258,25 +176,6 @@ def test_parse_refuses_options_that_exclude_each_other(register, words, message,
     with pytest.raises(SystemExit, match="2"):
         register(*words)
     assert message in capsys.readouterr().err
-
-
-def test_parse_needs_out_or_json(capsys):
-    with pytest.raises(SystemExit, match="2"):
-        main(["register", "a.jpg", "b.stl"])
-    assert "expected --out DIR, or --json" in capsys.readouterr().err
-
-
-def test_parse_takes_options_between_photograph_and_mesh(folder, register):
-    assert register(folder / "photos/0.png", "--box", *box_of(0), folder / "truck.safetensors") == 0
-
-
-def test_list_refuses_unusable_options_and_foreign_results(register_list, refused, tmp_path):
-    row = ["photos/0.png", *box_of(0)]
-    refused(register_list("options.csv", HEADER, row, words=["--field", "none.safetensors"]), "none.safetensors")
-    assert not (tmp_path / "out" / "results.csv").exists()
-    (tmp_path / "out").mkdir(exist_ok=True)
-    (tmp_path / "out" / "results.jsonl").write_text('{"score": 1}\n')
-    refused(register_list("options.csv", HEADER, row), "results.jsonl")
 
 
 LIMITED = [
@@ -299,21 +198,13 @@ LIMITED = [
 ]
 
 
-@pytest.mark.parametrize("as_json", [False, True])
-def test_list_has_limits_of_each_row(register_list, folder, register, tmp_path, as_json):
+def test_list_has_limits_of_each_row(register_list, tmp_path):
     """An empty cell leaves the option of the command line; a wrong one fails its row."""
     names = ["azimuth", "elevation", "side", "near", "within", "distance", "front"]
     rows = [[cell if name == column else "" for name in names] for column, cell, _ in LIMITED]
     words = ["--elevation", "-10", "80", "--no-refine"]
-    if as_json:
-        box = list(map(float, box_of(0)))
-        cells = [{column: _in_json(cell)} if column else {} for column, cell, _ in LIMITED]
-        (folder / "limited.json").write_text(json.dumps([{"photo": "photos/0.png", "box": box, **c} for c in cells]))
-        assert register("--list", folder / "limited.json", folder / "truck.safetensors", *words) == 0
-    else:
-        photo = ["photos/0.png", *box_of(0)]
-        header = f"{HEADER},{','.join(names)}"
-        assert register_list("limited.csv", header, *([*photo, *row] for row in rows), words=words) == 0
+    photo, header = ["photos/0.png", *box_of(0)], f"{HEADER},{','.join(names)}"
+    assert register_list("limited.csv", header, *([*photo, *row] for row in rows), words=words) == 0
     for (*_, expected), row in zip(LIMITED, lines(tmp_path / "out"), strict=True):
         if isinstance(expected, str):
             assert row["status"] == "failed"
@@ -321,11 +212,3 @@ def test_list_has_limits_of_each_row(register_list, folder, register, tmp_path, 
         else:
             assert row["status"] == "ok"
             assert {k: v for k, v in row["prior"].items() if k != "contradiction"} == expected
-
-
-def _in_json(cell):
-    """Numbers as a list, texts as they are."""
-    try:
-        return [float(number) for number in cell.split()]
-    except ValueError:
-        return cell

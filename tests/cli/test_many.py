@@ -8,11 +8,8 @@ import pytest
 import trimesh
 
 from curvireg_torch import ViewBank
-from curvireg_torch.data import BOPDataset
-from curvireg_torch.evaluation.lists import read_list
 from curvireg_torch.pipeline import PRESETS
 from tests._support.lists import CAMERA, box_of, lines, table, written
-from tests._support.miniature import write_bop
 from tests._support.scenes import truck_bank
 
 
@@ -60,67 +57,6 @@ def test_register_chooses_among_meshes(folder, register, document, tmp_path, cap
     assert list(found[0])[-1] == "found_mesh"
     assert [row["found_mesh"] for row in found] == [str(truck), ""]
     assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [str(v) for v in document("one")["rotation"][0]]
-
-
-def test_register_list_in_json(folder, register, tmp_path):
-    box = [float(v) for v in box_of(1)]
-    camera = [260, 260.0, 119.5, 89.5]
-    content = [
-        {"photo": "photos/1.png", "box": box, "camera": camera, "mesh": "truck.safetensors", "id": 7},
-        {"photo": "photos/1.png", "box": [1, 2, 3]},
-        {"photo": "photos/0.png", "note": {"deep": None}},
-        {"box": box},
-    ]
-    (folder / "list.json").write_text(json.dumps(content))
-    assert register("--list", folder / "list.json", folder / "truck.safetensors") == 0
-    rows = table(tmp_path / "out")
-    assert [row["status"] for row in rows] == ["ok", "failed", "ok", "failed"]
-    assert "x0" in rows[1]["message"]
-    assert "photo: empty" in rows[3]["message"]
-    assert rows[0]["id"] == "7"
-    assert rows[0]["tx"] != "" == rows[2]["tx"]
-    assert lines(tmp_path / "out")[0]["inputs"]["box"] == box
-
-
-def test_read_list_coco(tmp_path):
-    """COCO counts pixels from the picture's corner, half a pixel before the first centre."""
-    content = {
-        "images": [{"id": 4, "file_name": "a.jpg"}, {"id": 5, "file_name": "b.jpg"}],
-        "categories": [{"id": 1, "name": "truck"}],
-        "annotations": [
-            {"id": 8, "image_id": 5, "category_id": 1, "bbox": [0, 10, 20, 30]},
-            {"id": 9, "image_id": 4, "category_id": 2},
-        ],
-    }
-    (tmp_path / "coco.json").write_text(json.dumps(content))
-    found = read_list(tmp_path / "coco.json", [tmp_path / "truck.ply"])
-    assert found.columns[5:] == ("image_id", "annotation_id", "category")
-    first, second = found.entries
-    assert (first.photo, first.box) == (tmp_path / "b.jpg", (-0.5, 9.5, 19.5, 39.5))
-    assert first.cells[5:] == ("5", "8", "truck")
-    assert "no bbox" in second.error
-
-
-def test_read_list_bop_scene(tmp_path):
-    write_bop(tmp_path)
-    dataset = BOPDataset(tmp_path)
-    annotations = [dataset.annotation(i) for i in range(len(dataset))]
-    scene_id = annotations[0]["scene_id"]
-    entries = read_list(tmp_path / "test" / f"{scene_id:06d}").entries
-    usable = {(str(e.photo), e.box, e.camera, e.meshes[0].name) for e in entries if not e.error}
-    for annotation in annotations:
-        if annotation["scene_id"] == scene_id:
-            K, mesh = annotation["camera_matrix"], annotation["model_path"].rpartition("/")[2]
-            camera = tuple(float(v) for v in (K[0][0], K[1][1], K[0][2], K[1][2]))
-            assert (annotation["image_path"], tuple(annotation["box"].tolist()), camera, mesh) in usable
-    assert any("no bbox_obj" in entry.error for entry in entries)
-
-
-def test_register_refuses_a_folder_that_is_no_bop_scene(register, refused, tmp_path):
-    refused(register("--list", tmp_path, "truck.ply"), "scene_camera.json")
-    for name in ("scene_camera", "scene_gt", "scene_gt_info"):
-        (tmp_path / f"{name}.json").write_text('{"1": [[]]}')
-    refused(register("--list", tmp_path, "truck.ply"), "not a scene")
 
 
 def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path):

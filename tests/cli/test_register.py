@@ -13,9 +13,8 @@ from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
-from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of
-from tests._support.scenes import scene, unrefined
+from tests._support.scenes import scene
 
 BOX = [float(v) for v in box_of(0)]
 
@@ -54,23 +53,7 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert capsys.readouterr().err == ""
     keys = ("translation", "covariance", "standard_deviations")
     assert {document()[key] for key in keys} == {None}
-
-
-def test_register_applies_the_exif_orientation(folder, register_one, document, capsys):
-    assert register_one("--no-refine") == 0
-    upright = document()
-    # Stored rotated by 90 degrees anticlockwise; orientation 6 rotates it back.
-    cv2.imwrite(str(folder / "sideways.png"), np.rot90(cv2.imread(str(folder / "photos/0.png"))))
-    with_exif(folder / "sideways.png", exif(6))
-    assert register_one("--no-refine", photo="sideways.png") == 0
-    assert document()["rotation"] == upright["rotation"]
-    orientations = [result["inputs"]["picture"]["orientation"] for result in (upright, document())]
-    assert orientations == [1, 6]
-    assert "sideways.png: EXIF orientation 6 applied" in capsys.readouterr().out
-    # A path given in Python is read in the same way.
-    bank = ViewBank.load(folder / "truck.safetensors")
-    result = Registrar(bank, pipeline=unrefined(bank))([folder / "sideways.png"], [BOX])[0]
-    assert result.rotation.tolist() == upright["rotation"]
+    assert document()["pipeline"]["contours"] is False
 
 
 @pytest.mark.parametrize(("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")])
@@ -87,7 +70,6 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
 def broken_files(folder):
     (folder / "empty.obj").write_text("")
     (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    cv2.imwrite(str(folder / "dot.png"), np.zeros((1, 1, 3), np.uint8))
     (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
     (folder / "broken.safetensors").write_bytes((folder / "truck.safetensors").read_bytes()[:1000])
 
@@ -95,22 +77,15 @@ def broken_files(folder):
 @pytest.mark.parametrize(
     ("files", "options", "messages"),
     [
-        ({"mesh": "none.obj"}, [], ["none.obj", "no such"]),
-        ({"photo": "none.png"}, [], ["none.png", "no such"]),
         ({"mesh": "empty.obj"}, [], ["empty.obj"]),
         ({"mesh": "points.obj"}, [], ["points.obj", "faces"]),
         ({"mesh": "nan.off"}, [], ["nan.off", "NaN"]),
-        ({"mesh": "text.jpg"}, [], ["text.jpg", "mesh"]),
         ({"photo": "text.jpg"}, [], ["text.jpg"]),
-        ({"photo": "flat.png", "box": ()}, [], ["flat.png", "one colour"]),
         ({"mesh": "broken.safetensors"}, [], ["broken.safetensors", "build"]),
         ({"box": ["5", "5", "5", "9"]}, [], ["X0 < X1"]),
         ({"box": ["900", "5", "950", "9"]}, [], ["entirely outside"]),
         ({"box": ["5", "5", "16.9", "90"]}, [], ["0.png", "11.9 px", "at least 12"]),
-        ({"box": ["-1e9", "5", "2e9", "90"]}, [], ["coordinates beyond 1e+06 px"]),
-        ({"photo": "dot.png", "box": ()}, [], ["dot.png", "the photograph has 1.0 px"]),
         ({}, ["--device", "gpu"], ["--device: torch cannot use 'gpu' on this machine; choose from cpu"]),
-        ({}, ["--device", "meta"], ["--device: torch cannot use 'meta'"]),
         ({}, ["--camera", "325", "242", "572", "573"], ["swap the halves: 572 573 325 242"]),
         ({}, ["--camera", *CAMERA, "--distance", "2", "1"], ["distance: expected 0 < NEAR <= FAR"]),
         ({}, ["--field", "none"], ["none"]),
@@ -123,7 +98,6 @@ def broken_files(folder):
         ({}, ["--front", "x"], ["limits nothing"]),
         ({}, ["--distance", "1", "2"], ["--distance: needs a camera"]),
         ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
-        ({}, ["--elevation", "50", "10"], ["elevation: expected"]),
     ],
 )
 @pytest.mark.usefixtures("broken_files")
@@ -146,10 +120,7 @@ def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, ref
         (["register", "a.jpg", "b.stl", "--json", "--every", "0"], "--every: expected a whole number of at least 1"),
         (["evaluate", "bop", "a", "--out", "b", "--limit", "0"], "--limit: expected a whole number of at least 1"),
         (["view", "--port", "65536"], "--port: expected a whole number from 0 to 65535, got '65536'"),
-        (
-            ["register", "a.jpg", "b.stl", "--json", "--near", "10"],
-            "--near: expected AZIMUTH ELEVATION [THETA]",
-        ),
+        (["register", "a.jpg", "b.stl", "--json", "--near", "10"], "--near: expected AZIMUTH ELEVATION [THETA]"),
         (["register", "a.jpg", "b.stl", "--json", "--dist", "1", "2"], "unrecognized arguments: --dist"),
         (["register", "a.jpg", "b.stl", "--json", "--box", "1,2", "3"], "--box: expected X0 Y0 X1 Y1, finite numbers"),
         (["register", "a.jpg", "b.stl", "--json", "--camera", "1", "2", "3"], "or give FILE"),
@@ -168,10 +139,6 @@ def test_register_warns_of_a_questionable_camera(register_one, document, capsys)
     assert "FX FY and CX CY seem to be swapped" in line
     assert f"0.png: {line}" in capsys.readouterr().err
     assert document()["reliable"] is False
-
-
-def test_register_refuses_a_file_as_output_folder(folder, register_one, refused):
-    refused(register_one("--out", folder / "photos/0.png"), "--out")
 
 
 def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(folder, register_one, document, capsys):
@@ -239,8 +206,8 @@ def test_register_writes_that_the_object_is_lost(register_one, document, start, 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{}", "expected rotation"),
-        ('{"rotation": [[1, 0, 0]], "translation": [0, 0, 1]}', "expected rotation"),
+        ("{}", "rotation: expected numbers"),
+        ('{"rotation": [[1, 0, 0]], "translation": [0, 0, 1]}', "rotation: expected 9 finite"),
         ('{"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 1]}', "rotation"),
         ("[]", "an object"),
     ],

@@ -65,6 +65,13 @@ def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_inf
     assert sample["visib_fract"] != sample["visib_fract"]
 
 
+def test_bop_dataset_prefers_colour_to_grey(tree):
+    scene = tree[0] / "test" / "000001"
+    (scene / "gray").mkdir()
+    (scene / "gray" / "000000.tif").write_bytes(b"")
+    assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
+
+
 def test_targets_select_the_most_visible_instances(tree):
     for targets in (None, True):
         dataset = BOPDataset(tree[0], targets=targets)

@@ -117,6 +117,8 @@ def test_opencv_with_other_keys(tmp_path):
         storage.write(name, value)
     storage.release()
     check(load_camera(file), tuple(D[0, :4]), model="fisheye", size=None)
+    file.write_text(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"))
+    check(load_camera(file), tuple(D[0, :4]), size=None)
     file = tmp_path / "python.json"
     file.write_text(json.dumps({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}))
     check(load_camera(file), tuple(D[0]))
@@ -174,17 +176,12 @@ def replaced(old, new):
     ("name", "content", "words"),
     [
         ("a.yaml", "", "no camera matrix; expected YAML, XML or JSON of OpenCV, camera_info"),
-        ("a.yaml", "# nothing\n---\n", "no camera matrix"),
         ("a.yaml", "just some words\n", "expected 'key: value', got 'just some words'"),
         ("a.png", b"\x89PNG\r\n\x1a\n\xff\xfe", "not a text file; expected"),
         ("a.yaml", ROS[: ROS.index("rows")], "expected 9 numbers, or fx, fy, cx, cy, got 0"),
         ("a.yaml", replaced("238.5, 0, 0, 1]", "238.5, 0, 0, 1"), "a list without its '\\]'"),
-        ("a.yaml", replaced("[520.5, 0, ", "["), "expected 9 numbers, or fx, fy, cx, cy, got 7"),
         ("a.yaml", replaced("520.5", "five"), "camera_matrix: expected finite numbers, got .*'five'"),
-        ("a.yaml", replaced("520.5", "nan"), "camera_matrix: expected finite numbers, got .*nan"),
         ("a.yaml", replaced("520.5", "-520.5"), "FX, FY > 0"),
-        ("a.yaml", replaced("[520.5, 0, ", "[520.5, 3, "), "no skew"),
-        ("a.yaml", replaced("[520.5, 0, 321.25, 0, 522, 238.5, 0, 0, 1]", "[0, 0, 0, 0, 0, 0, 0, 0, 0]"), "FX, FY > 0"),
         (
             "a.yaml",
             replaced("plumb_bob", "double_sphere"),
@@ -194,19 +191,14 @@ def replaced(old, new):
         ("a.yaml", replaced(", 0.03]", ", 0.03, 1, 1]"), "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
         ("a.yaml", replaced("-0.31", ".inf"), "distortion_coefficients: expected finite numbers, got .*'.inf'"),
         ("a.yaml", replaced("640", "640.5"), "size of the image: expected width and height"),
-        ("a.yaml", replaced("image_height: 480\n", ""), "size of the image: expected width and height"),
-        ("a.yaml", replaced("640", "0"), "size of the image: expected an integer >= 1"),
         ("a.yaml", KALIBR.replace("pinhole", "omni"), "several cameras; choose one as FILE:NAME from cam0, cam1"),
         ("a.yaml:cam0", KALIBR.replace("pinhole", "omni"), "'omni' is not supported"),
         ("a.yaml:cam7", KALIBR, "no camera 'cam7'; choose one as FILE:NAME from cam0, cam1"),
-        ("a.yaml:left", ROS, "no camera 'left'; leave the name out"),
         ("cameras.txt", COLMAP, "several cameras; choose one as FILE:NAME from 1, 2, 3, 4, 5, 6"),
         ("cameras.txt", "1 FOV 640 480 500 500 320 240 0.1\n", "line 1: expected CAMERA_ID MODEL .* got '1 FOV"),
         ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", r"PINHOLE \(4\), .* got '1 PINHOLE 640 480 500 320 240'"),
-        ("cameras.txt", "1 PINHOLE 640 480 500 x 320 240\n", "line 1: expected finite numbers, got .*'x'"),
         ("cameras.txt", COLMAP + "7 [PINHOLE 640 480\n", r"line 10: expected CAMERA_ID MODEL .* got '7 \[PINHOLE"),
         ("a.json", '{"fx": 500, ', "damaged, or no calibration"),
-        ("a.json", '{"fx": 500, "fy": 500, "cx": 320}', "expected 9 numbers, or fx, fy, cx, cy, got 3"),
         ("a.json", '{"fx": "500", "fy": 500, "cx": 320, "cy": 240}', "fx: expected finite numbers, got .*'500'"),
         ("a.json", '{"K": ' + "[" * 100_000 + "]" * 100_000 + "}", "damaged|nested too deeply"),
         ("a.xml", "<opencv_storage><camera_matrix>", "damaged, or no calibration"),

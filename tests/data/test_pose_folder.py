@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.utils.data import DataLoader
 
 from curvireg_torch.data import PoseFolder
 from curvireg_torch.errors import InvalidInputError, MissingFileError
@@ -47,3 +48,13 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
     write_mesh(tree[0] / "cup" / "mesh.ply")
     with pytest.raises(InvalidInputError, match=r"one mesh.*mesh\.ply, mesh\.off"):
         PoseFolder(tree[0])
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
+def test_datasets_work_with_loader_workers(tree):
+    dataset = PoseFolder(tree[0])
+    for context in ("fork", "spawn"):
+        loader = DataLoader(dataset, 2, num_workers=1, collate_fn=list, multiprocessing_context=context)
+        samples = [sample for batch in loader for sample in batch]
+        assert torch.equal(samples[2]["image"], dataset[2]["image"])
+        assert [sample["image_path"] for sample in samples] == [dataset[i]["image_path"] for i in range(4)]

@@ -14,9 +14,7 @@ from .._support.pages import DOCS, PAGES, ROOT
 
 SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
 PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
-
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"
-
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 
 

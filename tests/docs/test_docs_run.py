@@ -31,6 +31,7 @@ from .._support.miniature import (
 )
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 
+# Commands that are not run here, and the reason
 SKIPPED = {
     r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser.py opens it
@@ -41,13 +42,9 @@ SKIPPED = {
     r"curvireg .* /data/": "needs a generated benchmark",
     r"python scripts/(?!paper/)": "long measurement",
 }
-"""Commands that are not run here, and the reason."""
-
+# Trees with every defect that datasets/verify.py must report
 DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
-"""Trees with every defect that ``datasets/verify.py`` must report."""
-
 AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
-
 SLOW = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}  # 30 s and more on one core
 
 

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, runner
-from curvireg_torch.evaluation.lists import PhotoList, list_photographs, read_list
+from curvireg_torch.evaluation.lists import list_photographs, read_list
+from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.runner import Entry
 from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
@@ -22,7 +23,8 @@ from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import SIZE, scene, unrefined
 
-CAMERA = (260.0, 260.0, 119.5, 89.5)
+CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
+LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +41,16 @@ def entry(tmp_path):
     picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
     cv2.imwrite(str(tmp_path / "photo.png"), picture)
     (tmp_path / "mesh.ply").write_text("a mesh")
-    return Entry((), "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
+    return Entry({}, "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
 
 
 def register_rows(rows, out, registrar, settings=None):
-    photos = PhotoList((), tuple(rows))
-    return lists.register_list(photos, out, lambda _: registrar, settings=settings or {}, progress=False)
+    return lists.register_list(rows, out, lambda _: registrar, settings=settings or {}, progress=False)
 
 
 def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
     unknown_box = replace(entry, box=None, camera=CAMERA)
-    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, guess=50.0), entry]
+    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, camera=50.0), entry]
     done = []
 
     def register_entry(one, photo, registrar, **_):
@@ -65,6 +66,14 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
         assert done == rows[:4], "equal rows are registered once"
 
 
+def test_rows_follow_the_order_of_the_list(registrar, entry, tmp_path):
+    rows = [replace(entry, cells={"id": "a"}), replace(entry, camera=50.0, cells={"id": "b"})]
+    for some in (rows, rows[::-1]):
+        register_rows(some, tmp_path / "out", registrar)
+        found = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
+        assert [(row["row"], row["columns"]) for row in found] == list(enumerate((one.cells for one in some), start=1))
+
+
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):
@@ -72,10 +81,17 @@ def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp
 
 
 @pytest.mark.parametrize(
-    ("camera", "guess", "source"),
-    [(CAMERA, None, "given"), (None, 50.0, "fov"), (None, "exif", "exif"), (None, None, None)],
+    ("camera", "source"),
+    [
+        (CAMERA, "given"),
+        (replace(CAMERA, size=SIZE), "file"),
+        (LENS, "file"),
+        (50.0, "fov"),
+        ("exif", "exif"),
+        (None, None),
+    ],
 )
-def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, guess, source):
+def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
     def with_covariance(image, box, K, **_):
         (result,) = registrar(image, box, K)
         assert isinstance(result, Registration)
@@ -91,10 +107,10 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
 
     photo = read_photo(entry.photo)
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
-    one = replace(entry, camera=camera, guess=guess)
+    one = replace(entry, camera=camera)
     result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
     assert document["inputs"]["camera_source"] == source
-    known = source == "given"
+    known = source in ("given", "file")
     assert document["covariance"] == (torch.eye(6).tolist() if known else None)
     assert (document["standard_deviations"] is not None) == known
     assert (result.translation is not None) == (source is not None)
@@ -130,7 +146,7 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     folder.mkdir()
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
-    photos = list_photographs([folder], entry.meshes, box=entry.box, frames=tmp_path)
+    photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box), frames=tmp_path)
     counts = lists.register_list(photos, tmp_path / "out", lambda _: registrar, settings={}, progress=False)
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
@@ -145,11 +161,11 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
     path = tmp_path / "excel.csv"
     path.write_text(
-        "photo,x0,y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
+        "Photo ,x0,Y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     )
     found = read_list(path, [tmp_path / "part.stl"])
-    assert found.columns == ("photo", "x0", "y0", "x1", "y1", "note")
-    assert [entry.cells[-1] for entry in found.entries] == ["", "new", "x"]
-    assert [entry.error for entry in found.entries] == ["", "", "7 cells, the header has 6; quote texts with commas"]
+    assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
+    assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
+    assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
-    assert read_list(path, [tmp_path / "part.stl"]).entries[0].box == (1.0, 2.0, 30.0, 40.0)
+    assert read_list(path, [tmp_path / "part.stl"])[0].box == (1.0, 2.0, 30.0, 40.0)

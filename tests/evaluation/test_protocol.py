@@ -27,13 +27,6 @@ def test_parse_and_str_are_inverse(words, text):
     assert Protocol.parse(text.split()) == protocol
 
 
-def test_parse_defaults():
-    assert Protocol.parse([], pose="any").pose == "any"
-    assert Protocol.parse(["pose=upright"], pose="any").pose == "upright"
-    assert Protocol.parse(["box=none"]).box is None
-    assert Protocol.parse(["box=annotated"]).box == 0.0
-
-
 @pytest.mark.parametrize(
     "word", ["cad=best", "pose", "box=0.5", "box=-0.1", "box=nan", "box=big", "seed=1.5", "mesh=1"]
 )
@@ -68,6 +61,7 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     assert float(missed.max()) <= 0.0
     assert float(missed.min()) >= -degrees
     assert float(missed.std()) > 0.15 * degrees
+    assert float(missed.max()) > -0.25 * degrees, "offsets fill the range"
     assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
     assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(R[0], frame, replace(protocol, seed=1), "a")
 

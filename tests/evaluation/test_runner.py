@@ -8,11 +8,11 @@ from unittest.mock import patch
 import pytest
 import torch
 
-from curvireg_torch import PosePrior
+from curvireg_torch import Camera, PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
-from curvireg_torch.evaluation.runner import Entry, run_entries
-from curvireg_torch.evaluation.workers import Workers, run_processes, workers
+from curvireg_torch.evaluation.runner import Entry, View, run_entries
+from curvireg_torch.evaluation.store import Workers, run_processes
 
 
 @pytest.fixture
@@ -64,10 +64,10 @@ def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
     assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
     assert registered(entries, tmp_path / "out") == []
     assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
-    parts = [registered(entries, tmp_path / "two", workers=Workers(rank, 2)) for rank in (0, 1)]
-    assert parts == [["0a", "1a"], ["0b", "1b"]]
-    parts = [registered(entries, tmp_path / "eight", workers=Workers(rank, 8)) for rank in range(8)]
-    assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
+    for size in (2, 8):
+        parts = [Workers(rank, size).part(["0a", "1a", "0b", "1b"]) for rank in range(size)]
+        assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
+        assert size == 8 or len(parts[0]) == 2
 
 
 @pytest.mark.parametrize(
@@ -105,25 +105,19 @@ def test_missing_photographs_are_tried_again(entries, tmp_path):
 
 
 def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").write_text("of other results")
     assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
+    assert not (tmp_path / "out" / "summary.json").exists()
     assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
 
-def test_job_array_reports_nothing_of_photographs_that_have_changed(entries, tmp_path):
-    """The job that finds rows of the others reports them only if they belong to the present files."""
-    out = tmp_path / "out"
-    for rank in (0, 1):
-        registered(entries, out, workers=Workers(rank, 2))
-    assert registered.store is not None
-    (tmp_path / "0.png").write_text("changed")
-    assert registered(entries, out, workers=Workers(0, 2)) == ["0a"]
-    assert registered.store is None, "job 1 has not registered 0b again"
-    assert registered(entries, out, workers=Workers(1, 2)) == ["0b"]
-    digests = {registered.store.read(label)["digests"]["photo"] for label in ("0a", "0b")}
-    assert len(digests) == 1
+ENTRY = Entry(
+    {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=Camera(torch.eye(3))
+)
 
 
-ENTRY = Entry(("x",), "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=(5.0, 5.0, 6.0, 7.0))
+VIEWS = (View("z.png", Path("z.png"), None, Camera(torch.eye(3)), torch.eye(4)),)
 
 
 @pytest.mark.parametrize(
@@ -132,29 +126,29 @@ ENTRY = Entry(("x",), "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3
         {"name": "y.png"},
         {"box": (1.0, 2.0, 3.0, 4.25)},
         {"box": None},
-        {"camera": (5.0, 5.0, 6.25, 7.0)},
+        {"camera": replace(Camera(torch.eye(3)), size=(5, 6))},
         {"camera": None},
-        {"guess": "exif"},
-        {"guess": 50.0},
+        {"camera": "exif"},
+        {"camera": 50.0},
         {"instances": 2},
         {"prior": PosePrior(distance=(1.0, 2.0))},
         {"start": ((1.0, 0.0, 0.0, 0.0),)},
         {"start_confidence": 0.5},
         {"as_stored": True},
+        {"views": VIEWS},
     ],
 )
 def test_request_covers_every_option(changes):
     changed = replace(ENTRY, **changes)
     assert changed.request() != ENTRY.request() == replace(ENTRY).request()
-    assert changed.key != ENTRY.key == replace(ENTRY, cells=("y",)).key
+    assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key
 
 
-@pytest.mark.parametrize(("rank", "size"), [("2", "2"), ("-1", "2"), ("a", "2"), ("0", "0")])
-def test_workers_refuses_a_bad_rank(monkeypatch, rank, size):
-    monkeypatch.setenv("RANK", rank)
-    monkeypatch.setenv("WORLD_SIZE", size)
-    with pytest.raises(InvalidInputError, match="RANK < WORLD_SIZE"), workers():
-        pass
+@pytest.mark.parametrize("name", ["box", "camera", "T_cam_from_world"])
+def test_request_covers_other_views(name):
+    values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
+    other = replace(VIEWS[0], **{name: values.get(name, 2.0 * torch.eye(4))})
+    assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request()
 
 
 def test_run_processes(monkeypatch, capfd):

@@ -13,7 +13,7 @@ import trimesh
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
-from curvireg_torch.evaluation.benchmarks import detection_recall, write_bop_csv
+from curvireg_torch.evaluation.benchmarks import detection_recall
 from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
@@ -171,15 +171,9 @@ def test_bop_table(instances, tmp_path):
     expected = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     assert [(r["scene_id"], r["im_id"], r["obj_id"]) for r in table] == expected
     assert [r["time"] for r in table] == [1.5, 1.5, 0.5], "BOP counts the seconds of the whole image"
-
-
-def test_write_bop_csv_writes_the_format_of_the_challenge(tmp_path):
-    rotation = [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0], [6.0, 7.0, 8.0]]
-    write_bop_csv(tmp_path / "a.csv", [((1, 2, 3), 0.25, rotation, [0.5, 1.0, 1000.0 / 3.0], 1.5)])
-    assert (tmp_path / "a.csv").read_bytes() == (
-        b"scene_id,im_id,obj_id,score,R,t,time\n"
-        b"1,2,3,0.25,0.0 1.0 2.0 3.0 4.0 5.0 6.0 7.0 8.0,0.5 1.0 333.3333333333333,1.5\n"
-    )
+    t = samples[0]["translation"].tolist()
+    line = (tmp_path / "predictions.csv").read_text().splitlines()[1]
+    assert line.endswith(f"{' '.join(map(str, t))},1.5"), "all digits"
 
 
 def test_mspd_is_relative_to_the_width_of_the_image(instances, tmp_path):
@@ -211,11 +205,6 @@ def test_score_without_results(tmp_path, instances, furniture, kind):
     assert json.loads((tmp_path / "summary.json").read_text())["med_err_deg"] is None
 
 
-def test_a_missing_result_is_named(furniture, tmp_path):
-    with pytest.raises(InvalidInputError, match=r"bottle.*run again"):
-        scores_of(furniture, tmp_path, [])
-
-
 def test_pose_folders_score_known_poses(web):
     benchmark = PoseFolderBenchmark(web, Protocol(pose="any"))
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
@@ -234,6 +223,13 @@ def test_pose_folders_score_known_poses(web):
         "acc_15_deg": None, "acc_30_deg": None, "med_err_deg": None,
     }  # fmt: skip
     assert benchmark.errors(benchmark.samples[:1], [FAILED])["error_deg"].tolist() == [torch.inf]
+
+
+def test_detection_is_scored_in_single_photographs(bop, tmp_path):
+    for views in (1, 2):
+        benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None, views=views))
+        summary = scores_of(benchmark, tmp_path / str(views), [FAILED] * 4)
+        assert ("detection" in summary) == (views == 1)
 
 
 BOX = (10.0, 10.0, 30.0, 30.0)

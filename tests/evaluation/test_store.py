@@ -3,8 +3,7 @@ import json
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
-from curvireg_torch.evaluation.store import ResultStore, to_json
-from curvireg_torch.evaluation.workers import Workers
+from curvireg_torch.evaluation.store import ResultStore, Workers, to_json
 
 DIGESTS = {"request": "a", "photo": "b"}
 
@@ -50,7 +49,7 @@ def test_is_current_compares_digests(tmp_path):
     assert not store.is_current("c", {"request": "a", "photo": ""}), "the photograph could not be read"
     assert not store.is_current("d", DIGESTS)
     assert store.is_complete({"a": DIGESTS, "c": {"request": "a", "photo": ""}})
-    assert not store.is_complete({"a": {**DIGESTS, "photo": "c"}}), "as of a job array, whose photograph has changed"
+    assert not store.is_complete({"a": {**DIGESTS, "photo": "c"}})
 
 
 @pytest.mark.parametrize("cut", [1, 20, -1])

@@ -78,7 +78,7 @@ def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
         assert len(photos | {entry.photo}) == 3
         assert {photo.parts[-3] for photo in photos} == {entry.photo.parts[-3]}, "of the same scene"
         for view in entry.views:
-            relative = torch.tensor(view.T_cam_from_first, dtype=torch.float64)
+            relative = view.T_cam_from_world
             expected = truths[view.photo] @ torch.linalg.inv(truths[entry.photo])
             torch.testing.assert_close(relative, expected, atol=1e-3, rtol=0)
     drawn = [[view.photo for view in entry.views] for entry in benchmark.entries]
@@ -100,7 +100,7 @@ def test_poses_of_the_cameras_come_first(trucks):
     truths = [photograph(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
     for view in benchmark.entries[0].views:
         expected = truths[int(view.photo.stem)] @ torch.linalg.inv(truths[0])
-        torch.testing.assert_close(torch.tensor(view.T_cam_from_first).double(), expected, atol=1e-3, rtol=0)
+        torch.testing.assert_close(view.T_cam_from_world, expected, atol=1e-3, rtol=0)
 
 
 def sample(image, place=None, instance=0):
@@ -110,13 +110,14 @@ def sample(image, place=None, instance=0):
     t = torch.tensor(place or (0.0, 0.0, 0.0)) + T[:3, 3]
     known = {"translation": t, "T_cam_from_world": T * torch.nan if place is None else T}
     ids = {"scene_id": 1, "image_id": image, "obj_id": 1, "instance_index": instance}
-    return {**ids, **known, "model_info": {"diameter": 10.0}}
+    return {**ids, **known, "model_info": {"diameter": 20.0}}
 
 
 def test_instances_are_told_apart_by_their_place():
     near, far = (0.0, 0.0, 100.0), (30.0, 0.0, 100.0)
-    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1), sample(2, (5.0, 0.0, 100.0))]
-    assert same_instances(swapped) == [[0, 3], [1, 2], [4]]
+    swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1)]
+    swapped += [sample(2, (3.0, 0.0, 100.0)), sample(3, (1.5, 0.0, 100.0))]
+    assert same_instances(swapped) == [[0, 3, 5], [1, 2], [4]]
     assert same_instances([sample(0), sample(1, instance=3)]) == [[0, 1]], "one in each photograph"
     listed = [sample(0), sample(0, instance=1), sample(1, instance=1), sample(1)]
     assert same_instances(listed) == [[0, 3], [1, 2]]

@@ -93,17 +93,6 @@ def test_hog_suppresses_blocks_far_below_the_strongest() -> None:
     assert float(lengths[5:].max()) < 0.01
 
 
-def test_hog_length_and_layout() -> None:
-    field = torch.zeros(1, 2, 64, 64)
-    field[0, 0, 24:32, 40:48] = 1.0  # cell (3, 5), along x: bins 0 and 8 equally
-    out = hog(field, voting="linear").view(7, 7, 2, 2, 9)
-    assert out.numel() == features.HOG().length == 1764
-    assert set(map(tuple, out.sum(-1).nonzero()[:, :2].tolist())) <= {(r, c) for r in range(1, 5) for c in range(3, 7)}
-    best = out[3, 5, 0, 0]  # the block whose first cell it is
-    assert best.nonzero().flatten().tolist() == [0, 8]
-    torch.testing.assert_close(best[0], best[8])
-
-
 def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
     field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(1))
     without = hog(field, bin_weights=torch.tensor([0.0, *[1.0] * 8]))
@@ -180,10 +169,3 @@ def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide() -> None:
     field = torch.zeros(1, 2, 5, 8)
     field[0, 0, :, 2:6] = torch.tensor([1.0, 2.0, 2.0, 1.0])
     assert field_points(field, fraction=1.0)[0, 0].sum(dim=1).tolist() == [1] * 5
-
-
-def test_field_points_of_zero_fields_and_bad_input() -> None:
-    assert not field_points(torch.zeros(2, 2, 8, 8)).any()
-    assert field_points(torch.zeros(0, 2, 8, 8)).shape == (0, 1, 8, 8)
-    with pytest.raises(InvalidInputError, match="fraction"):
-        field_points(torch.zeros(1, 2, 8, 8), fraction=0.0)

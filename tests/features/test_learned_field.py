@@ -43,19 +43,6 @@ def test_networks_do_not_advance_the_random_generator(make):
     assert not network.training
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 128, 128), (2, 3, 256, 256), (1, 3, 60, 90), (1, 1, 1, 1)])
-def test_learned_field_and_mask_of_any_size(field, shape):
-    x = torch.rand(shape)
-    out = field(x)
-    assert out.shape == (shape[0], 2, *shape[2:])
-    assert out.isfinite().all()
-    assert out.dtype == torch.float32
-    mask = field.mask(x)
-    assert mask.shape == (shape[0], 1, *shape[2:])
-    assert mask.min() >= 0
-    assert mask.max() <= 1
-
-
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [1e-6, 1.0, 1e3])
 def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):

@@ -62,7 +62,7 @@ def fields(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = to
 
 
 CAMERA = torch.tensor([[40.0, 0.0, 11.5], [0.0, 42.0, 12.5], [0.0, 0.0, 1.0]])
-
+# Function, inputs and module of every layer
 PAIRS = {
     "cs": (filters.depth_curvilinear_saliency, depths, filters.DepthCurvilinearSaliency),
     "asg": (filters.average_shading_gradient, depths, filters.AverageShadingGradient),
@@ -77,8 +77,6 @@ PAIRS = {
     "pci": (filters.principal_curvature_image, photos, filters.PrincipalCurvatureImage),
     "hog": (features.hog, fields, features.HOG),
 }
-"""Function, inputs and module of every layer."""
-
 OPTIONS: dict[str, dict[str, object]] = {
     **{name: {} for name in PAIRS},
     "cs-paper": {"formula": "paper"},

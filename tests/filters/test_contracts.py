@@ -58,8 +58,8 @@ class TestCompiled:
         "cs": [{"depth_scale": s} for s in (1.0, 1.5, 2.3)],
         "hfn": [{"sigma": s, "depth_scale": 2.0 * s} for s in (1.0, 1.5, 2.3)],
         "diffusion": [{"iterations": 2, "kappa": k, "step": s} for k, s in ((0.03, 0.2), (0.05, 0.1), (0.06, 0.05))],
-        "mcs": [{"scales": 2, "diffusion_time": t, "threshold": 0.1 * t} for t in (1.0, 2.0, 3.0)],
-        "mfc": [{"scales": 2, "saliency_weight": w, "threshold": 0.1 * w} for w in (0.5, 0.7, 0.9)],
+        "mcs": [{"scales": 2, "kappa": k} for k in (0.03, 0.05, 0.06)],
+        "mfc": [{"scales": 2, "saliency_weight": w} for w in (0.5, 0.7, 0.9)],
         "hog": [{"clip": c} for c in (0.2, 0.3, 0.4)],
     }
 
@@ -72,18 +72,3 @@ class TestCompiled:
         graph = torch.compile(function, fullgraph=True, backend="eager")
         for options in self.values[name]:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
-
-    @pytest.mark.parametrize("name", ["ig", "cs"])
-    def test_learnable_sigma_compiles_and_exports(self, name: str) -> None:
-        torch._dynamo.reset()
-        _, inputs, module = PAIRS[name]
-        layer, x = module(sigma=1.7, learnable=True), inputs(2, 24)
-        (parameter,) = layer.parameters()
-        want = layer(x)
-        want.square().sum().backward()
-        gradient, parameter.grad = parameter.grad, None
-        got = torch.compile(layer, fullgraph=True)(x)
-        got.square().sum().backward()
-        assert LayerContract().agrees(got, want)
-        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
-        assert LayerContract().agrees(torch.export.export(layer, (x,)).module()(x), want)

@@ -1,12 +1,11 @@
 """Options: functions and constructors check them alike; masks and cameras broadcast; cameras keep their dtype."""
 
 import copy
-import math
 from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError
@@ -18,24 +17,13 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("cs", {"formula": "x"}, "formula: expected one of 'geometric', 'paper', got 'x'"),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
     ("asg", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
-    ("hfn", {"depth_scale": math.inf}, "depth_scale"),
-    ("ig", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
     ("diffusion", {"iterations": 1, "step": 0.3}, "step: expected 0 < step <= 0.25"),
-    ("diffusion", {"iterations": 1, "kappa": 0.0}, "kappa"),
-    ("mcs", {"threshold": 1.0}, "threshold"),
-    ("mcs", {"diffusion_time": 0.0}, "diffusion_time"),
     ("mcs", {"scales": 2.5}, "scales: expected an integer >= 1, got 2.5"),
     ("mcs", {"sigma": "1"}, "sigma: expected a number, got str"),
-    ("diffusion", {"iterations": 2.0}, "iterations: expected an integer >= 0"),
-    ("mfc", {"scales": 2.5}, "scales: expected an integer >= 2"),
     ("blur", {"reblur_sigmas": 1.0}, "reblur_sigmas: expected a sequence"),
     ("hog", {"grid": 8.5}, "grid: expected an integer >= 1, got 8.5"),
-    ("hog", {"block": True}, "block: expected an integer"),
-    ("mfc", {"threshold": -1.0}, "threshold"),
     ("blur", {"reblur_sigmas": (1.0, 0.0)}, "reblur_sigmas"),
-    ("pci", {"sigmas": (1.0, -1.0)}, "sigmas"),
     ("hog", {"clip": 1.5}, "clip"),
-    ("hog", {"bins": 0}, "bins"),
     ("hog", {"voting": "soft"}, "voting"),
     ("hog", {"grid": 2, "block": 3}, "block <= grid"),
 ]
@@ -62,16 +50,6 @@ def test_depth_layers_broadcast_masks() -> None:
     for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None], depth):
         with pytest.raises(InvalidInputError, match=r"mask: expected bool of shape \(3, 1, 24, 24\)"):
             filters.average_shading_gradient(depth, wrong)
-
-
-@pytest.mark.parametrize("layer", [filters.average_shading_gradient, filters.apparent_ridges])
-def test_perspective_layers_broadcast_cameras(layer: Callable[..., Tensor]) -> None:
-    depth = depths(3)
-    want = layer(depth, camera_matrix=CAMERA.expand(3, 3, 3))
-    assert torch.equal(layer(depth, camera_matrix=CAMERA), want)
-    assert torch.equal(layer(depth, camera_matrix=CAMERA[None]), want)
-    with pytest.raises(InvalidInputError, match=r"camera_matrix: expected shape \(3, 3, 3\), got \(2, 3, 3\)"):
-        layer(depth, camera_matrix=CAMERA.expand(2, 3, 3))
 
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
@@ -121,24 +99,6 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
     gradients = torch.autograd.grad(function(*parameters).square().sum(), parameters)
     assert all(float(g) != 0.0 for g in gradients)
     assert torch.autograd.gradcheck(function, parameters, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
-
-
-@pytest.mark.parametrize("name", list(MODULES))
-def test_learnable_modules_stay_positive_and_finite_after_large_steps(name: str) -> None:
-    make, options, inputs, learnable = MODULES[name]
-    x = inputs(1, 12)
-    module = make(**options, learnable=True)
-    for log in (-3.0, -60.0, 60.0):
-        for parameter in module.parameters():
-            parameter.data.fill_(log)
-            parameter.grad = None
-        out = module(x)
-        assert torch.isfinite(out).all()
-        out.square().sum().backward()
-        assert all(float(getattr(module, option).detach()) > 0.0 for option in learnable)
-        for parameter in module.parameters():
-            assert parameter.grad is not None
-            assert bool(torch.isfinite(parameter.grad))
 
 
 def test_learnable_options_reject_values_that_are_not_positive() -> None:

@@ -34,18 +34,6 @@ def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
 
 
-@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0, 3.0])
-def test_multiscale_focus_curves_are_limited_by_sigma_on_edges(sigma: float) -> None:
-    step = (torch.arange(65.0) > 32).to(torch.float64).expand(1, 1, 65, 65)
-    noise = torch.rand(1, 1, 65, 65, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    of_step, of_noise = (
-        float(filters.multiscale_focus_curves(x, sigma=sigma, saliency_weight=0.0).norm(dim=1).max())
-        for x in (step, noise)
-    )
-    assert 0.7 / sigma < of_step <= 1.0 / sigma
-    assert of_noise == pytest.approx(1.0 / 0.6, rel=1e-3)
-
-
 def test_image_gradient_and_curvilinear_saliency_of_a_ramp() -> None:
     x, y = grid(33)
     ramp = (0.03 * x - 0.04 * y)[None, None]
@@ -56,29 +44,15 @@ def test_image_gradient_and_curvilinear_saliency_of_a_ramp() -> None:
     torch.testing.assert_close(filters.image_curvilinear_saliency(ramp)[inner], want * 0.05)
 
 
-def test_principal_curvature_image_of_dark_and_bright_lines() -> None:
+def test_principal_curvature_image_of_a_dark_line() -> None:
     x, _ = grid(65)
     bright = torch.exp(-0.5 * (x / 2.0) ** 2)[None, None]
-    for image, right, wrong in ((1 - bright, "largest", "smallest"), (bright, "smallest", "largest")):
-        field = filters.principal_curvature_image(image, eigenvalue=right)[0, :, 32]
-        other = filters.principal_curvature_image(image, eigenvalue=wrong)[0, :, 32]
-        assert int(field.norm(dim=0).argmax()) == 32
-        assert float(other[:, 32].norm()) < 1e-9
-        # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2, so the scale of 2.8 px has the maximum.
-        assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
-        assert float(field[1, 32].abs()) < 1e-9
-
-
-def test_principal_curvature_image_has_the_direction_of_the_best_scale() -> None:
-    """Length and direction together are those of the single scale with the largest curvature."""
-    image = torch.rand(1, 1, 48, 48, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    sigmas = (1.0, 2.0, 4.0)
-    single = torch.cat([filters.principal_curvature_image(image, sigmas=[sigma]) for sigma in sigmas])
-    winner = single.norm(dim=1).argmax(dim=0)
-    assert len(winner.unique()) == 3
-    best = single.gather(0, winner.expand(1, 2, -1, -1))
-    found = filters.principal_curvature_image(image, sigmas=sigmas)
-    torch.testing.assert_close((found * best).sum(dim=1).abs(), best.square().sum(dim=1))  # the sign is free
+    field = filters.principal_curvature_image(1 - bright)[0, :, 32]
+    assert int(field.norm(dim=0).argmax()) == 32
+    # s^2 2 / (4 + s^2)^1.5 is largest at s = 2 sqrt 2, so the scale of 2.8 px has the maximum.
+    assert float(field[:, 32].norm()) == pytest.approx(2.8**2 * 2 / (4 + 2.8**2) ** 1.5, rel=0.03)
+    assert float(field[1, 32].abs()) < 1e-9
+    assert float(filters.principal_curvature_image(bright)[0, :, 32, 32].norm()) < 1e-9
 
 
 def test_multiscale_focus_curves_reject_edges_below_three_per_cent_of_the_contrast() -> None:

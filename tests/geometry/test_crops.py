@@ -15,14 +15,6 @@ def ramp(height: int, width: int) -> torch.Tensor:
     return torch.stack([x, y])[None]
 
 
-def test_square_boxes_match_values_by_hand() -> None:
-    boxes = torch.tensor([[10.0, 20.0, 30.0, 24.0], [0.0, 0.0, 2.0, 8.0]])
-    assert g.square_boxes(boxes, 0.0).tolist() == [[10.0, 12.0, 30.0, 32.0], [-3.0, 0.0, 5.0, 8.0]]
-    assert g.square_boxes(boxes, 0.25).tolist() == [[5.0, 7.0, 35.0, 37.0], [-5.0, -2.0, 7.0, 10.0]]
-    with pytest.raises(InvalidInputError, match="margin"):
-        g.square_boxes(boxes, -0.1)
-
-
 def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
@@ -60,56 +52,19 @@ def test_crop_squares_are_triangle_filtered(side: float) -> None:
         torch.testing.assert_close(crop, weights(y0, y1, 70) @ image @ weights(x0, x1, 90).mT)
 
 
-def test_crop_images_repeats_the_border() -> None:
-    crop, _ = g.crop_images(ramp(10, 10), torch.tensor([[-8.0, -8.0, 8.0, 8.0]]), size=16, margin=0.0)
-    assert torch.equal(crop[0, 0, :, :7], torch.zeros(16, 7))
-    assert torch.equal(crop[0, 1, :7], torch.zeros(7, 16))
-    far, _ = g.crop_images(ramp(10, 10), torch.tensor([[2.0, 2.0, 18.0, 18.0]]), size=16, margin=0.0)
-    assert torch.equal(far[0, 0, :, 8:], torch.full((16, 8), 9.0))
-
-
-def test_crop_images_is_batch_independent() -> None:
-    images = [torch.rand(3, 30, 40), torch.rand(3, 50, 20)]
-    boxes = torch.tensor([[3.0, 4.0, 20.0, 22.0], [1.0, 10.0, 15.0, 40.0]])
-    crops, A = g.crop_images(images, boxes, size=24, margin=0.2)
-    assert torch.equal(A, g.crop_transforms(g.square_boxes(boxes, 0.2), 24))
-    for i, image in enumerate(images):
-        alone = g.crop_images(image[None], boxes[i : i + 1], size=24, margin=0.2)
-        torch.testing.assert_close((crops[i], A[i]), (alone[0][0], alone[1][0]))
-    default, _ = g.crop_images(images, boxes)
-    torch.testing.assert_close(default, g.crop_images(images, boxes, size=256, margin=0.1)[0], rtol=0, atol=0)
-    whole = g.crop_images(images[:1], boxes[:1].long(), size=8)[0]  # integer boxes
-    torch.testing.assert_close(whole, g.crop_images(images[:1], boxes[:1], size=8)[0])
-
-
 @pytest.mark.parametrize(
     ("box", "match"),
     [
         ([float("nan"), 0.0, 5.0, 5.0], "finite"),
-        ([0.0, 0.0, float("inf"), 5.0], "finite"),
         ([0.0, 0.0, 1e9, 5.0], r"beyond 1e\+06 px; give pixel coordinates of the 30 x 20"),
         ([5.0, 0.0, 5.0, 5.0], "X0 < X1"),
-        ([0.0, 6.0, 5.0, 5.0], "X0 < X1"),
         ([-9.0, 0.0, -0.5, 5.0], "entirely outside the 30 x 20 image"),
-        ([0.0, -9.0, 5.0, -0.5], "entirely outside"),
         ([29.5, 0.0, 40.0, 5.0], "entirely outside"),
-        ([0.0, 19.5, 5.0, 40.0], "entirely outside"),
     ],
 )
 def test_check_boxes_refuses_boxes_without_pixels(box: list[float], match: str) -> None:
     with pytest.raises(InvalidInputError, match=rf"box 1 .*{match}"):
         check_boxes(torch.tensor([[0.0, 0.0, 5.0, 5.0], box]), [(20, 30), (20, 30)])
-
-
-def test_check_boxes_accepts_boxes_at_the_border() -> None:
-    for box in ([-9.0, 0.0, -0.4, 5.0], [0.0, -9.0, 5.0, -0.4], [29.4, 0.0, 40.0, 5.0], [0.0, 19.4, 5.0, 40.0]):
-        check_boxes(torch.tensor([box]), [(20, 30)])
-    with pytest.raises(InvalidInputError, match="boxes"):
-        check_boxes(torch.zeros(2, 4), [(20, 30)])
-    with pytest.raises(InvalidInputError, match="at least one image"):
-        g.crop_images([], torch.zeros(0, 4))
-    with pytest.raises(InvalidInputError, match="images"):
-        g.crop_images([torch.rand(4, 4)], torch.tensor([[0.0, 0.0, 2.0, 2.0]]))
 
 
 def test_crop_images_spreads_missing_pixels_no_further_than_its_filter() -> None:

@@ -42,14 +42,6 @@ def test_viewpoint_from_rotation_wraps_angles() -> None:
     assert bool((t < 180).all())
 
 
-def test_rotation_from_viewpoint_promotes_and_broadcasts() -> None:
-    R = g.rotation_from_viewpoint(torch.tensor([10, 20]), 5, torch.tensor([[1.0], [2.0]], dtype=torch.float64))
-    assert R.shape == (2, 2, 3, 3)
-    assert R.dtype == torch.float64
-    torch.testing.assert_close(R[1, 0], g.rotation_from_viewpoint(*(torch.tensor(v).double() for v in (10, 5, 2))))
-    assert g.rotation_from_viewpoint(10, 5).dtype == torch.float32
-
-
 def test_rotation_error_agrees_with_scipy() -> None:
     A = Rotation.random(60, random_state=1)
     differences = Rotation.from_rotvec([[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10)
@@ -81,17 +73,9 @@ def test_view_functions_refuse_invalid_options() -> None:
         (lambda: ViewSphere(one, one, one, one + 1), "distances > 1"),
         (lambda: ViewSphere(one, one, torch.zeros(2), one + 2), "one shape"),
         (lambda: sample_views(azimuth_step=0), "azimuth_step"),
-        (lambda: sample_views(elevations=[]), "elevations"),
         (lambda: sample_views(elevations=[91]), "elevations"),
-        (lambda: uniform_views(0), "count"),
         (lambda: uniform_views(2.5), "count: expected an integer"),
-        (lambda: uniform_views(5, distances="far"), "distances: expected numbers"),
-        (lambda: sample_views(elevations=["high"]), "elevations: expected numbers"),
-        (lambda: sample_views(azimuth_step="10"), "azimuth_step: expected a number"),
-        (lambda: cr.camera_matrix("1", 1, 1, 1), "fx: expected a number"),
-        (lambda: cr.crop_images(torch.rand(1, 1, 4, 4), [[0, 0, 3, 3]], size=8.0), "size: expected an integer"),
         (lambda: sample_views(elevations=[float("nan")]), "elevations: expected at least one finite"),
-        (lambda: uniform_views(5, thetas=[]), "thetas"),
     ):
         with pytest.raises(InvalidInputError, match=match):
             call()

@@ -4,7 +4,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.geometry import projected_boxes, sample_views
+from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber, quarter_turns
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.rendering import make_renderer
@@ -38,28 +38,6 @@ def test_quarter_turns_groups_views_of_equal_direction_and_distance():
     theta = views.theta.round().long()
     assert quarters.tolist() == ((theta[first] - theta) // 90 % 4).tolist()
     assert torch.equal(views.azimuth[first], views.azimuth)
-
-
-def test_cameras_of_boxes_approximate_parallel_projection(truck):
-    """An orthographic view is seen from 20 distances farther away: up to perspective its projection fills the box."""
-    describe = ViewDescriber(truck, BankSettings(image_size=64, camera="orthographic"))
-    views = sample_views(azimuth_step=90, elevations=[20])
-    rotations, distances = views.rotations.double(), 5.0 * views.distance.double() * describe.radius
-    near, _, flat = describe.cameras(rotations, distances)
-    boxes = 130.0 * flat / (flat[:, 2:] - flat[:, :2]).amax(dim=1, keepdim=True) + torch.tensor([200.0, 150.0] * 2)
-    T, K = describe.cameras_of_boxes(rotations, distances, boxes)
-    torch.testing.assert_close(T[:, 2, 3] + (near[:, :3, :3] @ describe.centre)[:, 2], 21.0 * distances)
-    assert float((projected_boxes(describe.hull, T, K) - boxes).abs().max()) < 130.0 * 0.02
-
-
-def test_silhouettes_fill_their_crops_up_to_the_margin(bank):
-    S = bank.settings.image_size
-    expected = S / (1.0 + 2.0 * bank.settings.margin)
-    for silhouette in bank.silhouettes_at(torch.arange(0, len(bank), 7)):
-        y, x = silhouette.nonzero(as_tuple=True)
-        longer = max(int(y.max() - y.min()), int(x.max() - x.min())) + 1
-        assert abs(longer - expected) < 2.5
-        assert bool(silhouette[S // 2].any())
 
 
 def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():

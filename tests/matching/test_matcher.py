@@ -4,12 +4,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.matching import Ranking, distinct_views
+from curvireg_torch.matching import distinct_views
 from curvireg_torch.terms import Correlation, Repeatability
 from tests._support.scenes import scene
 
@@ -44,18 +43,14 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     assert ranking.top(3).equal(ranking.order[:, :3])
 
 
-def test_matcher_is_batch_independent(bank, matcher):
+def test_matcher_is_batch_independent(matcher):
     images, boxes = batch(0, 1, 2)
     together = matcher(images, boxes)
-    loader = DataLoader(list(zip(images, boxes, strict=True)), batch_size=2)
-    parts = [Ranking.cat([matcher(*part) for part in loader]) for _ in range(2)]
-    assert torch.equal(parts[0].scores, parts[1].scores)
-    assert torch.equal(parts[0].order, parts[1].order)
-    chunked = ViewMatcher(bank, chunk_size=2)(images, boxes)
-    single = Ranking.cat([matcher(images[i : i + 1], boxes[i : i + 1]) for i in range(3)])
-    for other in (parts[0], chunked, single, matcher(list(images), boxes)):
-        torch.testing.assert_close(other.scores, together.scores, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(other.hog, together.hog, rtol=1e-5, atol=1e-5)
+    assert torch.equal(matcher(list(images), boxes).scores, together.scores)
+    for i in range(3):
+        alone = matcher(images[i : i + 1], boxes[i : i + 1])
+        torch.testing.assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
 
 
 def test_matcher_takes_bytes_and_mixed_channels(matcher):
@@ -79,27 +74,13 @@ def test_ranking_breaks_ties_in_the_order_of_the_bank(bank, matcher):
     [
         (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
         (torch.rand(1, 3, 64, 64), [[500.0, 5, 600, 50]], "outside"),
-        (torch.rand(1, 3, 64, 64), [[5, 5, float("nan"), 50]], "finite"),
-        (torch.rand(1, 3, 64, 64), [[5.0, 5, 50]], "shape"),
         (torch.rand(2, 3, 64, 64), [[5.0, 5, 50, 50]] * 3, r"shape \(2, 4\), one for each image, got \(3, 4\)"),
-        (torch.rand(1, 4, 64, 64), [[5.0, 5, 50, 50]], "channels"),
         (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
     ],
 )
 def test_matcher_refuses_unusable_input(matcher, image, boxes, message):
     with pytest.raises(InvalidInputError, match=message):
         matcher(image, torch.tensor(boxes))
-
-
-def test_matcher_takes_an_empty_batch(bank, matcher):
-    ranking = matcher([], torch.zeros(0, 4))
-    assert ranking.scores.shape == ranking.order.shape == ranking.hog.shape == (0, len(bank))
-
-
-def test_ranking_slice_owns_its_memory(matcher):
-    ranking = matcher(*batch(0, 1, 2))[1:2]
-    for x in (ranking.scores, ranking.order, *ranking.terms.values()):
-        assert x.untyped_storage().nbytes() == x.numel() * x.element_size()
 
 
 @pytest.mark.parametrize("channels", [3, 1])
@@ -126,16 +107,6 @@ def test_matcher_weights_terms(bank):
     torch.testing.assert_close(ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0)
     alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(images, boxes)
     assert set(alone.terms) == {"hog"}
-
-
-def test_matcher_in_half_precision(bank):
-    for whitening in ("none", "bank"):
-        pipeline = bank.pipeline.with_term("hog", whitening=whitening)
-        single = ViewMatcher(bank, pipeline=pipeline)(*batch(0))
-        half = ViewMatcher(bank, pipeline=pipeline).half()(*batch(0))
-        assert half.scores.dtype == torch.float32
-        torch.testing.assert_close(half.hog, single.hog, rtol=0, atol=4e-3)
-        torch.testing.assert_close(half.repeatability, single.repeatability, rtol=0, atol=4e-3)
 
 
 def test_distinct_views_applies_symmetries_to_the_model():

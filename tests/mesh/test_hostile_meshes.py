@@ -154,14 +154,6 @@ def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) ->
     refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
 
 
-def test_load_mesh_opens_files_of_the_folder_and_ignores_others(tmp_path: Path) -> None:
-    (tmp_path / "b c.bin").write_bytes(POINTS)
-    (tmp_path / "a.gltf").write_text(json.dumps(tree(buffers=[{"byteLength": 36, "uri": "b%20c.bin"}])))
-    assert cr.load_mesh(tmp_path / "a.gltf").area == 0.5
-    (tmp_path / "a.obj").write_text("mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl x\nf 1 2 3\n")
-    assert cr.load_mesh(tmp_path / "a.obj").area == 0.5
-
-
 AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
 PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
 PLY += b"property list uchar int vertex_indices\nend_header\n"
@@ -174,11 +166,8 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
         ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
         ("a.ply", PLY % (b"ascii", 1) + b"0 0 0\n3 0 0 0\n", "ends before the last face"),
-        ("a.ply", PLY % (b"ascii", 10**9) + b"0 0 0\n", "ends before the last vertex"),
-        ("a.off", b"OFF\n3 10000001 0\n" + b"\n".join([b"0 0 0"] * 3), "early"),
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "got none"),
         ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "JSON is damaged"),
-        ("a.obj", b"v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"\(3, 2\)"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
         ("a.obj", b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n", "only 9e-07 units across; scale it up"),
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
@@ -213,17 +202,6 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) ->
     vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
     for point in (at, far):
         assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
-
-
-def test_as_mesh_places_parts_above_the_base_frame() -> None:
-    scene = trimesh.Scene()
-    moved = trimesh.transformations.translation_matrix([2, 0, 0])
-    scene.add_geometry(trimesh.creation.box(), node_name="a", transform=moved)
-    scene.add_geometry(trimesh.creation.box(), node_name="b", parent_node_name="a")
-    scene.graph.base_frame = "b"
-    found = mesh_module.as_mesh(scene)
-    expected = trimesh.util.concatenate(scene.dump())
-    assert np.allclose(np.sort(found.vertices, axis=0), np.sort(expected.vertices, axis=0))
 
 
 def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,6 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
-from curvireg_torch.geometry import symmetry_transforms
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration.confidence import (
@@ -22,7 +21,6 @@ from curvireg_torch.registration.confidence import (
     are_near,
     concentration,
     confidence_features,
-    detection_probability,
     hypothesis_probabilities,
     is_calibrated,
     registration_confidence,
@@ -31,9 +29,7 @@ from curvireg_torch.registration.contour_fit import contour_support
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar
 
-HALF_TURN = {"symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
-R4 = sample_views(azimuth_step=90, elevations=[0]).rotations
 
 
 def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
@@ -53,11 +49,6 @@ def test_concentration_in_closed_form():
     ):
         assert concentration(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
     assert concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
-
-
-def test_views_near_symmetric_ones_are_near():
-    assert are_near(R4, R4[0]).tolist() == [True, False, False, False]
-    assert are_near(R4, R4[0], symmetry_transforms(HALF_TURN)).tolist() == [True, False, True, False]
 
 
 def test_logistic_model():
@@ -98,18 +89,12 @@ def test_probabilities_of_hypotheses_in_closed_form():
     assert hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
-def test_response_and_similarity_raise_the_probability_of_a_detection():
-    assert detection_probability(8.0, 0.7) > detection_probability(4.0, 0.7)
-    assert detection_probability(5.0, 0.8) > detection_probability(5.0, 0.7)
-
-
 @pytest.mark.parametrize(
     ("pipeline", "calibrated"),
     [
         (Pipeline(), True),
         (replace(Pipeline(), hypotheses=1, box_jitter=0.0), True),
         (replace(Pipeline(), contours=False), False),
-        (Pipeline().with_term("hog", whitening="bank"), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),

@@ -51,18 +51,6 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
         json.dumps(result.to_dict(), allow_nan=False)
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_follower_takes_frames_with_gradients_on_any_threads(threads):
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    frames = sequence(3)
-    follow = Follower(truck_registrar(), CAMERA)
-    follow.start(frames[0][0].requires_grad_(), frames[0][2])
-    results = [follow(image.requires_grad_()) for image, _, _ in frames[1:]]
-    torch.set_num_threads(before)
-    assert all(result.ok and not result.rotation.requires_grad for result in results)
-
-
 def lost(*_, **__):
     raise LostObjectError("lost")
 
@@ -153,20 +141,6 @@ def test_dark_frame_keeps_or_doubts_the_pose():
     assert errors(after, frames[2][2])[0] < 5.0
 
 
-def test_a_registered_pose_outside_the_frame_is_returned_and_not_followed(monkeypatch):
-    image, box, T = sequence(1)[0]
-    registrar = truck_registrar()
-    result = registrar([image], box[None], CAMERA)[0]
-    answering(monkeypatch, registrar, [0.9, 0.9])
-    follow = Follower(registrar, CAMERA)
-    behind = torch.eye(4, dtype=torch.float64)
-    behind[2, 3] = -9.0
-    with monkeypatch.context() as patch:
-        patch.setattr(following, "_pose", lambda _: behind)
-        assert torch.equal(follow(image, box).rotation, result.rotation)
-    assert errors(follow(image, box), T)[0] < 4.0  # registered again
-
-
 def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     """The object jumps by 11 degrees and a tenth of its distance."""
     image, _, T = sequence(1)[0]
@@ -208,12 +182,6 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     result = follow(*frames[1][:2])
     assert result.ok == used
     assert not used or result.confidence == confidence
-
-
-@pytest.mark.parametrize("pose", [torch.eye(3), torch.full((4, 4), torch.nan), 2.0 * torch.eye(4)])
-def test_start_refuses_what_is_not_a_pose(pose):
-    with pytest.raises(InvalidInputError, match="pose"):
-        Follower(truck_registrar(), CAMERA).start(torch.rand(3, 40, 60), pose)
 
 
 def test_follower_refuses_several_meshes():

@@ -8,33 +8,24 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
-from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.registration import inputs
 from curvireg_torch.registration.inputs import camera_warnings, check_box_side, input_warnings
-from curvireg_torch.utils.checks import check_square_pixels
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
 VGA = (480, 640)
-LARGE = torch.tensor([100.0, 100.0, 300.0, 300.0])
 
 
 @pytest.mark.parametrize(
     ("camera", "size", "parts"),
     [
         ((325, 325, 572, 573), VGA, ["(572, 573) lies outside", "640 x 480", "seem to be swapped"]),
-        ((325, 300, 572, 620), VGA, ["seem to be swapped"]),
         ((572, 700, 573, 650), VGA, ["near the centre"]),  # inside the picture, but no swapped camera
         ((1450, 1450, 960, 540), VGA, ["belong to a picture of about 1921 x 1081 px; scale it"]),
-        ((600, 600, 639.6, 100), VGA, ["near the centre"]),
         ((600, 600, 0, 0), VGA, ["(0, 0) lies outside", "near the centre"]),
         ((35, 35, 319.5, 239.5), VGA, ["35 px gives", "1.7e+02 degrees; it is in px"]),
-        ((213, 213, 239.5, 319.5), (640, 480), ["field of view of 97 degrees"]),
         ((12801, 12801, 319.5, 239.5), VGA, ["2.9 degrees; scale it"]),
-        ((36, 36, 1000, 600), VGA, ["belong to", "in px"]),
         ((572, 573, 325, 242), VGA, []),
-        ((213.4, 213.4, 319.5, 239.5), VGA, []),
         ((12799, 12799, 319.5, 239.5), VGA, []),
-        ((600, 600, 639, 479), VGA, []),
         ((600, 600, 0, 1), VGA, []),
     ],
 )
@@ -46,21 +37,14 @@ def test_camera_warnings_name_the_likely_mistake(camera, size, parts):
         assert part in text
 
 
-@pytest.mark.parametrize(("fov", "count"), [(1.9, 1), (2.8, 1), (3.0, 0), (112.0, 0), (114.0, 1), (151.0, 1)])
-def test_camera_warnings_question_extreme_fields_of_view(fov, count):
-    assert len(camera_warnings(camera_of_view(fov, VGA), VGA)) == count
-
-
 @pytest.mark.parametrize(
     ("box", "refused", "warned"),
     [
         ([10, 10, 21.9, 200], True, True),
-        ([10, 10, 200, 21.9], True, True),
         ([10, 10, 22, 200], False, True),
         ([10, 10, 33.9, 200], False, True),
         ([10, 10, 34, 34], False, False),
         ([-50, 10, 11, 200], True, True),  # 11.5 px are inside the picture
-        ([628.5, 10, 900, 200], True, True),
         ([10, 400, 200, 491.5], False, False),
     ],
 )
@@ -87,22 +71,6 @@ def test_result_with_a_questionable_camera_is_never_reliable(monkeypatch):
     assert bad.to_dict()["warnings"] == camera_warnings(far, SIZE)
     refined = registrar.refine([image[:, :, :100]], CAMERA, [T])[0]  # half the picture: its centre lies outside
     assert refined.ok is False or refined.warnings
-
-
-def test_registrar_refuses_a_small_box_and_a_small_picture():
-    image, box, _ = scene(0)
-    small = torch.cat([box[:2], box[:2] + 9])
-    results = truck_registrar()([image, image[:, :1, :1]], torch.stack([small, torch.tensor([-0.5, -0.5, 0.5, 0.5])]))
-    for result in results:
-        with pytest.raises(InvalidInputError, match=r"image \d: .*at least 12"):
-            _ = result.rotation
-
-
-def test_check_square_pixels_recognises_swapped_halves():
-    with pytest.raises(InvalidInputError, match="CX CY FX FY, swap the halves: 572 573 325 242"):
-        check_square_pixels(camera_matrix(325, 242, 572, 573))
-    with pytest.raises(InvalidInputError, match="got 325 and 242; resize"):
-        check_square_pixels(camera_matrix(325, 242, 300, 573))
 
 
 def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):

@@ -1,13 +1,11 @@
 """Least squares over poses: derivatives, bounded steps, the covariance in closed form and against injected noise."""
 
-import math
-
 import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
 
-from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration.confidence import COVARIANCE_SCALE
@@ -28,7 +26,7 @@ from curvireg_torch.registration.least_squares import (
     project,
 )
 from curvireg_torch.rendering.contours import ContourPoints
-from tests.registration.cube import K, cube, fitted, pose, silhouette
+from tests.registration.cube import K, fitted, pose, silhouette
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 
@@ -86,13 +84,6 @@ def test_inlier_ratio_counts_all_points():
     assert PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO) == pytest.approx((5 + 0.25) / 10, abs=1e-4)
 
 
-def test_matches_move_with_the_crop():
-    points, T = torch.rand(1, 5, 3, dtype=torch.float64) - 0.5, pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
-    other = torch.tensor([[[600.0, 0, 90.0], [0, 620.0, 20.0], [0, 0, 1]]], dtype=torch.float64)
-    moved = PointMatches(points, pixels(points, T, K[None], ZERO), torch.ones(1, 5)).moved(K[None], other)
-    torch.testing.assert_close(moved.uv, pixels(points, T, other, ZERO))
-
-
 def test_nearest_rigid_pose_is_orthogonal():
     T = pose([0.3, -0.2, 0.5], [1.0, 2.0, 3.0])[None]
     drifted = T.clone()
@@ -134,24 +125,6 @@ def test_covariance_in_closed_form():
     torch.testing.assert_close(C[0], COVARIANCE_SCALE * inverse @ B @ inverse, rtol=1e-3, atol=1e-9)
 
 
-def test_covariance_covers_injected_noise():
-    """Independent noise of 0.6 px on the distances: least squares spreads no more than the covariance says."""
-    points, T, centre, J = cloud(200)
-    d = 0.6 * torch.randn(400, 200, 1, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    estimates = (torch.linalg.pinv(J) @ d)[..., 0]  # rotation about the centre and its translation
-    T400 = T.expand(400, 4, 4)
-    ends = apply_twist(T400, estimates, centre)
-    off = torch.cat([axis_angle_from_rotation(ends[:, :3, :3] @ T[:, :3, :3].mT), ends[:, :3, 3] - T[:, :3, 3]], dim=1)
-    several = points[torch.zeros(400, dtype=torch.long)]
-    matches = Measurements(J.expand(400, -1, -1), d - J @ estimates[..., None], torch.ones_like(d))
-    C, _ = pose_covariance(matches, several, T400, K.expand(400, 3, 3), centre, radius=1.7)
-    # The mean covariance is the spread times the allowance for correlated errors.
-    allowed = COVARIANCE_SCALE * (POINT_ERROR**2 / 0.36 + SHARED_ERROR + 1)
-    ratio = C.mean(dim=0).diagonal() / torch.cov(off.T).diagonal()
-    assert float(ratio.min()) > 0.8 * (allowed - COVARIANCE_SCALE)
-    assert float(ratio.max()) < 1.25 * allowed
-
-
 @pytest.mark.parametrize(("factor", "known"), [(0.95, False), (1.05, True)])
 def test_covariance_needs_a_minimum_of_weight(factor, known):
     points, T, centre, J = cloud(60)
@@ -166,15 +139,6 @@ def silhouette_fit(mesh: trimesh.Trimesh, axis_angle: list[float]):
     return T, fitted(silhouette(mesh, T), apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
 
 
-def test_covariance_of_a_sphere_has_unknown_rotation():
-    T, fit = silhouette_fit(trimesh.creation.icosphere(subdivisions=4, radius=0.7), [0.0, 0.0, 0.0])
-    assert float((fit.transform[0, :3, 3] - T[:3, 3]).norm()) < 0.08
-    assert int(fit.observable) == 3
-    deviation = fit.covariance[0].diagonal().sqrt()
-    assert float(deviation[:3].min()) > 1.0  # rad
-    assert float(deviation[3:].max()) < 0.5  # of a distance of 8
-
-
 @pytest.mark.parametrize("axis_angle", [[1.0, 0.3, 0.2], [1.9, -0.4, 0.3]])
 def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle):
     T, fit = silhouette_fit(trimesh.creation.cylinder(0.5, 1.4, sections=96), axis_angle)
@@ -185,9 +149,3 @@ def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle
     assert float(axis @ T[:3, 2]) > 0.985
     assert float((axis @ C @ axis).sqrt()) > 1.0
     assert float(torch.linalg.eigvalsh(C)[0].sqrt()) < 0.2  # other rotations are known
-
-
-def test_covariance_of_a_cube_is_known_in_all_directions():
-    _, fit = silhouette_fit(cube(), [0.4, 0.5, 0.1])
-    assert int(fit.observable) == 6
-    assert math.degrees(float(fit.covariance[0].diagonal().sqrt()[:3].max())) < 20

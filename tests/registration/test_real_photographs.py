@@ -56,8 +56,7 @@ def registered(benchmark, case):
     pipeline = cr.Pipeline().with_pose_prior(benchmark.protocol.pose)
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
     for entry, known in chosen:
-        K = None if entry.camera is None else cr.camera_matrix(*entry.camera)[None]
-        yield known, registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], K)[0]
+        yield known, registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], entry.camera)[0]
 
 
 @pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)

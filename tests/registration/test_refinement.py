@@ -49,16 +49,6 @@ def test_refine_reports_the_best_of_several_starts(registrar):
     assert float(rotation_error(result.hypotheses[-1].rotation, T[:3, :3])) > 90.0
 
 
-def test_refine_is_the_same_in_a_batch(registrar):
-    (image, _, T), (other, _, T_other) = scene(0), scene(1)
-    starts = [moved(T, degrees=8.0), moved(T_other, distance=0.05)]
-    both = registrar.refine([image, other], CAMERA, starts)
-    alone = [registrar.refine([i], CAMERA, [s])[0] for i, s in zip((image, other), starts, strict=True)]
-    for one, batched in zip(alone, both, strict=True):
-        assert torch.equal(one.rotation, batched.rotation)
-        assert one.confidence == batched.confidence
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     _, _, T = scene(0)
@@ -84,14 +74,6 @@ def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar, move, mes
     result = registrar.refine([image], CAMERA, [T])[0]
     assert isinstance(result.error, LostObjectError)
     assert message in str(result.error)
-
-
-def test_refine_leaves_out_a_start_outside_the_photograph(registrar):
-    image, _, T = scene(0)
-    start, behind = moved(T, degrees=8.0), T.clone()
-    behind[2, 3] -= 100.0
-    found = registrar.refine([image], CAMERA, [torch.stack([behind, start])])[0]
-    assert torch.equal(found.rotation, registrar.refine([image], CAMERA, [start])[0].rotation)
 
 
 @pytest.mark.parametrize(
@@ -164,10 +146,3 @@ def test_confidence_never_exceeds_that_of_the_start(start_confidence):
     assert limited.confidence == start_confidence
     assert torch.equal(limited.rotation, free.rotation)
     assert again.confidence <= free.confidence + 0.05
-
-
-def test_uncalibrated_pipeline_has_no_confidence(registrar):
-    image, _, T = scene(0)
-    result = registrar.refine([image], CAMERA, [T])[0]
-    assert result.confidence is None
-    assert not result.reliable

@@ -5,22 +5,7 @@ import math
 import pytest
 import torch
 
-from curvireg_torch.registration import region_colours
-from curvireg_torch.registration.region_colours import RegionModel, colour_bins, line_posterior
-
-
-@pytest.mark.parametrize("end", [-3, 0, 2])
-def test_posterior_of_clear_colours_lies_where_they_change(end):
-    offsets = torch.arange(-8, 9, dtype=torch.float64)
-    mean, variance = line_posterior(torch.where(offsets <= end, 6.0, -6.0)[None], 6)
-    assert float(mean) == pytest.approx(end + 0.5, abs=0.02)
-    assert float(variance) < 0.02
-
-
-def test_posterior_without_information_is_uniform():
-    mean, variance = line_posterior(torch.zeros(1, 17, dtype=torch.float64), 6)
-    assert float(mean) == pytest.approx(0.0)
-    assert float(variance) == pytest.approx((12**2 - 1) / 12)  # of 12 equally likely places 1 px apart
+from curvireg_torch.registration.tracker import HALF_RATE_COUNT, RegionModel, colour_bins, line_posterior
 
 
 def test_posterior_is_that_of_bayes():
@@ -62,17 +47,6 @@ def test_histograms_move_by_the_rate_towards_new_colours():
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten(), rate=0.2)
     assert float(model._histograms[0, 0, red]) == 1.0
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten(), rate=0.2)  # the colours swap
-    step = 0.2 * 64 / (64 + region_colours.HALF_RATE_COUNT)
+    step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
-
-
-def test_smoothing_keeps_the_sum_and_reaches_the_next_level():
-    histograms = torch.zeros(2, region_colours.SECTORS, region_colours.COLOUR_LEVELS**3)
-    middle = (3 * region_colours.COLOUR_LEVELS + 4) * region_colours.COLOUR_LEVELS + 5
-    histograms[0, 2, middle] = 1.0
-    smooth = region_colours._smoothed(histograms)
-    assert float(smooth.sum()) == pytest.approx(1.0)
-    assert float(smooth[0, 2, middle]) == pytest.approx(0.6**3)
-    for step in (1, region_colours.COLOUR_LEVELS, region_colours.COLOUR_LEVELS**2):
-        assert float(smooth[0, 2, middle + step]) == pytest.approx(0.6**2 * 0.2)

@@ -10,18 +10,16 @@ from curvireg_torch import Registration, rotation_error, rotation_from_viewpoint
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.registration.result import result_document
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
+# Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round
 IN_DOUBT = ((335.0, 100), (329.0, 105), (190.0, 107))
-"""Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round."""
-
+# True T_world_from_model
 WORLD = transform(
     rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.4]).double()
 )
-"""True ``T_world_from_model``."""
 
 
 @cache
@@ -194,11 +192,3 @@ def test_bad_photographs_and_boxes():
         registered(images, boxes[:2], cameras)
     with pytest.raises(InvalidInputError, match="needs the camera matrix"):
         learned_registrar().register_views(images, boxes, None, cameras)
-
-
-def test_document_lists_the_photographs(easy):
-    document = result_document(easy, learned_registrar(), {})
-    assert document["rotation"] == easy.rotation.tolist()
-    assert [set(view) for view in document["views"]] == [
-        {"rotation", "translation", "box", "edge_support", "similarity", "contribution", "failure"}
-    ] * 3

@@ -12,8 +12,7 @@ from torch import Tensor
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
 from curvireg_torch.rendering import make_renderer, render_colour
-from curvireg_torch.rendering.colour import shade
-from curvireg_torch.rendering.embree import EmbreeRenderer
+from curvireg_torch.rendering.depth import shade
 
 COLOURS = [(230, 20, 20), (20, 220, 30), (30, 40, 240), (240, 230, 10), (10, 230, 230), (220, 20, 230)]
 SIZE = (72, 96)
@@ -146,15 +145,3 @@ def test_load_mesh_warns_of_a_damaged_texture(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="texture"):
         mesh = load_mesh(tmp_path / "box.obj")
     assert len(mesh.faces) == 12
-
-
-def test_faces_at_returns_the_depth_of_render(orthographic: bool) -> None:
-    mesh = trimesh.creation.icosphere(2)
-    renderer = EmbreeRenderer(mesh)
-    T = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
-    T[:, 2, 3] = torch.tensor([3.0, 7.0])
-    K = torch.tensor([[15.0, 0, 15.5], [0, 15.0, 15.5], [0, 0, 1]], dtype=torch.float64)
-    face, _, _, depth = renderer.faces_at(T, K, (32, 32), orthographic=orthographic)
-    expected = renderer.render(T, K, (32, 32), orthographic=orthographic)
-    torch.testing.assert_close(depth, expected, rtol=1e-6, atol=0)
-    assert ((expected[:, 0] > 0).numpy() == (face >= 0)).all()

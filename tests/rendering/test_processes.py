@@ -38,7 +38,6 @@ from curvireg_torch.rendering import make_renderer, opengl
 T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
 """
-
 _FORK = """
 for backend in sys.argv[1:]:
     renderer = make_renderer(trimesh.creation.box(), backend)
@@ -67,21 +66,3 @@ def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
     """embree and torch work in the child; OpenGL cannot, and the error says what to do."""
     require(*backends)
     assert run_script(_SCENE + _FORK, *backends, OMP_NUM_THREADS="2").split() == codes
-
-
-def test_opengl_context_is_deleted_at_exit() -> None:
-    require("pyrender")
-    script = """
-atexit.register(lambda: print(opengl._context))  # runs last, because it is registered first
-for i in range(30):
-    make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (30 + i % 3, 40))
-print(len(opengl._context[1]._renderer._meshes))
-"""
-    assert run_script(_SCENE + script).split() == ["1", "None"]
-
-
-def test_triton_loads_after_opengl() -> None:
-    """Mesa's LLVM and triton's in one process crash unless triton's is loaded first."""
-    pytest.importorskip("triton")
-    require("pyrender")
-    run_script(_SCENE + 'make_renderer(trimesh.creation.box(), "pyrender").render(T, K, (32, 32)); import triton')

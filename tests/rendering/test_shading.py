@@ -2,11 +2,8 @@ import math
 
 import pytest
 import torch
-import trimesh
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.rendering import render_depth
-from curvireg_torch.rendering.colour import AMBIENT, LIT, shade
+from curvireg_torch.rendering.depth import AMBIENT, LIT, shade
 
 from .conftest import pixel_grid
 
@@ -29,20 +26,6 @@ def test_shade_is_exact_for_planes_in_parallel_projection():
     torch.testing.assert_close(shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0)
 
 
-def test_shade_follows_lamberts_law_on_a_sphere():
-    size, focal, distance = 129, 400.0, 6.0
-    camera = torch.tensor([[focal, 0, 64.0], [0, focal, 64.0], [0, 0, 1]])
-    T = torch.eye(4)
-    T[2, 3] = distance
-    depth = render_depth(trimesh.creation.icosphere(5), T, camera, (size, size))
-    grey = shade(depth, camera)[0, 0]
-    for column in (64, 84, 104):
-        point = depth[0, 0, 64, column] * torch.tensor([(column - 64) / focal, 0.0, 1.0])
-        cosine = -(point - T[:3, 3]) @ point / point.norm()
-        assert abs(float(grey[64, column]) - float(AMBIENT + (LIT - AMBIENT) * cosine)) < 0.02
-    assert (grey[depth[0, 0] == 0] == 1.0).all()
-
-
 def test_shade_is_sharp_at_contours_and_steps():
     depth = torch.zeros(1, 1, 12, 24)
     depth[..., 3:9, 2:8] = 4.0
@@ -51,14 +34,3 @@ def test_shade_is_sharp_at_contours_and_steps():
     grey = shade(depth, torch.tensor([[1000.0, 0, 11.5], [0, 1000.0, 5.5], [0, 0, 1]]))
     assert (grey[depth > 0] > LIT - 1e-3).all()
     assert (grey[depth == 0] == 1.0).all()
-
-
-def test_shade_batches_and_dtypes():
-    depth = 4.0 + torch.rand(3, 1, 16, 16)
-    cameras = torch.stack([K, 1.5 * K, 2.0 * K]).float()
-    cameras[:, 2, 2] = 1.0
-    torch.testing.assert_close(shade(depth, cameras)[1:2], shade(depth[1:2], cameras[1]))
-    assert shade(depth.double(), cameras).dtype == torch.float64
-    assert shade(depth[:0], cameras[:0]).shape == (0, 1, 16, 16)
-    with pytest.raises(InvalidInputError):
-        shade(torch.ones(2, 1, 4, 4), torch.eye(3).expand(3, 3, 3))

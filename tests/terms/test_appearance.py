@@ -73,12 +73,6 @@ def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, mat
     assert torch.equal(reranking(*photograph(2)).scores, ranking.scores), "cached features"
 
 
-def test_appearance_is_largest_for_the_same_view(matcher):
-    bank, views = matcher.bank, torch.tensor([0, 9, 20])
-    query = matcher.features(matcher.describer.shaded(bank.rotations[views], bank.distances[views]))
-    assert matcher.rank(query).terms["appearance"].argmax(dim=1).tolist() == [0, 9, 20]
-
-
 def painted() -> trimesh.Trimesh:
     """A box with a red front and a blue back: rotated by 180 degrees, only its colours differ."""
     box = trimesh.creation.box((0.6, 0.6, 1.0)).subdivide().subdivide()

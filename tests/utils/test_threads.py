@@ -1,4 +1,5 @@
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -35,39 +36,18 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
         assert sorted(done) == list(range(6))
 
 
-def test_for_each_runs_in_sequence_on_single_threads() -> None:
-    here = []
-    with single_threaded_pool() as pool:
-        pool.submit(for_each, 3, lambda _: here.append(threading.get_ident())).result()
-    assert len(set(here)) == 1
-    torch.set_num_threads(1)
-    for_each(2, lambda _: here.append(threading.get_ident()))
-    assert here[3:] == [threading.get_ident()] * 2
-
-
-def test_nested_jobs_stay_on_the_thread_of_their_job() -> None:
-    pairs: list[tuple[int, int]] = []
-
-    def job(_: int) -> None:
-        mine = threading.get_ident()
-        for_each(3, lambda _: pairs.append((mine, threading.get_ident())))
-
-    for_each(4, job)
-    assert len(pairs) == 12
-    assert all(outer == inner for outer, inner in pairs)
-
-
 def test_for_each_stops_at_an_error_and_raises_it() -> None:
     done = []
 
     def job(number: int) -> None:
         if number == 2:
             raise ValueError("two")
+        time.sleep(1e-4)
         done.append(number)
 
     with pytest.raises(ValueError, match="two"):
-        for_each(100_000, job)
-    assert len(done) < 99_999
+        for_each(20_000, job)
+    assert len(done) < 19_999
     for_each(2, done.append)  # the threads survive
 
 

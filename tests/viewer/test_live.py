@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 import urllib.error
 import urllib.request
 import webbrowser
@@ -17,7 +18,28 @@ from curvireg_torch.registration import Follower
 from curvireg_torch.visualization.contours import OUTLINE
 from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
-from tests.cli.test_follow import Camera
+
+
+class Camera:
+    """Delivers the frames of a sequence, each once the one before was taken."""
+
+    def __init__(self, frames, taken):
+        self.frames, self.taken, self.number = frames, taken, 0
+
+    def isOpened(self):  # noqa: N802
+        return True
+
+    def get(self, _):
+        return 0.0
+
+    def release(self):
+        pass
+
+    def read(self):
+        while len(self.taken) < self.number:
+            time.sleep(0.01)
+        self.number += 1
+        return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
 
 
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
