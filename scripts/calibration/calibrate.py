@@ -22,7 +22,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-import trimesh
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
@@ -35,6 +34,7 @@ import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.registration import Follower
+from curvireg_torch.registration.confidence import RELIABLE, LogisticModel
 from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
@@ -105,9 +105,9 @@ def fine(T: Tensor, sample: Row) -> bool:
     )
 
 
-def registered(registrar: cr.Registrar, sample: Row, name: str) -> Iterator[Row]:
-    """One row: features, scores and errors of the hypotheses; with the camera unless the mesh is a similar one."""
-    K = None if name == "similar" else sample["camera_matrix"].double()
+def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
+    """One row: features, scores and errors of the hypotheses."""
+    K = sample["camera_matrix"].double() if with_camera else None
     result = registrar([sample["image"]], sample["box"][None], K)[0]
     if not result.ok:
         return
@@ -120,7 +120,7 @@ def registered(registrar: cr.Registrar, sample: Row, name: str) -> Iterator[Row]
     row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
     row |= {"errors": errors_of(R, sample).tolist()}
     best = result.hypotheses[0]
-    if name == "exact" and best.covariance is not None and row["errors"][0] < RIGHT:
+    if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
         e = torch.cat([turn, sample["translation"].double() - best.translation])
         row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
@@ -183,19 +183,15 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     data = BOPDataset(folder)
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
-    mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
-    registrar = cr.Registrar(mesh, pipeline=pipeline)
+    registrar = cr.Registrar(cr.load_mesh(samples[0]["model_path"], unit="mm"), pipeline=pipeline)
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
-    elif kind == "shelves":  # the package with its print, and in grey
-        grey = cr.Registrar(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), pipeline=pipeline)
-        found = [(s, row) for s in samples for each in (registrar, grey) for row in registered(each, s, "exact")]
     else:
         methods: dict[str, Callable[[Row], Iterator[Row]]] = {
             "refined": lambda s: refined(registrar, s, other),
             "detected": lambda s: detected(registrar, s, other),
         }
-        method = methods.get(kind, lambda s: registered(registrar, s, kind))
+        method = methods.get(kind, lambda s: registered(registrar, s, with_camera=kind != "similar"))
         found = [(s, row) for s in samples for row in method(s)]
     groups = json.loads((folder / "benchmark.json").read_text())["groups"]
     return [{"scene": s["scene_id"], "group": groups[str(s["obj_id"])], **row} for s, row in found]
@@ -299,7 +295,10 @@ def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str]) -
         weight = np.where(wrong, WRONG_FRACTION / (1 - WRONG_FRACTION) * (~wrong).sum() / max(1, wrong.sum()), 1.0)
         fitted, quality[name] = fit_logistic(rows, weight)
         constants[name] = fitted | fit_rivals([row for row in rows if row["set"] != "wrong"])
-        distances = [row["distance2"] for row in rows if "distance2" in row]
+        model = LogisticModel(fitted["weights"], fitted["bias"])
+        distances = [
+            r["distance2"] for r in rows if r["right"] and "distance2" in r and model(r["features"]) >= RELIABLE
+        ]
         if distances:
             scale = constants["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
             constants["covariance_scale"] = round(scale, 3)
