@@ -150,12 +150,22 @@ def test_follow_refuses_what_it_cannot_follow(follow, tmp_path, capsys, words, s
 def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
     """Ctrl-C is the usual end of a live video."""
 
-    def interrupted(*_):
-        raise KeyboardInterrupt
+    drawn, add = [] if source == "shots" else ["nothing"], OverlayVideo.add
+
+    def interrupted(*arguments):
+        if drawn:
+            raise KeyboardInterrupt
+        drawn.append(add(*arguments))
 
     capture, file = cv2.VideoCapture, str(frames[0] / "turn.avi")
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
     assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == code
-    assert [row["status"] for row in table(tmp_path)] == ["ok"]
+    statuses = [row["status"] for row in table(tmp_path)]
+    if source == "0":
+        assert statuses == ["ok"]
+        assert not (tmp_path / "overlay.mp4").exists()
+    else:
+        assert statuses == ["ok", "ok"]
+        assert [image.shape for _, image in Video(tmp_path / "overlay.mp4")] == [(3, 180, 240)]
