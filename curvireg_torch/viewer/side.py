@@ -128,7 +128,8 @@ class Answers:
         return found
 
     async def _draw_cards(self) -> None:
-        result, _ = self.session.shot.require_result()
+        shot = self.session.shot
+        result, _ = shot.require_result()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
@@ -145,7 +146,7 @@ class Answers:
                 region("img", src=url, alt=f"contours of answer {number + 1}")
                 text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
                 text("span", "" if probabilities[number] is None else f"{probabilities[number]:.2f}", "facts")
-            card.on("click", lambda number=number: self.session.shot.choose(number))
+            card.on("click", lambda number=number: shot.choose(number))
 
 
 class Inputs:

@@ -209,7 +209,7 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     with pytest.raises(InvalidInputError, match="2 photographs are open"):
         session.open_photo(folder / "photo.png")
     session.shot = second
-    session.remove_photo()
+    session.remove_photo(second)
     assert (session.shots, session.shot) == ([first], first)
 
 
