@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..evaluation.opening import RegisterOptions
-    from ..registration import FailedRegistration, Registration
+    from ..registration import FailedRegistration, Registrar, Registration
 
 FOLDER_FPS = 10.0
 """Frames per second of the overlay of a folder, or of a camera that does not tell."""
@@ -129,7 +129,7 @@ def _follow(
 
 
 def _poses(
-    options: "RegisterOptions", registrar: Any, frames: "Iterable[tuple[str, Tensor | ImageError]]"
+    options: "RegisterOptions", registrar: "Registrar", frames: "Iterable[tuple[str, Tensor | ImageError]]"
 ) -> "Iterator[tuple[str, Tensor | None, Registration | FailedRegistration, float]]":
     """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
     import torch

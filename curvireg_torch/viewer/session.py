@@ -251,7 +251,9 @@ class Session:
         if shot is self.shot:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
-    def _read(self, path: Path, camera: Any, box: Numbers | None = None) -> tuple[Photo, Numbers | None]:
+    def _read(
+        self, path: Path, camera: Numbers | Camera | None, box: Numbers | None = None
+    ) -> tuple[Photo, Numbers | None]:
         """A photograph and a box without the distortion of a calibrated camera, which must fit the photograph."""
         photo = read_photo(path, dtype=torch.uint8)
         if not isinstance(camera, Camera):
@@ -270,7 +272,7 @@ class Session:
         """Whether the distortion of the camera is removed from photographs."""
         return isinstance(self.options.camera, Camera) and self.options.camera.distorts
 
-    def set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+    def set_camera(self, camera: Numbers | Camera | None = None, guess: str | float | None = None) -> None:
         """Change the camera of all photographs: four numbers, a calibrated one, or a guess.
 
         Boxes and results stay unless distortion is removed, or no longer is; after an error nothing has changed.
