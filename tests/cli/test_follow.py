@@ -11,6 +11,7 @@ import torch
 from curvireg_torch.cli import main
 from curvireg_torch.data import Video
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA
@@ -80,6 +81,18 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert pictures[3][:, 40:].max() < 30  # the unreadable frame is black
     photograph = (scenes[2][0] * 255).int()
     assert 2 < (pictures[2] - photograph).abs().float().mean() < 30  # contours and codec
+
+
+def test_follow_uses_the_box_in_the_first_frame_alone(frames, follow, monkeypatch):
+    boxes, call = [], Follower.__call__
+
+    def watched(self, image, box=None):
+        boxes.append(box)
+        return call(self, image, box)
+
+    monkeypatch.setattr(Follower, "__call__", watched)
+    assert follow("--camera", *CAMERA, "--json") == 0
+    assert boxes == [frames[1][0][1].tolist(), None, None]
 
 
 def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(follow, tmp_path, capsys):

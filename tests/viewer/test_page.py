@@ -166,6 +166,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     shot, posed = shown.session.shot, Stage(shown)
     asyncio.run(posed.refresh())
     assert posed.mode == "pose"
+    assert "disabled" in posed.undo.props
     T, K = shot.answer.pose.projection
     describer = shot.result.registrar.describer
 
@@ -179,6 +180,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
     assert shot.answer.pose.projection[0][:3, :3].tolist() == T[:3, :3].tolist()
     asyncio.run(posed.refresh())
+    assert "disabled" not in posed.undo.props
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
     assert len(shot.answer.edits) == 2

@@ -213,6 +213,21 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     assert (session.shots, session.shot) == ([first], first)
 
 
+def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monkeypatch):
+    monkeypatch.setattr(module, "open_registrar", lambda options, meshes, **_: (options.pose, meshes))
+    request = replace(RegisterOptions(), meshes=(folder / "truck.ply",), pose="any")
+    session = new_session()
+    first = session._open_registrar(request)
+    assert first == ("any", request.meshes)
+    box, camera = (1.0, 2.0, 30.0, 40.0), (260.0, 260.0, 119.5, 89.5)
+    other = replace(request, photos=(folder / "photo.png",), box=box, camera=camera, limits={"theta": (0.0, 9.0)})
+    assert session._open_registrar(other) is first
+    assert session._open_registrar(replace(other, camera=None, guess=60.0)) is first
+    for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
+        changed = replace(request, **changes)
+        assert session._open_registrar(changed) == (changed.pose, changed.meshes)
+
+
 def test_distortion_is_removed_from_all_photographs(folder):
     K = torch.tensor([[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]])
     session = new_session("photo.png", "truck.ply", "--pipeline", "small.json")  # 240 x 180 px
