@@ -51,7 +51,7 @@ def add_evaluate(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
     if not Path(arguments.root).is_dir():
-        raise MissingFileError("no such folder; datasets/README.md shows the layout", subject=arguments.root)
+        raise MissingFileError("no such folder; docs/datasets.md shows the layout", subject=arguments.root)
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
     from ..evaluation.store import run_processes

@@ -127,7 +127,7 @@ def _colmap(folder: Path) -> Iterator[View]:
 def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
-        read_json(folder / name, dict, "datasets/README.md") if (folder / name).is_file() else {}
+        read_json(folder / name, dict, "datasets/bop/README.md") if (folder / name).is_file() else {}
         for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None

@@ -92,7 +92,7 @@ def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[Surf
     textures, found = _Textures(close=close), []
     for mesh in meshes:
         try:
-            colours = surface_colours(mesh, textures)
+            colours = _surface_colours(mesh, textures)
             if colours is not None and len(colours) != len(mesh.faces):
                 raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
@@ -102,9 +102,13 @@ def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[Surf
     return found
 
 
-def surface_colours(mesh: Any, textures: "_Textures | None" = None) -> SurfaceColours | None:
+def surface_colours(mesh: Any) -> SurfaceColours | None:
     """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white. They come from
     ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``."""
+    return _surface_colours(mesh, _Textures())
+
+
+def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
@@ -122,7 +126,7 @@ def surface_colours(mesh: Any, textures: "_Textures | None" = None) -> SurfaceCo
     image = getattr(material, "baseColorTexture", None) if image is None else image
     factor = getattr(material, "baseColorFactor", None)
     colour = material.main_color[:3] if factor is None else _encoded(factor[:3])
-    texture = None if image is None or visual.uv is None else (textures or _Textures())(image)
+    texture = None if image is None or visual.uv is None else textures(image)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]

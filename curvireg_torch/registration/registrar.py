@@ -62,7 +62,7 @@ photographs of another object, 14 were called reliable with one hypothesis, 2 wi
 
 SAME_BOX_OVERLAP = 0.85
 """Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
-on 60 generated photographs, see docs/experiments.md."""
+on 60 generated photographs."""
 
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
