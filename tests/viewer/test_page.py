@@ -224,6 +224,9 @@ def test_photographs_are_chosen_from_a_strip(shown, registered):
     stage._commit()
     assert second.box == pytest.approx((20, 30, 120, 90))
     assert (second.answer, first.answer.pose.projection[0].equal(T)) == (None, True)
+    stage.mode = "box"
+    drag(stage, (40, 50), (100, 80))
+    assert second.box == pytest.approx((20, 30, 120, 90))
     asyncio.run(shown.remove_photo())
     stage._select(second)
     assert session.shot is first, "the other one is closed"

@@ -205,6 +205,10 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     session.shot = first
     assert session.request() == first.result.request
     assert second.box == (10.0, 20.0, 90.0, 80.0)
+    third = session.open_photo(folder / "photo.png")
+    session.shot = first
+    session.remove_photo(third)
+    assert (session.shots, session.shot) == ([first, second], first)
     monkeypatch.setattr(module, "MAX_VIEWER_PHOTOGRAPHS", 2)
     with pytest.raises(InvalidInputError, match="2 photographs are open"):
         session.open_photo(folder / "photo.png")
