@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..evaluation.opening import RegisterOptions
-    from ..registration import FailedRegistration, Registration
+    from ..registration import FailedRegistration, Registrar, Registration
 
 FOLDER_FPS = 10.0
 """Frames per second of the overlay of a folder, or of a camera that does not tell."""
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> None:
     summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
     after_first = seconds[1:]  # the first frame is registered
     rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
-    files = "" if out is None else f"; see {out}/results.csv and {video}"
+    files = "" if out is None else f"; see {out}/results.csv" + (f" and {video}" if video else "")
     print(f"{len(rows)} frames: {summary}{rate}{files}", file=sys.stderr if arguments.json else sys.stdout)
     if not counts["ok"] and not counts["unsure"]:
         reason = f"; the first: {rows[0][-1]}" if rows else ""
@@ -90,7 +90,7 @@ def _follow(
     options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool, show: bool
 ) -> tuple[list[list[Any]], list[float], Path | None]:
     """Rows of ``out / "results.csv"``, which is also written after an interruption, seconds that the pose of each frame
-    took, and path of the overlay."""
+    took, and path of the overlay, if there is one."""
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
@@ -125,11 +125,11 @@ def _follow(
     finally:
         if rows and out is not None:
             _write_table(out, rows)
-    return rows, seconds, None if video is None else video.path
+    return rows, seconds, None if video is None or not video.path.is_file() else video.path
 
 
 def _poses(
-    options: "RegisterOptions", registrar: Any, frames: "Iterable[tuple[str, Tensor | ImageError]]"
+    options: "RegisterOptions", registrar: "Registrar", frames: "Iterable[tuple[str, Tensor | ImageError]]"
 ) -> "Iterator[tuple[str, Tensor | None, Registration | FailedRegistration, float]]":
     """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
     import torch

@@ -18,6 +18,7 @@ from ..utils.files import check_writable
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
 
 if TYPE_CHECKING:
+    from ..evaluation.lists import Counts
     from ..evaluation.opening import RegisterOptions
     from ..evaluation.runner import Entry
     from ..registration import Registrar
@@ -262,7 +263,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     return result.reliable
 
 
-def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> Any:
+def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> "Counts | None":
     from ..evaluation.lists import register_list
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest

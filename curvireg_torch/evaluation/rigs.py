@@ -44,7 +44,7 @@ def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
         raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
-    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path))
+    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path, csv_cells(path)))
 
 
 def _checked(path: Path, rows: Iterator[View]) -> list[View]:
@@ -78,11 +78,11 @@ def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any
         raise InvalidInputError(str(error), subject=name) from error
 
 
-def _table(path: Path) -> Iterator[View]:
-    header, *rows = csv_cells(path) or [[]]
+def _table(path: Path, cells: Sequence[Sequence[str]]) -> Iterator[View]:
+    header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
-    for number, cells in enumerate(rows, start=1):
-        row = dict(zip(names, map(str.strip, cells), strict=False))
+    for number, values in enumerate(rows, start=1):
+        row = dict(zip(names, map(str.strip, values), strict=False))
         name = f"row {number}: {row.get('photo', '')}"
         if not row.get("photo"):
             raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")

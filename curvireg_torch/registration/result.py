@@ -6,7 +6,7 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, overload
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -172,8 +172,12 @@ class _OfBest(Generic[Value]):
     def __init__(self, get: Callable[[Hypothesis], Value]) -> None:
         self._get = get
 
-    def __get__(self, result: "Registration", owner: type) -> Value:
-        return self._get(result.hypotheses[0])
+    @overload
+    def __get__(self, result: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, result: "Registration", owner: type) -> Value: ...
+    def __get__(self, result: "Registration | None", owner: type) -> Self | Value:
+        return self if result is None else self._get(result.hypotheses[0])
 
 
 @dataclass(frozen=True)

@@ -201,6 +201,7 @@ class Session:
         options: of ``curvireg view``, with the camera of all photographs; :meth:`set_camera` changes it.
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
+        searched: the one in which a registration runs.
         progress, cancelled: stage, done and total of a registration; True ends it at its next step.
     """
 
@@ -208,6 +209,7 @@ class Session:
     folder: Path | None = None
     shots: list[Shot] = field(default_factory=list)
     shot: Shot = field(default_factory=Shot)
+    searched: Shot | None = None
     mesh_path: Path | None = None
     mesh: trimesh.Trimesh | None = None
     progress: tuple[str, int, int] = ("", 0, 1)
@@ -236,19 +238,24 @@ class Session:
         """Add a photograph, and show it; a box in it loses its distortion too."""
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
             raise InvalidInputError(f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path)
-        self.shot = Shot(path, *self._read(path, box))
+        self.shot = Shot(path, *self._read(path, self.options.camera, box))
         self.shots.append(self.shot)
         return self.shot
 
-    def remove_photo(self) -> None:
-        """Close the photograph that is shown; the next one is shown instead."""
-        number = self.shots.index(self.shot)
+    def remove_photo(self, shot: Shot) -> None:
+        """Close a photograph; if it is shown, the next one is shown instead."""
+        if shot not in self.shots:  # closed already, in another window
+            return
+        number = self.shots.index(shot)
         del self.shots[number]
-        self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
+        if shot is self.shot:
+            self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
-    def _read(self, path: Path, box: Numbers | None = None) -> tuple[Photo, Numbers | None]:
+    def _read(
+        self, path: Path, camera: Numbers | Camera | None, box: Numbers | None = None
+    ) -> tuple[Photo, Numbers | None]:
         """A photograph and a box without the distortion of a calibrated camera, which must fit the photograph."""
-        photo, camera = read_photo(path, dtype=torch.uint8), self.options.camera
+        photo = read_photo(path, dtype=torch.uint8)
         if not isinstance(camera, Camera):
             return photo, box
         try:
@@ -265,21 +272,17 @@ class Session:
         """Whether the distortion of the camera is removed from photographs."""
         return isinstance(self.options.camera, Camera) and self.options.camera.distorts
 
-    def set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+    def set_camera(self, camera: Numbers | Camera | None = None, guess: str | float | None = None) -> None:
         """Change the camera of all photographs: four numbers, a calibrated one, or a guess.
 
         Boxes and results stay unless distortion is removed, or no longer is; after an error nothing has changed.
         """
-        before, was_undistorted = self.options, self.is_undistorted
-        self.options = replace(before, camera=camera, guess=guess)
-        if self.shots and (isinstance(camera, Camera) or was_undistorted):
-            try:
-                shots = [Shot(shot.path, *self._read(shot.path)) for shot in self.shots]
-            except CurviregError:
-                self.options = before
-                raise
-            if self.is_undistorted or was_undistorted:
-                self.shot, self.shots = shots[self.shots.index(self.shot)], shots
+        was_undistorted, shots = self.is_undistorted, self.shots
+        if isinstance(camera, Camera) or was_undistorted:
+            shots = [Shot(shot.path, *self._read(shot.path, camera)) for shot in self.shots]
+        self.options = replace(self.options, camera=camera, guess=guess)
+        if self.shots and (self.is_undistorted or was_undistorted):
+            self.shot, self.shots = shots[self.shots.index(self.shot)], shots
 
     def open_mesh(self, path: Path) -> str:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
@@ -356,8 +359,9 @@ class Session:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         photo, command = shot.photo, "" if self.is_undistorted else _command_line(request, self.name)
         check_camera(request.camera, request.guess)
+        self.searched = shot
         try:
-            registrar = self._open_registrar(request.meshes[0])
+            registrar = self._open_registrar(request)
             registrar.progress = self._report_progress
             entry = request.entry(request.photos[0])
             meshes = tuple(Path(self.name(path)) for path in entry.meshes)
@@ -368,7 +372,7 @@ class Session:
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
-            self.cancelled = False
+            self.cancelled, self.searched = False, None
         if isinstance(camera, Camera):
             document["camera"] = camera.at(shot.size).describe()
             document["inputs"]["camera_source"] = "file"
@@ -429,9 +433,9 @@ class Session:
         if self.cancelled:
             raise CurviregError("stopped")
 
-    def _open_registrar(self, mesh: Path) -> Registrar:
-        """The registrar of a mesh and the present options; the last one is reused."""
-        key = replace(self.options, meshes=(mesh,), limits=None, camera=None, guess=None)
+    def _open_registrar(self, request: RegisterOptions) -> Registrar:
+        """The registrar of a mesh and options; the last one is reused."""
+        key = replace(request, photos=(), box=None, limits=None, camera=None, guess=None)
         if self._registrar is None or self._registrar[0] != key:
             self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]

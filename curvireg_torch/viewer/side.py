@@ -13,6 +13,7 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
+from .session import Answer, Numbers, Result
 from .widgets import button, fold, region, set_text, text
 from .workspace import Workspace
 
@@ -42,8 +43,8 @@ class Answers:
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
-        self.shown_result: Any = None
-        self.shown_answer: Any = None
+        self.shown_result: Result | None = None
+        self.shown_answer: Answer | None = None
         with region("section", "answers", aria_label="answer", data_testid="answers") as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
@@ -128,7 +129,8 @@ class Answers:
         return found
 
     async def _draw_cards(self) -> None:
-        result, _ = self.session.shot.require_result()
+        shot = self.session.shot
+        result, _ = shot.require_result()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
@@ -145,7 +147,7 @@ class Answers:
                 region("img", src=url, alt=f"contours of answer {number + 1}")
                 text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
                 text("span", "" if probabilities[number] is None else f"{probabilities[number]:.2f}", "facts")
-            card.on("click", lambda number=number: self.session.shot.choose(number))
+            card.on("click", lambda number=number: shot.choose(number))
 
 
 class Inputs:
@@ -188,9 +190,13 @@ class Inputs:
         typed = _numbers(self.camera.value)
         if typed is None or typed == self._camera():  # unfinished, or shown by refresh
             return
-        await self._set_camera(typed if len(typed) == 4 else None, typed[0] if len(typed) == 1 else None)
+        match typed:
+            case fx, fy, cx, cy:
+                await self._set_camera((fx, fy, cx, cy))
+            case _:
+                await self._set_camera(guess=next(iter(typed), None))
 
-    async def _set_camera(self, camera: Any = None, guess: str | float | None = None) -> None:
+    async def _set_camera(self, camera: Numbers | None = None, guess: str | float | None = None) -> None:
         await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
 
     def _camera(self) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import LEGEND, to_uint8
-from .session import Numbers, Point, dragged_box
+from .session import Numbers, Point, Shot, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 
@@ -115,7 +115,7 @@ class Stage:
     async def _handle(self, event: Any) -> None:
         """Correct the box or the pose; coordinates come as fractions of the photograph."""
         shot, what = self.session.shot, event.args
-        if shot.photo is None:
+        if shot.photo is None or shot.photo is not self.shown.get("photo"):  # another window has just changed it
             return
         H, W = shot.size
         point = float(what.get("x", 0.0)) * W - 0.5, float(what.get("y", 0.0)) * H - 0.5
@@ -180,9 +180,10 @@ class Stage:
         if self._following:
             return
         self._following, drawn = True, None
+        result, answer = self.session.shot.require_result()
         try:
             while self.moved is not None and self.moved is not drawn:
-                drawn, (result, answer) = self.moved, self.session.shot.require_result()
+                drawn = self.moved
                 paths = await asyncio.to_thread(contour_paths, result.registrar, drawn, answer.pose.projection[1])
                 self._show_layers(shown=False)
                 self._draw_shapes(paths)
@@ -193,7 +194,9 @@ class Stage:
         """Make the pose that was moved the answer."""
         moved, self.moved, self.pressed = self.moved, None, None
         answer = self.session.shot.answer
-        if moved is not None and answer is not None and moved is not answer.pose.projection[0]:
+        if moved is None or answer is None or self.session.shot.photo is not self.shown.get("photo"):
+            return
+        if moved is not answer.pose.projection[0]:
             self.session.shot.place(moved)
 
     def _changed(self, name: str, value: Any) -> bool:
@@ -231,7 +234,7 @@ class Stage:
 
     async def _show_strip(self) -> None:
         """Show small pictures of the photographs, if there are several, and mark the one that is shown."""
-        shots = self.session.shots
+        shots = tuple(self.session.shots)  # others may be opened meanwhile
         images = [shot.photo.image for shot in shots if shot.photo is not None]
         if list(map(id, images)) != list(map(id, self.shown.get("strip", []))):
             self.shown["strip"] = images
@@ -246,14 +249,15 @@ class Stage:
                 test_id = f"photograph-{number + 1}"
                 with self.strip, region("button", "thumbnail", type="button", data_testid=test_id) as thumbnail:
                     region("img", src=url, alt=self.session.name(shots[number].path))
-                thumbnail.on("click", lambda number=number: self._select(number))
+                thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
         for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
             thumbnail.props(f"aria-pressed={'true' if shot is self.session.shot else 'false'}")
             thumbnail.classes(**{"add" if shot.answer is not None else "remove": "done"})
 
-    def _select(self, number: int) -> None:
+    def _select(self, shot: Shot) -> None:
         self._commit()
-        self.session.shot = self.session.shots[number]
+        if shot in self.session.shots:  # not closed in another window
+            self.session.shot = shot
         self.workspace.messages.pop("pose", None)
 
     def _show_mode(self) -> None:
@@ -273,7 +277,7 @@ class Stage:
         assert photo is not None
         content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
         if content:
-            H, W = self.session.shot.size
+            H, W = photo.image.shape[-2:]
             self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
             self.viewport.style(f"--ratio: {W / H:.5f}")
 

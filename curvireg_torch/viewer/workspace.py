@@ -58,6 +58,7 @@ class Workspace:
         self.mesh_facts, self.started, self._version = "", 0.0, 0
         self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
+        self._begun = False  # whether the search has waited for the jobs before it
         self._before_sample: RegisterOptions | None = None
 
     @property
@@ -71,7 +72,7 @@ class Workspace:
         Returns its result or True, and None after an error, which becomes a message.
         """
         async with self._lock:  # no search begins before it is done
-            if stop and self._search is not None:
+            if stop and self._search is not None and self._begun:  # else it waits for this job
                 self.stop()
                 await asyncio.wait({self._search})
             return await self._attempt(part, job)
@@ -98,13 +99,14 @@ class Workspace:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a time."""
         if self._search is None:
             self.session.progress, self.session.cancelled, self.started = ("", 0, 1), False, time.monotonic()
+            self._begun = False
             self._search = asyncio.create_task(self._find())
         return self._search
 
     async def _find(self) -> None:
         try:
             async with self._lock:  # a photograph or a mesh may be opening
-                pass
+                self._begun = True
             await self._attempt("pose", self.session.register)
         finally:
             self._search = None
@@ -118,11 +120,14 @@ class Workspace:
         stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
         if stored + sum(self._sizes.values()) + size > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
-        folder = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder))
+        folder, received = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder)), 0
         self.receiving[folder], self._sizes[folder] = name, size
         try:
             with (folder / name).open("wb") as file:
                 async for block in blocks:
+                    received += len(block)
+                    if received > size:  # in chunks, a request may send more than it has announced
+                        raise InvalidInputError(f"{name}: larger than announced; send it again")
                     await asyncio.to_thread(file.write, block)
             await self._open_upload(folder / name)
         finally:
@@ -133,8 +138,8 @@ class Workspace:
         suffix, session = path.suffix.lower(), self.session
         kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".zip")
         self.messages.pop("file", None)
-        if suffix in kinds:
-            self._leave_sample()
+        if suffix in kinds and self._before_sample is not None:
+            await self.run("file", self._leave_sample, stop=True)
         if suffix not in kinds:
             self.messages["file"] = (
                 f"{path.name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
@@ -169,11 +174,12 @@ class Workspace:
             self.mesh_facts = opened
             self.messages.pop("pose", None)
 
-    def remove_photo(self) -> None:
-        """Close the photograph that is shown."""
-        self.session.remove_photo()
-        self.messages.pop("pose", None)
-        self._remove_unused()
+    async def remove_photo(self) -> None:
+        """Close the photograph that is shown; a search in it is stopped."""
+        shot = self.session.shot
+        if await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot is self.session.searched):
+            self.messages.pop("pose", None)
+            self._remove_unused()
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
@@ -198,7 +204,6 @@ class Workspace:
     async def load_sample(self) -> None:
         """Open the scene of ``curvireg demo``, with its box and camera."""
         self.messages.clear()
-        self._before_sample = self._before_sample or self.session.options
         await self.run("file", self._open_sample, stop=True)
 
     def _open_sample(self) -> None:
@@ -208,6 +213,7 @@ class Workspace:
         K, (x0, y0, x1, y1) = scene.camera_matrix, (round(float(v), 1) for v in scene.box)
         sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
         sample["camera"] = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        self._before_sample = self._before_sample or session.options
         session.close()
         session.options = replace(session.options, **sample)
         session.open_photo(photo).set_box((x0, y0, x1, y1))

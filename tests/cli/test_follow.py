@@ -11,6 +11,7 @@ import torch
 from curvireg_torch.cli import main
 from curvireg_torch.data import Video
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA
@@ -82,6 +83,18 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert 2 < (pictures[2] - photograph).abs().float().mean() < 30  # contours and codec
 
 
+def test_follow_uses_the_box_in_the_first_frame_alone(frames, follow, monkeypatch):
+    boxes, call = [], Follower.__call__
+
+    def watched(self, image, box=None):
+        boxes.append(box)
+        return call(self, image, box)
+
+    monkeypatch.setattr(Follower, "__call__", watched)
+    assert follow("--camera", *CAMERA, "--json") == 0
+    assert boxes == [frames[1][0][1].tolist(), None, None]
+
+
 def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(follow, tmp_path, capsys):
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
     printed = capsys.readouterr()
@@ -150,12 +163,22 @@ def test_follow_refuses_what_it_cannot_follow(follow, tmp_path, capsys, words, s
 def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
     """Ctrl-C is the usual end of a live video."""
 
-    def interrupted(*_):
-        raise KeyboardInterrupt
+    drawn, add = [] if source == "shots" else ["nothing"], OverlayVideo.add
+
+    def interrupted(*arguments):
+        if drawn:
+            raise KeyboardInterrupt
+        drawn.append(add(*arguments))
 
     capture, file = cv2.VideoCapture, str(frames[0] / "turn.avi")
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
     assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == code
-    assert [row["status"] for row in table(tmp_path)] == ["ok"]
+    statuses = [row["status"] for row in table(tmp_path)]
+    if source == "0":
+        assert statuses == ["ok"]
+        assert not (tmp_path / "overlay.mp4").exists()
+    else:
+        assert statuses == ["ok", "ok"]
+        assert [image.shape for _, image in Video(tmp_path / "overlay.mp4")] == [(3, 180, 240)]

@@ -7,6 +7,7 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
+from curvireg_torch.evaluation import runner
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
@@ -25,6 +26,18 @@ def register_list(folder, register):
         return register("--list", path, *([folder / mesh] if mesh else []), *words, out=out)
 
     return run
+
+
+def test_instances_are_those_of_each_row_without_a_box(register_list, monkeypatch):
+    asked, detect = [], runner.detect
+
+    def watched(*arguments, instances, **options):
+        asked.append(instances)
+        return detect(*arguments, instances=instances, **options)
+
+    monkeypatch.setattr(runner, "detect", watched)
+    assert register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
+    assert asked == [2]
 
 
 def rotation(row):

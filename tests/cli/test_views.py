@@ -159,7 +159,7 @@ def test_read_rig_refuses_other_files(tmp_path):
     for name, message in (
         ("none.csv", "no such file"),
         ("empty.csv", "no photographs"),
-        ("binary.csv", "not CSV in UTF-8"),
+        ("binary.csv", r"^\S+binary\.csv: not CSV in UTF-8"),
         ("long.csv", "qw qx qy qz of length 1"),
         ("colmap", "expected IMAGE_ID QW"),
         ("", "without images.txt"),

@@ -7,6 +7,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.mesh.edges import simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
 
@@ -42,3 +43,14 @@ def test_views_of_y_up_meshes_are_upright(tmp_path: Path) -> None:
     bank = cr.ViewBank.build(tmp_path / "a.glb", pipeline=few, progress=False)
     up = bank.rotations @ torch.tensor([0.0, 1.0, 0.0])
     assert float(up[:, 1].max()) <= -0.5  # y of the file points up in the picture in every view
+
+
+def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_area() -> None:
+    box = trimesh.creation.box((1, 2, 3))
+    apart = np.asarray(box.vertices)[box.faces].reshape(-1, 3) + 1e-8 * np.arange(36)[:, None]
+    faces = np.arange(36).reshape(12, 3)
+    faces = np.concatenate([faces, faces[:2, ::-1], [[0, 0, 1]]])  # twice, turned over, and a line
+    vertices, faces = simplified(trimesh.Trimesh(apart, faces, process=False), np.array([0.5, 0.0, 0.0]), 100)
+    assert sorted(vertices.round(3).tolist()) == sorted((np.asarray(box.vertices) - [0.5, 0, 0]).tolist())
+    welded = trimesh.Trimesh(vertices, faces, process=False)
+    assert (len(faces), welded.is_watertight, welded.volume) == (12, True, pytest.approx(6.0, rel=1e-5))

@@ -15,11 +15,7 @@ from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotatio
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
-from curvireg_torch.registration.detection import (
-    Candidate,
-    _allowed_views,
-    _medoids,
-)
+from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views, _medoids
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, unrefined
@@ -314,3 +310,15 @@ def squared_distances(points: torch.Tensor) -> torch.Tensor:
 def test_medoids_are_the_centres_of_clusters() -> None:
     points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
     assert sorted(points[_medoids(squared_distances(points), 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+
+
+@pytest.mark.parametrize(("score", "kept"), [(0.2, [0.9, 0.3]), (0.5, [0.9, 0.3]), (0.95, [0.95])])
+def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_each(score, kept):
+    def at(x0, score):
+        return Found(None, torch.tensor([x0, 0.0, x0 + 10.0, 10.0]), 1.0, score)
+
+    found = [at(0.0, 0.9), at(5.0, 0.3)]
+    _add(found, at(2.0, score))
+    assert [one.score for one in found] == kept
+    _add(found, at(40.0, 0.1))  # elsewhere
+    assert [one.score for one in found] == [*kept, 0.1]

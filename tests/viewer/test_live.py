@@ -10,11 +10,14 @@ import webbrowser
 import cv2
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.cli import main
-from curvireg_torch.registration import Follower
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.registration import FailedRegistration, Follower
+from curvireg_torch.viewer.live import LivePage
 from curvireg_torch.visualization.contours import OUTLINE
 from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
@@ -40,6 +43,22 @@ class Camera:
             time.sleep(0.01)
         self.number += 1
         return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
+
+
+def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
+    page = LivePage(learned_registrar())
+    result = FailedRegistration(LostObjectError("gone"))
+    grey = torch.full((3, 60, 120), 0.5)
+    page.show(None, result)
+    assert page.number == 0, "it could not be read"
+    for level, number in ((0.5, 1), (0.1, 1), (0.2, 1)):
+        page.show(torch.full_like(grey, level), result)
+        assert (page.number, page.ratio) == (number, 2.0)
+    picture = cv2.imdecode(np.frombuffer(page._send().body, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (60, 120, 3)
+    assert abs(int(picture[50, 60, 0]) - 128) < 5, "the first one"
+    page.show(torch.full_like(grey, 0.9), result)
+    assert page.number == 2
 
 
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):

@@ -46,6 +46,7 @@ def drag(stage, start, end):
 
 def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
     shot, stage = workspace.session.shot, build(Stage)
+    asyncio.run(stage.refresh())
     drag(stage, (20, 30), (120, 90))
     assert shot.box == pytest.approx((20, 30, 120, 90))
     drag(stage, (122, 60), (150, 60))  # the right edge, which is near enough
@@ -165,6 +166,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     shot, posed = shown.session.shot, Stage(shown)
     asyncio.run(posed.refresh())
     assert posed.mode == "pose"
+    assert "disabled" in posed.undo.props
     T, K = shot.answer.pose.projection
     describer = shot.result.registrar.describer
 
@@ -178,6 +180,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
     assert shot.answer.pose.projection[0][:3, :3].tolist() == T[:3, :3].tolist()
     asyncio.run(posed.refresh())
+    assert "disabled" not in posed.undo.props
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
     assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
     assert len(shot.answer.edits) == 2
@@ -210,11 +213,22 @@ def test_photographs_are_chosen_from_a_strip(shown, registered):
     assert (one.props["aria-pressed"], other.props["aria-pressed"]) == ("false", "true")
     assert ("done" in one.classes, "done" in other.classes) == (True, False)
     drag(stage, (20, 30), (120, 90))
-    stage._select(0)
+    stage._select(first)
     asyncio.run(stage.refresh())
     assert (session.shot, stage.mode, stage.layers.visible) == (first, "pose", True)
     assert second.box == pytest.approx((20, 30, 120, 90))
-    session.shot = second
-    shown.remove_photo()
+    T = first.answer.pose.projection[0]
+    send(stage, "scale", factor=1.1, roll=5.0)
+    session.shot = second  # in another window, and this one has not noticed yet
+    drag(stage, (40, 50), (100, 80))
+    stage._commit()
+    assert second.box == pytest.approx((20, 30, 120, 90))
+    assert (second.answer, first.answer.pose.projection[0].equal(T)) == (None, True)
+    stage.mode = "box"
+    drag(stage, (40, 50), (100, 80))
+    assert second.box == pytest.approx((20, 30, 120, 90))
+    asyncio.run(shown.remove_photo())
+    stage._select(second)
+    assert session.shot is first, "the other one is closed"
     asyncio.run(stage.refresh())
     assert stage.strip.default_slot.children == []

@@ -205,12 +205,31 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     session.shot = first
     assert session.request() == first.result.request
     assert second.box == (10.0, 20.0, 90.0, 80.0)
+    third = session.open_photo(folder / "photo.png")
+    session.shot = first
+    session.remove_photo(third)
+    assert (session.shots, session.shot) == ([first, second], first)
     monkeypatch.setattr(module, "MAX_VIEWER_PHOTOGRAPHS", 2)
     with pytest.raises(InvalidInputError, match="2 photographs are open"):
         session.open_photo(folder / "photo.png")
     session.shot = second
-    session.remove_photo()
+    session.remove_photo(second)
     assert (session.shots, session.shot) == ([first], first)
+
+
+def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monkeypatch):
+    monkeypatch.setattr(module, "open_registrar", lambda options, meshes, **_: (options.pose, meshes))
+    request = replace(RegisterOptions(), meshes=(folder / "truck.ply",), pose="any")
+    session = new_session()
+    first = session._open_registrar(request)
+    assert first == ("any", request.meshes)
+    box, camera = (1.0, 2.0, 30.0, 40.0), (260.0, 260.0, 119.5, 89.5)
+    other = replace(request, photos=(folder / "photo.png",), box=box, camera=camera, limits={"theta": (0.0, 9.0)})
+    assert session._open_registrar(other) is first
+    assert session._open_registrar(replace(other, camera=None, guess=60.0)) is first
+    for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
+        changed = replace(request, **changes)
+        assert session._open_registrar(changed) == (changed.pose, changed.meshes)
 
 
 def test_distortion_is_removed_from_all_photographs(folder):

@@ -62,12 +62,12 @@ def test_uploads_find_their_place(workspace, scene):
     assert workspace.messages == {}
     assert sorted(stored(workspace)) == ["a.png", "b.png", "part.PLY"], "the former mesh is removed"
     session.shot = session.shots[0]
-    workspace.remove_photo()
+    asyncio.run(workspace.remove_photo())
     assert (names(workspace), sorted(stored(workspace))) == (["b.png"], ["b.png", "part.PLY"])
     calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0]}
     asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
     assert session.shot.photo.notes == ("undistorted",)
-    workspace.remove_photo()
+    asyncio.run(workspace.remove_photo())
     assert (names(workspace), session.shot.photo, stored(workspace)) == ([], None, ["part.PLY"])
 
 
@@ -96,6 +96,16 @@ def test_uploads_are_bounded(workspace, scene, monkeypatch):
     asyncio.run(upload(workspace, scene / "photo.png"))
     with pytest.raises(InvalidInputError, match=r"^x\.png: all files have more than"):
         asyncio.run(upload(workspace, scene, "x.png", b"0"))
+
+
+def test_an_upload_of_more_than_it_announced_is_refused(workspace):
+    async def blocks():
+        for _ in range(3):
+            yield b"12"
+
+    with pytest.raises(InvalidInputError, match=r"^x\.png: larger than announced"):
+        asyncio.run(workspace.receive("x.png", 5, blocks()))
+    assert stored(workspace) == []
 
 
 def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
@@ -186,6 +196,69 @@ def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end
         assert workspace.messages == {}
 
     asyncio.run(work())
+
+
+def test_a_search_that_waits_for_a_mesh_searches_with_it(workspace, scene, search):
+    """The mesh waits for a job; the search was started later."""
+    released = threading.Event()
+
+    async def work():
+        await upload(workspace, scene / "photo.png")
+        job = asyncio.create_task(workspace.run("page", lambda: released.wait(10)))
+        await asyncio.sleep(0)
+        opening = asyncio.create_task(workspace.open_mesh(scene / "truck.ply"))
+        await asyncio.sleep(0)
+        running = workspace.start_search()
+        await asyncio.sleep(0)
+        released.set()
+        search.released.set()
+        await asyncio.wait_for(asyncio.gather(job, opening, running), 10)
+
+    asyncio.run(work())
+    assert len(search.shots) == 1
+    assert workspace.session.mesh_path == scene / "truck.ply"
+    assert workspace.messages == {}
+
+
+def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, scene, search):
+    ended = []
+
+    async def work():
+        for close in (lambda: upload(workspace, scene / "photo.png"), workspace.remove_photo):
+            search.begun.clear()
+            running = workspace.start_search()
+            await asyncio.to_thread(search.begun.wait, 10)
+            workspace.session.searched = workspace.session.shot  # as ``register`` sets it
+            try:
+                await close()
+                ended.append(running.done())
+            finally:
+                search.released.set()
+            await running
+            search.released.clear()
+        await workspace.remove_photo()  # in a window that has not noticed yet
+
+    asyncio.run(workspace.load_sample())
+    asyncio.run(work())
+    assert ended == [True, True]
+    assert names(workspace) == []
+    assert workspace.messages == {}
+
+
+def test_a_sample_that_fails_leaves_the_work_as_it_is(workspace, scene, monkeypatch):
+    def fail():
+        raise OSError("disk full")
+
+    monkeypatch.setattr(module, "demo_scene", fail)
+
+    async def work():
+        await upload(workspace, scene / "photo.png", "a.png")
+        await workspace.load_sample()
+        assert workspace.messages == {"file": "disk full"}
+        await upload(workspace, scene / "photo.png", "b.png")
+
+    asyncio.run(work())
+    assert names(workspace) == ["a.png", "b.png"]
 
 
 def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene, search, monkeypatch):
