@@ -341,7 +341,10 @@ class Registrar:
             poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
         features = self._features(work, poses)
         if self.pipeline.contours and work.exact:
-            poses, features = self._with_texture(work, poses, features, outside)
+            best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+            poses, features = self._fitted_again(work, poses, features, best, mask)
+            best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+            poses, features = self._with_texture(work, poses, features, best)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
@@ -411,13 +414,30 @@ class Registrar:
             appearance = self.matcher.reranking_score(Appearance.name, *compared)
         return pose_features(self.describer, work.descriptors, poses, appearance)
 
-    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
-        """Fit the best pose to the mesh's colours as well."""
-        best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-        fitted = fit_texture_of(self.describer, [work.item.image], poses, work.item.box[None], int(best))
-        if fitted is None or (work.limits is not None and not bool(work.limits.keeps(fitted))):
+    def _fitted_again(
+        self, work: _Work, poses: Poses, features: Tensor, best: Tensor, mask: Tensor | None
+    ) -> tuple[Poses, Tensor]:
+        """Fit pose ``best`` (1,) again from where it is, and keep the result if it has a higher score."""
+        fitted = fit_poses(self.describer, [work.item.image], poses[best], work.item.box[None], mask)
+        new = self._features(work, fitted)
+        if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features
-        return poses.replaced(best, fitted), features.index_copy(0, best, self._features(work, fitted))
+        return self._replaced(work, poses, features, best, fitted, new)
+
+    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, best: Tensor) -> tuple[Poses, Tensor]:
+        """Fit pose ``best`` (1,) to the mesh's colours as well."""
+        fitted = fit_texture_of(self.describer, [work.item.image], poses, work.item.box[None], int(best))
+        if fitted is None:
+            return poses, features
+        return self._replaced(work, poses, features, best, fitted, self._features(work, fitted))
+
+    def _replaced(
+        self, work: _Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
+    ) -> tuple[Poses, Tensor]:
+        """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds the limits."""
+        if work.limits is not None and not bool(work.limits.keeps(fitted)):
+            return poses, features
+        return poses.replaced(index, fitted), features.index_copy(0, index, new)
 
     def _kept(self, work: _Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
         """(H,) bool: poses that do not return to their views."""
