@@ -32,7 +32,7 @@ BOP = (
 )
 
 
-LIGHTINGS = {"hope": 5}  # per view; objects of these sets are not independent
+LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are not independent
 
 
 def main() -> int:
