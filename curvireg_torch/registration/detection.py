@@ -33,6 +33,9 @@ TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
 MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
+FOUND_CONFIDENCE = 0.1  # below which a warning says that the object was not found
+NOT_FOUND = "the object was not found: this is the least unlikely place; give a box"
+
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
 MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
 MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
@@ -194,14 +197,19 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
     boxes = torch.cat([torch.stack([one.box for one in found]), proposals.boxes.double()])
     responses = torch.cat([torch.tensor([one.response for one in found]), proposals.responses])
     kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
-    return [
-        replace(
-            one.registration,
-            detection=Detection(one.box, one.score, one.response, boxes[kept], responses[kept]),
-            probabilities=tuple(p * one.score for p in one.registration.probabilities),
+    results = []
+    for one in found:
+        probabilities = tuple(p * one.score for p in one.registration.probabilities)
+        uncertain = probabilities and probabilities[0] < FOUND_CONFIDENCE
+        results.append(
+            replace(
+                one.registration,
+                detection=Detection(one.box, one.score, one.response, boxes[kept], responses[kept]),
+                probabilities=probabilities,
+                warnings=one.registration.warnings + ((NOT_FOUND,) if uncertain else ()),
+            )
         )
-        for one in found
-    ]
+    return results
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,14 @@ def test_probabilities_are_those_of_a_right_box_times_its_score(found):
     assert found_there.probabilities == pytest.approx((0.8 * one.score, 0.1 * one.score))
 
 
+@pytest.mark.parametrize(("probability", "warned"), [(0.099, True), (0.101, False)])
+def test_a_place_that_is_hardly_likely_asks_for_a_box(found, probability, warned):
+    one = replace(as_found(replace(found[2], probabilities=(probability,), warnings=())), score=1.0)
+    none = Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
+    (result,) = detection_module._with_proposals([one], none)
+    assert any("give a box" in text for text in result.warnings) == warned
+
+
 @pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
 def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
     one, other = as_found(found[2]), as_found(found[2])
