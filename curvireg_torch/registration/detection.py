@@ -33,9 +33,8 @@ TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
 MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
-FOUND_CONFIDENCE = 0.1  # below which a warning says that the object was not found
-NOT_FOUND = "the object was not found: this is the least unlikely place; give a box"
-
+FOUND_CONFIDENCE = 0.1  # Confidence below which a result warns that the object is hardly there
+NOT_FOUND = "the object is hardly at this place; give a box"
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
 MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
 MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids

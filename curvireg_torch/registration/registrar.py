@@ -341,10 +341,8 @@ class Registrar:
             poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
         features = self._features(work, poses)
         if self.pipeline.contours and work.exact:
-            best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-            poses, features = self._fitted_again(work, poses, features, best, mask)
-            best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-            poses, features = self._with_texture(work, poses, features, best)
+            poses, features = self._fitted_again(work, poses, features, outside, mask)
+            poses, features = self._with_texture(work, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
@@ -415,17 +413,19 @@ class Registrar:
         return pose_features(self.describer, work.descriptors, poses, appearance)
 
     def _fitted_again(
-        self, work: _Work, poses: Poses, features: Tensor, best: Tensor, mask: Tensor | None
+        self, work: _Work, poses: Poses, features: Tensor, outside: Tensor, mask: Tensor | None
     ) -> tuple[Poses, Tensor]:
-        """Fit pose ``best`` (1,) again from where it is, and keep the result if it has a higher score."""
+        """Fit the best pose again from where it is, and keep the result if it has a higher score."""
+        best = _best_inside(features, outside)
         fitted = fit_poses(self.describer, [work.item.image], poses[best], work.item.box[None], mask)
         new = self._features(work, fitted)
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features
         return self._replaced(work, poses, features, best, fitted, new)
 
-    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, best: Tensor) -> tuple[Poses, Tensor]:
-        """Fit pose ``best`` (1,) to the mesh's colours as well."""
+    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
+        """Fit the best pose to the mesh's colours as well."""
+        best = _best_inside(features, outside)
         fitted = fit_texture_of(self.describer, [work.item.image], poses, work.item.box[None], int(best))
         if fitted is None:
             return poses, features
@@ -482,6 +482,11 @@ class Registrar:
             prior_contradiction=contradiction,
             warnings=work.item.warnings + self.mesh_warnings,
         )
+
+
+def _best_inside(features: Tensor, outside: Tensor) -> Tensor:
+    """(1,) index of the best pose that is not outside the limits."""
+    return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
 
 
 def _better(
