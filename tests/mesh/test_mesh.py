@@ -7,7 +7,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.mesh.edges import simplified
+from curvireg_torch.mesh.edges import MeshEdges, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
 
@@ -54,3 +54,9 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     assert sorted(vertices.round(3).tolist()) == sorted((np.asarray(box.vertices) - [0.5, 0, 0]).tolist())
     welded = trimesh.Trimesh(vertices, faces, process=False)
     assert (len(faces), welded.is_watertight, welded.volume) == (12, True, pytest.approx(6.0, rel=1e-5))
+
+
+def test_edges_of_one_vertex_are_neighbours():
+    """Contour points are spread along the edges in this order, and so over the whole contour."""
+    edges = MeshEdges(trimesh.creation.icosphere(subdivisions=3), np.zeros(3), max_faces=2000).edges
+    assert edges.tolist() == sorted(edges.tolist())

@@ -95,6 +95,19 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     assert counts == [3, 1], "the best is fitted twice"
 
 
+@pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
+def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
+    fit_poses = registrar_module.fit_poses
+
+    def pretended(describer, images, poses, *rest):
+        fitted = fit_poses(describer, images, poses, *rest)
+        return replace(fitted, edge_support=torch.full_like(fitted.rank, support)) if len(poses) == 1 else fitted
+
+    monkeypatch.setattr(registrar_module, "fit_poses", pretended)
+    result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
+    assert (result.edge_support == support) == kept
+
+
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = registrar_module.fit_poses
 
