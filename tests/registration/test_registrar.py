@@ -95,6 +95,13 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     assert counts == [3, 1], "the best is fitted twice"
 
 
+def test_the_best_pose_is_not_one_outside_the_limits():
+    similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
+    features = torch.stack([0 * similarity, similarity, 0 * similarity, 0 * similarity], dim=1)
+    outside = torch.tensor([False, False, True, False])
+    assert registrar_module._best_inside(features, outside).tolist() == [1]
+
+
 @pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
 def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
     fit_poses = registrar_module.fit_poses
