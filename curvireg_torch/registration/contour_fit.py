@@ -32,8 +32,6 @@ from .least_squares import (
     step_fraction,
 )
 
-__all__ = ["ContourFit", "ContourProblem", "ContourState", "EdgeField", "ObjectMask", "contour_support", "fit_contours"]
-
 CROP_SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
 
@@ -465,6 +463,19 @@ def fit_contours(
         measured, state.points, state.T, full.K, contours.centre, radius=contours.radius
     )
     return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
+
+
+@torch.no_grad()
+def quick_support(
+    contours: MeshContours, image: Tensor, box: Tensor, K: Tensor, T: Tensor, *, margin: float, mask: Tensor | None
+) -> Tensor:
+    """(N,) edge support, with the weights of the ``mask``, that poses ``T`` (N, 4, 4) with cameras ``K`` (N, 3, 3)
+    reach by a short fit at a quarter of the size; it tells in a tenth of the time which of them are worth a fit."""
+    crops, inside, full = full_size_problem(
+        contours, [image], box[None], K, torch.zeros(len(T), dtype=torch.long), margin
+    )
+    quarter = smaller_problem(replace(full, mask=None if mask is None else ObjectMask(mask)), crops, inside, 4)
+    return quarter.supports(quarter.descend(quarter.state(T), QUARTER_SIZE_RADII))[1]
 
 
 @torch.no_grad()
