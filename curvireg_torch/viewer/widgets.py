@@ -52,5 +52,5 @@ def file_chooser(label: str, test_id: str) -> None:
     """A button that opens the dialogue for files; ``page.js`` sends them."""
     with region("label", "button file"):
         ui.label(label)
-        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".zip"))
+        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip"))
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")

@@ -1,9 +1,12 @@
 """The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
 
+import json
 import re
 
 import pytest
+import torch
 
+from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import demo_scene, example_mesh
 from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
@@ -254,3 +257,55 @@ def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(
     browser.wait(lambda: browser.text("camera-facts") == "from a calibration file, without its distortion", "facts")
     browser.click("no-photo")
     browser.wait(lambda: not browser.part("strip").is_displayed(), "one photograph needs no strip")
+
+
+def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
+    browser.click("sample-again")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("sample"), "the sample")
+    scenes = [demo_scene(seed) for seed in (4, 5)]  # the world is the mesh's own frame
+    lines = ["photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"]
+    for seed, scene in zip((4, 5), scenes, strict=True):
+        R, t = scene.truth[:3, :3].flatten().tolist(), (1000.0 * scene.truth[:3, 3]).tolist()  # in mm
+        box = scene.box.tolist() if seed == 4 else [""] * 4
+        lines.append(",".join(map(str, [f"table-{seed}.png", *box, 1040, 1040, 479.5, 359.5, *R, *t])))
+    (folder / "rig.csv").write_text("\n".join(lines))
+    browser.drop(*map(folder.joinpath, ["table-4.png", "table-5.png", "table.ply", "rig.csv"]))
+    browser.wait(lambda: browser.text("rig-facts") == "rig.csv: one pose in 2 photographs", "the rig")
+    browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "the mesh")
+    assert browser.text("register") == "Find the pose in 2 photographs"
+    browser.click("register")
+    browser.wait(lambda: browser.text("progress") == "done", "one pose")
+    extent = """
+        const image = arguments[0], canvas = document.createElement('canvas');
+        [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+        const context = canvas.getContext('2d');
+        context.drawImage(image, 0, 0);
+        const alpha = context.getImageData(0, 0, canvas.width, canvas.height).data.filter((_, k) => k % 4 === 3);
+        const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
+        const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
+        const y = drawn.map(k => Math.floor(k / canvas.width));
+        return [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))]"""
+    for number, scene in enumerate(scenes, start=1):
+        browser.click(f"photograph-{number}")
+        solid = browser.part("photograph").find_elements("css selector", "img")[1]
+        box = pytest.approx(scene.box.tolist(), abs=4)
+        browser.wait(lambda box=box, solid=solid: browser.driver.execute_script(extent, solid) == box, f"mesh {number}")
+        assert browser.part("answers").is_displayed()
+    browser.click("download-result.json")
+    document = json.loads(browser.downloaded("result.json"))
+    assert (document["frame"], [view["photo"] for view in document["views"]]) == (
+        "world",
+        ["table-4.png", "table-5.png"],
+    )
+    assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
+    browser.click("download-pose.glb")
+    assert browser.downloaded("pose.glb").count(b'"photograph ') == 2
+    browser.emulate(1440, 900)
+    browser.picture("viewer-rig")
+    (folder / "rig.csv").write_text("\n".join([*lines[:2], lines[2].replace(",1040,", ",wide,")]))
+    browser.upload("photograph", folder / "rig.csv")
+    wrong = "rig.csv: row 2: table-5.png: fx: expected a number, got 'wide'"
+    browser.wait(lambda: browser.text("message-rig").startswith(wrong), "the row that is wrong")
+    assert browser.text("register") == "Find the object and its pose"
+    browser.click("no-rig")
+    browser.wait(lambda: browser.messages() == [], "as without a rig")

@@ -121,7 +121,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     before, describer = session.shot.answer.pose, session.shot.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    assert session.shot.answer_before is None
+    assert session.shot.result.answer_before is None
     moved = session.shot.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
     session.shot.place(moved)
     pose = session.shot.answer.pose
@@ -144,7 +144,7 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
         session.shot.undo()
         assert session.shot.answer.pose is answer
     session.shot.choose(1)
-    assert (session.shot.answer.edits, session.shot.answer_before) == ((), None)
+    assert (session.shot.answer.edits, session.shot.result.answer_before) == ((), None)
     with pytest.raises(InvalidInputError, match="touch the camera"):
         session.shot.result.moved(moved, translation=(0, 0, -100))
 

@@ -228,7 +228,7 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
             search.begun.clear()
             running = workspace.start_search()
             await asyncio.to_thread(search.begun.wait, 10)
-            workspace.session.searched = workspace.session.shot  # as ``register`` sets it
+            workspace.session.searched = (workspace.session.shot,)  # as ``register`` sets it
             try:
                 await close()
                 ended.append(running.done())

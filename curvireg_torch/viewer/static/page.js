@@ -3,8 +3,10 @@
   // --- Files: chosen, dropped anywhere, or pasted.
   const address = () => location.pathname.replace(/\/$/, "") + "/upload";
 
+  const isRig = (file) => /(^(images\.txt|scene_camera\.json)|\.csv)$/i.test(file.name);
+
   async function sendFiles(files) {
-    for (const file of files) {
+    for (const file of files.sort((a, b) => isRig(b) - isRig(a))) {  // what belongs to a rig comes after it
       const headers = { "x-file-name": encodeURIComponent(file.name) };
       await fetch(address(), { method: "POST", body: file, headers }).catch(() => {});  // the server shows the reason
     }
