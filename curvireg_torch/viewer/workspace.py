@@ -18,11 +18,9 @@ from typing import Any
 from ..data import load_camera
 from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..synthetic import demo_scene
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.files import write_file
-from ..visualization.encoding import png
-from ..visualization.overlay import to_uint8
+from . import sample
 from .session import Session
 
 __all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
@@ -220,21 +218,21 @@ class Workspace:
             self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
     async def load_sample(self) -> None:
-        """Open the scene of ``curvireg demo``, with its box and camera."""
+        """Open the photograph of the sample, its mesh and its box."""
         self.messages.clear()
         await self.run("file", self._open_sample, stop=True)
 
     def _open_sample(self) -> None:
-        scene, session, photo, mesh = demo_scene(), self.session, self.folder / "sample.png", self.folder / "sample.ply"
-        write_file(photo, png(to_uint8(scene.image)))
-        write_file(mesh, scene.mesh.export(file_type="ply"))
-        K, (x0, y0, x1, y1) = scene.camera_matrix, (round(float(v), 1) for v in scene.box)
-        sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
-        sample["camera"] = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        session, photo, mesh = self.session, self.folder / sample.PHOTO.name, self.folder / "cup.ply"
+        write_file(photo, sample.PHOTO.read_bytes())
+        write_file(mesh, sample.cup().export(file_type="ply"))
+        options: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
         self._before_sample = self._before_sample or session.options
         session.close()
-        session.options = replace(session.options, **sample)
-        session.open_photo(photo).set_box((x0, y0, x1, y1))
+        session.options = replace(session.options, **options, camera=None, guess=sample.VIEW)
+        shot = session.open_photo(photo, sample.BOX)
+        assert shot.photo is not None
+        shot.photo = replace(shot.photo, notes=(sample.CREDIT,))
         self.mesh_facts = session.open_mesh(mesh)
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:

@@ -35,7 +35,8 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("coffee.jpg: 600 x 400 px"), "photograph")
+    assert "CC0" in browser.text("photograph-facts")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
 
@@ -88,7 +89,7 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     browser.driver.refresh()
     browser.wait(lambda: [browser.text(name) for name in names] == before, "everything again")
     images = browser.part("photograph").find_elements("css selector", "img")
-    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [960] * 3, "layers")
+    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [600] * 3, "layers")
     browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
     assert browser.text("progress") == "done"
     browser.emulate(1440, 900)
@@ -103,7 +104,7 @@ def test_contours_follow_the_mesh_that_is_dragged(browser):
         browser.wait(lambda: browser.driver.find_element("css selector", ".canvas path.outline"), "contours", 20)
         browser.picture("viewer-drag")
 
-    browser.drag((20, 20), (80, 60), 960, held=follows)
+    browser.drag((20, 20), (60, 45), 600, held=follows)
     browser.wait(lambda: "moved: rotated" in browser.text("facts"), "turned")
     browser.click("undo")
     browser.wait(lambda: browser.text("facts") == before, "as before")
@@ -182,8 +183,8 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     assert browser.driver.execute_script("return arguments[0].scrollLeft", viewport) > 100
     browser.driver.find_element("css selector", "[data-zoom=fit]").click()
     browser.wait(lambda: image.size["width"] == width, "as before")
-    browser.drag((100, 500), (300, 650), 960)
-    browser.wait(lambda: browser.box() == pytest.approx([100, 500, 300, 650], abs=2), "drawn box")
+    browser.drag((10, 250), (120, 350), 600)
+    browser.wait(lambda: browser.box() == pytest.approx([10, 250, 120, 350], abs=2), "drawn box")
 
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
@@ -261,7 +262,7 @@ def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(
 
 def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     browser.click("sample-again")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("sample"), "the sample")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("coffee"), "the sample")
     scenes = [demo_scene(seed) for seed in (4, 5)]  # the world is the mesh's own frame
     lines = ["photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"]
     for seed, scene in zip((4, 5), scenes, strict=True):

@@ -203,7 +203,7 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     assert (second.box, second.result) == (None, None)
     second.set_box((10.0, 20.0, 90.0, 80.0))
     session.shot = first
-    assert session.request() == first.result.request
+    assert session.request() == first.result.inputs[0]
     assert second.box == (10.0, 20.0, 90.0, 80.0)
     third = session.open_photo(folder / "photo.png")
     session.shot = first
@@ -261,7 +261,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert session.shot.photo.notes == ("undistorted",)
     with pytest.raises(InvalidInputError, match="another aspect ratio"):
         session.set_camera(Camera(K, size=(480, 640 + 90)))
-    assert session.is_undistorted, "nothing has changed"
+    assert session.shot.is_undistorted, "nothing has changed"
     session.shot.set_box(tuple(scene(0)[1].tolist()))
     session.register()
     document = session.document()
