@@ -14,7 +14,7 @@ from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .session import Answer, Numbers, Result, Shot
-from .widgets import button, fold, region, set_text, text
+from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
 
 __all__ = ["Answers", "Inputs", "Preview"]
@@ -35,7 +35,7 @@ NOT_IN_RIG = (
     "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and open all photographs."
 )
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
-CAMERA_HINT = "With it the position is found. All photographs have the same: drop a calibration file, or type."
+CAMERA_HINT = "With it the position is found. All photographs have the same: type it, or choose a calibration."
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
@@ -128,7 +128,12 @@ class Answers:
             self.workspace.start_search()
 
         if document.get("prior", {}).get("contradiction") is not None:
-            front = {name: value for name, value in (options.limits or {}).items() if name == "front"}
+            limits = dict(options.limits or {})
+            front = {name: value for name, value in limits.items() if name == "front"}
+            if "viewpoint" in limits:
+                azimuth, *rest = limits["viewpoint"]
+                around = {**limits, "viewpoint": ((azimuth + 180.0) % 360.0, *rest)}
+                found["Turn the hint around"] = lambda: search_with(limits=around)
             found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
@@ -177,7 +182,9 @@ class Inputs:
             self.camera = ui.input("fx fy cx cy in px, or the horizontal field of view in degrees")
             self.camera.props("dense data-testid=camera").on_value_change(self._typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
-            self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
+            with region("div", "row"):
+                file_chooser("From a file", "upload-camera")
+                self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -318,6 +325,6 @@ class Preview:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
-                scene.text(name, "font-weight: bold").move(*end)
+                scene.text(name, "font-weight: bold; color: #1b1f23").move(*end)
         scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
         self.scene = scene

@@ -169,7 +169,17 @@
 
   // --- Texts to copy.
   addEventListener("click", (event) => {
-    const source = event.target.dataset?.copy;
-    if (source) navigator.clipboard?.writeText(document.querySelector(`[data-testid="${source}"]`).textContent);
+    const button = event.target, source = button.dataset?.copy;
+    if (!source) return;
+    const element = document.querySelector(`[data-testid="${source}"]`), label = button.textContent;
+    if (navigator.clipboard) {
+      navigator.clipboard.writeText(element.textContent);
+    } else {  // a page from another machine, without encryption
+      element.closest("details").open = true;
+      getSelection().selectAllChildren(element);
+      document.execCommand("copy");
+    }
+    button.textContent = "copied";
+    setTimeout(() => (button.textContent = label), 1500);
   });
 })();
