@@ -276,6 +276,10 @@ class Session:
         """What the user calls a file."""
         return Path(path).name if self.folder in Path(path).parents else str(path)
 
+    def usable_name(self, path: Path) -> str:
+        """:meth:`name`, in commands and programs; the sample is there as long as the page is."""
+        return str(path) if path.parent == self.folder else self.name(path)
+
     def close(self) -> None:
         """Forget the photographs, the rig and the mesh."""
         self.shots, self.shot, self.mesh_path, self.mesh = [], Shot(), None, None
@@ -466,7 +470,7 @@ class Session:
         """The command line that gives the same result; none takes the box of an undistorted photograph, or boxes and
         photographs that a rig does not have."""
         if self.shot.view is None:
-            return "" if self.shot.is_undistorted else _command_line(self.request(), self.name)
+            return "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
         shots = self.together()
         drawn = any(shot.box != (shot.view and shot.view.box and _box(shot.view.box)) for shot in shots)
         if self.rig_path is None or (drawn and not shots[0].is_undistorted) or len(shots) < len(self.rig):
@@ -555,8 +559,8 @@ class Session:
         """A Python program that gives the answer."""
         result, answer = self.shot.require_result()
         (request, boxes), prior = result.inputs, result.registration.prior
-        mesh, rows = repr(self.name(request.meshes[0])), result.document["views"]
-        photos = [repr(self.name(path)) for path in request.photos]
+        mesh, rows = repr(self.usable_name(request.meshes[0])), result.document["views"]
+        photos = [repr(self.usable_name(path)) for path in request.photos]
         if self.shot.is_undistorted:
             read = "cr.geometry.undistorted(cr.data.read_photo({}).image, cr.load_camera('CALIBRATION')).image"
             photos = list(map(read.format, photos))

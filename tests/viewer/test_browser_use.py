@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -121,7 +122,8 @@ def test_the_program_is_copied(browser):
     script = "navigator.clipboard.readText().then(arguments[0], arguments[0])"
     copied = browser.driver.execute_async_script(script)
     assert copied.startswith("import curvireg_torch as cr\n")
-    assert "coffee.jpg" in copied
+    files = re.findall(r"'([^']+coffee\.jpg|[^']+cup\.ply)'", copied)
+    assert [Path(file).is_file() for file in files] == [True, True], "it runs as long as the page is open"
 
 
 def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(browser):
