@@ -13,7 +13,7 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .session import Answer, Numbers, Result, Shot
+from .shot import Answer, Numbers, Result, Shot
 from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
 

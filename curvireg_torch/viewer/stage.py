@@ -16,7 +16,7 @@ from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import LEGEND, to_uint8
-from .session import Numbers, Point, Shot, dragged_box
+from .shot import Numbers, Point, Shot, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 

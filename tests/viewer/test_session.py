@@ -21,7 +21,8 @@ from curvireg_torch.geometry import Camera, rotation_error, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
-from curvireg_torch.viewer.session import Answer, Session, dragged_box
+from curvireg_torch.viewer.session import Session
+from curvireg_torch.viewer.shot import Answer, dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
