@@ -117,8 +117,7 @@ class Steps:
         )
         together = len(session.together())
         counted = f"{together} photograph{'s' * (together > 1)}"
-        rig = session.name(session.rig_path or "")
-        set_text(self.facts["rig"], f"{rig}: one pose in {counted}" if shot.view else "")
+        set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
         self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
         self.no_photo.set_visibility(len(session.shots) > 1)

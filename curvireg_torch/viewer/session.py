@@ -27,7 +27,7 @@ from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
 from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
-from .shot import Numbers, Result, Shot
+from .shot import Numbers, Result, Shot, numbers
 
 __all__ = ["Session"]
 
@@ -110,7 +110,7 @@ class Session:
         which must fit the photograph."""
         photo, camera = read_photo(path), self.options.camera
         if view is not None:
-            camera, box = view.camera, box if box is not None or view.box is None else _box(view.box)
+            camera, box = view.camera, box if box is not None or view.box is None else numbers(view.box)
         if not isinstance(camera, Camera):
             return Shot(path, photo, box, view)
         try:
@@ -118,13 +118,13 @@ class Session:
         except InvalidInputError as error:
             raise error.with_subject(path if view is None else view.name) from error
         if moved is not None and camera.distorts:
-            box = _box([round(float(v), 1) for v in moved])
+            box = numbers([round(float(v), 1) for v in moved])
         notes = (*photo.notes, *["undistorted"] * camera.distorts)
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
     def _open_again(self, shot: Shot, view: View | None) -> Shot:
-        """A photograph with another camera; its box and its result stay unless distortion is removed, or no longer is,
-        its result not with another row of a rig."""
+        """A photograph with another camera, or row of a rig. Its box stays unless distortion is removed, or no longer
+        is; its result only where no rig is concerned."""
         opened = self._opened(shot.path, None, view)
         if opened.is_undistorted or shot.is_undistorted:
             return opened
@@ -157,7 +157,7 @@ class Session:
         except CurviregError as error:
             self.rig = ()
             subject = str(error.subject or "").replace(f"{folder}/", "")
-            raise error.with_subject(subject.replace(str(path), "scene_camera.json")) from error
+            raise error.with_subject(subject.replace(str(path), self.rig_name)) from error
         self._replace_shots(shots)
 
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
@@ -171,16 +171,25 @@ class Session:
         shot = shot or self.shot
         return [shot] if shot.view is None else [one for view in self.rig for one in self.shots if one.view is view]
 
+    @property
+    def rig_name(self) -> str:
+        """What the user calls the rig."""
+        path = self.rig_path
+        return "" if path is None else "scene_camera.json" if path.is_dir() else path.name
+
     def rig_gaps(self) -> str:
         """Which photographs of the rig are not open, and which are not of it, in words."""
-        if not self.rig or self.rig_path is None:
+        if not self.rig:
             return ""
         used = {_key(shot.path) for shot in self.shots if shot.view is not None}
         missing = [view.photo.name for view in self.rig if _key(view.photo) not in used]
         others = [shot.path.name for shot in self.shots if shot.view is None]
-        lines = [f"not open: {_listed(missing)}; drop them here" + ", or go on without" * bool(used)] if missing else []
-        lines += [f"not in the rig: {_listed(others)}; registered alone, remove or rename them"] if others else []
-        return "; ".join(lines)
+        gaps = []
+        if missing:
+            gaps.append(f"not open: {_listed(missing)}; drop what is missing here" + ", or go on without" * bool(used))
+        if others:
+            gaps.append(f"not in the rig: {_listed(others)}; registered alone")
+        return "; ".join(gaps)
 
     def set_camera(self, camera: Numbers | Camera | None = None, guess: str | float | None = None) -> None:
         """Change the camera of all photographs that have none in a rig: four numbers, a calibrated one, or a guess.
@@ -190,8 +199,7 @@ class Session:
         before, self.options = self.options, replace(self.options, camera=camera, guess=guess)
         try:
             calibrated = isinstance(camera, Camera) or isinstance(before.camera, Camera)
-            again = [calibrated and shot.view is None for shot in self.shots]
-            shots = [self._open_again(shot, None) if a else shot for shot, a in zip(self.shots, again, strict=True)]
+            shots = [self._open_again(shot, None) if calibrated and not shot.view else shot for shot in self.shots]
         except CurviregError:
             self.options = before
             raise
@@ -275,10 +283,9 @@ class Session:
         if self.shot.view is None:
             return "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
         shots = self.together()
-        drawn = any(shot.box != (shot.view and shot.view.box and _box(shot.view.box)) for shot in shots)
-        if self.rig_path is None or (drawn and not shots[0].is_undistorted) or len(shots) < len(self.rig):
+        if self.rig_path is None or len(shots) < len(self.rig) or not all(shot.has_box_of_view for shot in shots):
             return ""
-        return _command_line(self.request(), self.name, self.rig_path)
+        return _command_line(self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name)
 
     def register(self) -> Registration:
         """Find the pose in the photograph that is shown, as ``curvireg register`` does, or in those of its rig."""
@@ -324,15 +331,13 @@ class Session:
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
     ) -> tuple[Found, list[Tensor | None]]:
-        assert self.rig_path is not None
         views = []
         for shot in shots:
             assert shot.view is not None
             assert shot.photo is not None
             camera = Camera(shot.view.camera.at(shot.size).matrix, size=shot.size)
             views.append(replace(shot.view, photo=shot.path, box=shot.box, camera=camera, image=shot.photo.image))
-        path = Path(self.name(self.rig_path))
-        registration, document, photographs = register_rig(path, views, registrar, bank_seconds=seconds)
+        registration, document, photographs = register_rig(Path(self.rig_name), views, registrar, bank_seconds=seconds)
         document["mesh"] = self.name(request.meshes[0])
         for row, shot in zip(document["views"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
@@ -415,11 +420,6 @@ class Session:
         return self._registrar[1]
 
 
-def _box(numbers: Sequence[float]) -> Numbers:
-    x0, y0, x1, y1 = map(float, numbers)
-    return x0, y0, x1, y1
-
-
 def _key(photo: Path) -> str:
     """What files of one photograph have in common: those of BOP sets have different suffixes."""
     return photo.stem.lower()
@@ -429,11 +429,10 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: Path | None = None) -> str:
+def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:
     """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
-    words = ["curvireg", "register", *([] if rig is None else ["--views", name(rig)])]
-    for paths, placeholder in ((() if rig else options.photos, "PHOTO"), (options.meshes, "MESH")):
-        words += list(map(name, paths)) or [placeholder] * (rig is None or placeholder == "MESH")
+    words = ["curvireg", "register", *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"])]
+    words += list(map(name, options.meshes)) or ["MESH"]
     limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
     values: dict[str, Any] = {
         "box": options.box,

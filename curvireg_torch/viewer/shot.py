@@ -20,7 +20,7 @@ from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 
-__all__ = ["Answer", "Numbers", "Point", "Result", "Shot", "dragged_box"]
+__all__ = ["Answer", "Numbers", "Point", "Result", "Shot", "dragged_box", "numbers"]
 
 MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
@@ -132,6 +132,14 @@ class Shot:
         return self.photo is not None and "undistorted" in self.photo.notes
 
     @property
+    def has_box_of_view(self) -> bool:
+        """Whether the box is that of the row of the rig, and was not drawn."""
+        given = None if self.view is None or self.view.box is None else numbers(self.view.box)
+        if given is not None and self.is_undistorted:
+            return self.box is not None and self.box_before is None
+        return self.box == given
+
+    @property
     def answer(self) -> Answer | None:
         """The chosen answer of the result."""
         return None if self.result is None else self.result.answer
@@ -218,6 +226,12 @@ class Shot:
         if result.photographs:
             return views_picture(result.registrar, answer.registration(result.registration), result.photographs)
         return png(contour_overlay(result.registrar, answer.pose, self.photo.image, self.found_box))
+
+
+def numbers(box: Sequence[float]) -> Numbers:
+    """A box as four numbers."""
+    x0, y0, x1, y1 = map(float, box)
+    return x0, y0, x1, y1
 
 
 def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:

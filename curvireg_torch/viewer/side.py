@@ -109,7 +109,7 @@ class Answers:
         if shot.view is not None:
             for row in document["views"]:
                 counts = "" if row["similarity"] is None else f"prefers the pose by {row['contribution']:.2f}"
-                lines.append(f"{self.session.name(row['photo'])}: {row['failure'] or counts or 'as the pose says'}")
+                lines += [f"{self.session.name(row['photo'])}: {said}" for said in [row["failure"] or counts] if said]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
         self.repairs.clear()

@@ -119,8 +119,7 @@ def found(rig, tmp_path_factory):
 def test_photographs_of_no_row_and_rows_without_photograph_are_named(found):
     _, session = found
     assert session.rig_gaps() == (
-        "not open: 1.png; drop them here, or go on without; not in the rig: other.png; registered alone, remove or "
-        "rename them"
+        "not open: 1.png; drop what is missing here, or go on without; not in the rig: other.png; registered alone"
     )
     other, first, last = session.shots
     assert [shot.result is first.result for shot in (other, first, last)] == [False, True, True]
@@ -220,11 +219,13 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     send(workspace, folder, "1.png", "truck.safetensors")
     assert [shot.is_undistorted for shot in session.shots] == [True, True]
     assert session.shots[0].box != tuple(rows[0][1:5])
+    send(workspace, folder, "2.png")
+    assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
     assert session.options.camera is None
     search(workspace)
     assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0]
     asyncio.run(workspace.remove_rig())
-    assert [shot.is_undistorted for shot in session.shots] == [False, False]
+    assert [shot.is_undistorted for shot in session.shots] == [False, False, False]
 
 
 def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
@@ -247,7 +248,7 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert workspace.messages["rig"].startswith("images.txt: ")
     send(workspace, tmp_path, "cameras.txt")
     assert (workspace.messages, len(session.together())) == ({}, 2)
-    assert session.rig_gaps() == "not open: 2.png; drop them here, or go on without"
+    assert session.rig_gaps() == "not open: 2.png; drop what is missing here, or go on without"
     example_mesh().apply_scale(1000.0).export(tmp_path / "obj_000005.ply")
     send(
         workspace, tmp_path, "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
@@ -255,3 +256,7 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert (workspace.messages, session.options.unit) == ({}, "mm")
     assert [shot.path.name for shot in session.together()] == ["000000.png"]
     assert session.shot.box == (5.0, 6.0, 25.0, 36.0)
+    send(workspace, tmp_path, "000001.png", "000002.png")
+    assert session.command() == "curvireg register --views SCENE obj_000005.ply --unit mm --out result"
+    session.shot.set_box((6.0, 6.0, 25.0, 36.0))
+    assert session.command() == ""
