@@ -34,10 +34,8 @@ def build_page(workspace: Workspace) -> None:
     text("a", "To the photograph", "skip", href="#work")
     ui.dark_mode(None)
     with region("header", "top"):
-        with region("div"):
-            text("h1", "curvireg")
-            text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
-        button("Sample", workspace.load_sample, "sample-again", "quiet")
+        text("h1", "curvireg")
+        text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
     with region("div", "work", id="work"):
         stage = Stage(workspace)
         with region("div", "side"):
@@ -120,7 +118,7 @@ class Steps:
         set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
         self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
-        self.no_photo.set_visibility(len(session.shots) > 1)
+        self.no_photo.set_visibility(shot.photo is not None)
         self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
         words = "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"
         set_text(self.find, words if shot.view is None else f"Find the pose in {counted}")
