@@ -135,7 +135,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     assert workspace.mesh_facts.endswith(" ft, rendered in grey")
 
 
-def test_the_pose_of_the_sample_is_right(workspace):
+def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     """Outline of the cup and its handle, marked by eye in the photograph, in px."""
     marked = [
         (173, 116),
@@ -149,6 +149,7 @@ def test_the_pose_of_the_sample_is_right(workspace):
         (302, 283),
     ]
     handle = [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
     assert result.reliable
