@@ -67,7 +67,7 @@ class Answers:
         document = {"result.json": lambda: to_json(session.document()).encode()}
         make = {"picture": session.shot.overlay, "pose.glb": session.shot.glb, **document}[kind]
         if content := await self.workspace.run("pose", make):
-            ui.download.from_url(self.workspace.serve(name, content, media_type), name)
+            ui.download.from_url(f"./{self.workspace.serve(name, content, media_type)}", name)
 
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""

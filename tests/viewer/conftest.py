@@ -52,7 +52,8 @@ def address(folder, request):
             server.kill()
             server.wait()
         server.stdout.close()
-    assert (server.returncode, (folder / "log").read_text().count("Traceback")) == (0, 0)
+    log = (folder / "log").read_text().replace("WARNING:  Invalid HTTP request received.\n", "")  # one test sends it
+    assert (server.returncode, log) == (0, "")
     assert not list((folder / "temporary").glob("curvireg-view-*")), "the server removes its folder"
 
 
