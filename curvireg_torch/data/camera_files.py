@@ -84,7 +84,7 @@ def _content(file: Path) -> dict[str, Any]:
         raise InvalidInputError(f"not a text file; expected {_FORMATS}") from error
     except (ValueError, RecursionError, ElementTree.ParseError) as error:
         raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
-    return _colmap(text) if re.search(r"^\d+ [A-Z_]+ \d+ \d+ ", text, re.MULTILINE) else _yaml(text)
+    return _colmap(text) if re.search(r"^\d+ [A-Z_]+ ", text, re.MULTILINE) else _yaml(text)
 
 
 def _chosen(content: dict[str, Any], name: str) -> Camera:

@@ -3,9 +3,10 @@
     python scripts/robustness/wrong_inputs.py                    # command lines with one mistake, then damaged files
     python scripts/robustness/wrong_inputs.py --damaged 5000     # more damaged files
 
-``CASES`` holds command lines with one mistake each, and the word that the message must contain. Damaged files are good
-photographs, meshes, cameras, banks and lists with bytes changed, cut, doubled or removed at random. Each runs in a
-process with limits on time and memory. The record is scripts/results/wrong_inputs.json; exit code 1 if anything failed.
+wrong_inputs.txt lists command lines, and files with one mistake each, and what the message must contain. Damaged files
+are good photographs, meshes, cameras, banks and lists with bytes changed, cut, doubled or removed at random. Each runs
+in a process with limits on time and memory. The record is scripts/results/wrong_inputs.json; exit code 1 if anything
+failed.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import json
 import re
 import resource
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -25,73 +27,115 @@ from typing import Any
 import cv2
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from scripts._shared import RESULTS, commit, today, write_json
 
 SECONDS, MEGABYTES = 20.0, 4000
 """Processor seconds and memory that a command may take."""
 
-CASES = """
-register lost.png truck.ply BOX => lost.png
-register text.jpg truck.ply BOX => text.jpg
-register empty.png truck.ply BOX => empty.png
-register cut.png truck.ply BOX => cut.png
-register flat.png truck.ply BOX => flat.png
-register truck.ply truck.ply BOX => truck.ply
-register photo.png lost.ply BOX => lost.ply
-register photo.png text.obj BOX => text.obj
-register photo.png nan.obj BOX => nan.obj
-register photo.png points.obj BOX => points.obj
-register photo.png cut.ply BOX => cut.ply
-register photo.png truck.step BOX => truck.step
-register photo.png truck.ply --box 1 2 3 => --box
-register photo.png truck.ply --box 90 90 10 10 => box
-register photo.png truck.ply --box nan 2 30 40 => box
-register photo.png truck.ply --box 9000 9000 9100 9100 => box
-register photo.png truck.ply BOX --camera 0 0 1 1 => camera
-register photo.png truck.ply BOX --camera lost.json => lost.json
-register photo.png truck.ply BOX --camera text.jpg => text.jpg
-register photo.png truck.ply BOX --unit furlong => --unit
-register photo.png truck.ply BOX --pose sideways => --pose
-register photo.png truck.ply BOX --side bottomleft => --side
-register photo.png truck.ply BOX --preset best => --preset
-register photo.png truck.ply BOX --pipeline text.jpg => text.jpg
-register photo.png truck.ply BOX --start lost.json => lost.json
-register photo.png truck.ply BOX --distanc 3 => --distanc
-register photo.png truck.ply BOX --device quantum => --device
-register --list lost.csv truck.ply => lost.csv
-register --list text.jpg truck.ply => text.jpg
-evaluate bop lost => lost
-evaluate bop empty => empty
-evaluate pascal3d empty => empty
-evaluate web empty => empty
-evaluate bop empty --protocol box=often => --protocol
-evaluate kitti empty => kitti
-follow lost.mp4 truck.ply => lost.mp4
-follow text.jpg truck.ply --camera 260 260 119.5 89.5 => text.jpg
-bank lost.ply => lost.ply
-frobnicate => frobnicate
-"""
+GOOD_FILES = {
+    "cam.yml": """%YAML:1.0
+---
+image_width: 240
+image_height: 180
+camera_matrix: !!opencv-matrix
+   data: [260., 0., 119.5, 0., 260., 89.5, 0., 0., 1.]
+distortion_coefficients: [-0.25, 0.1, 0., 0., 0.]
+""",
+    "chain.yaml": """cam0:
+  camera_model: pinhole
+  distortion_model: radtan
+  distortion_coeffs: [-0.25, 0.1, 0, 0, 0]
+  intrinsics: [260, 260, 119.5, 89.5]
+cam1:
+  intrinsics: [260, 260, 119.5, 89.5]
+""",
+    "cameras.txt": "1 PINHOLE 240 180 260 260 120 90\n2 OPENCV 240 180 260 260 120 90 -0.25 0.1 0 0\n",
+    "camera.json": '{"fx": 260, "fy": 260, "cx": 119.5, "cy": 89.5}',
+    "camera.xml": "<a><camera_matrix><data>260 0 119.5 0 260 89.5 0 0 1</data></camera_matrix></a>",
+    "images.txt": "1 1 0 0 0 0 0 0 1 0.png\n\n",
+    "photos.csv": "photo,x0,y0,x1,y1\n0.png,95,54,197,148\n",
+    "start.json": '{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 3]}',
+    "scene/scene_camera.json": '{"0": {"cam_K": [260, 0, 119.5, 0, 260, 89.5, 0, 0, 1], '
+    '"cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}}',
+}
+
+
+COMMANDS = {
+    "rig.csv": "register --views {} truck.ply",
+    "images.txt": "register --views {} truck.ply",
+    "scene/scene_camera.json": "register --views {folder} truck.ply",
+    "photos.csv": "register --list {} truck.ply",
+    "start.json": "register photo.png truck.ply --camera camera.json --start {}",
+}
+"""The commands that read the good files which are no calibrations."""
+
+
+def cases(folder: Path) -> list[tuple[str, str]]:
+    """Write the inputs of wrong_inputs.txt into a folder; command lines, and what their messages must contain."""
+    write_files(folder)
+    (folder / "good" / "scene").mkdir(parents=True)
+    write_rig(folder / "good")
+    found = []
+    rows = Path(__file__).with_suffix(".txt").read_text(encoding="utf-8").splitlines()
+    for number, row in enumerate(row for row in rows if row and row[0] != "#"):
+        line, expected = row.split(" => ")
+        if line.count("|") == 2:
+            name, old, new = (part.strip() for part in line.split("|"))
+            place, file = folder / f"bad{number}", name.partition(":")[0]
+            shutil.copytree(folder / "good", place)
+            text = (place / file).read_text()
+            assert old == "*" or old in text, row
+            (place / file).write_text(new if old == "*" else text.replace(old, new))
+            command = COMMANDS.get(file, "register photo.png truck.ply BOX --camera {}")
+            line = command.format(f"{place.name}/{name}", folder=f"{place.name}/{Path(name).parent}")
+        line += " --out out.safetensors" if line.startswith("bank") else "" if line.startswith("view") else " --out out"
+        found.append((line.replace("BOX", "--box 30 25 210 160"), expected))
+    return found
+
+
+def write_rig(folder: Path) -> None:
+    """Write good calibrations, and a rig of photographs of the example mesh, two of which are equal."""
+    from curvireg_torch.synthetic import demo_scene
+
+    rows = ["photo,x0,y0,x1,y1,camera,qw,qx,qy,qz,tx,ty,tz"]
+    for name, seed, box in (("0.png", 2, "95,54,197,148"), ("1.png", 7, "75,59,208,155"), ("2.png", 2, ",,,")):
+        scene = demo_scene(seed)
+        write_picture(folder / name, scene.image)
+        quaternion = Rotation.from_matrix(scene.truth[:3, :3].numpy()).as_quat(scalar_first=True)
+        shift = [f"{v:.9f}e+00" for v in scene.truth[:3, 3].tolist()]
+        rows.append(",".join([name, box, "camera.json", *map(str, quaternion), *shift]))
+    for name, text in {**GOOD_FILES, "rig.csv": "\n".join(rows)}.items():
+        (folder / name).write_text(text)
+
+
+def write_picture(path: Path, image: Tensor) -> None:
+    """Write a generated photograph of a quarter of its size."""
+    pixels = (255 * image.permute(1, 2, 0).flip(2).numpy()).round().astype(np.uint8)
+    cv2.imwrite(str(path), cv2.resize(pixels, (240, 180), interpolation=cv2.INTER_AREA))
 
 
 def write_files(folder: Path) -> None:
     """Write good and wrong inputs."""
+    import curvireg_torch as cr
     from curvireg_torch.synthetic import demo_scene, example_mesh
 
-    scene = demo_scene()
-    pixels = (255 * scene.image.permute(1, 2, 0).flip(2).numpy()).round().astype(np.uint8)
-    cv2.imwrite(str(folder / "photo.png"), cv2.resize(pixels, (240, 180), interpolation=cv2.INTER_AREA))
+    write_picture(folder / "photo.png", demo_scene().image)
     cv2.imwrite(str(folder / "photo.jpg"), cv2.imread(str(folder / "photo.png")))
     cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
     for name in ("truck.ply", "truck.obj", "truck.stl", "truck.off", "truck.glb"):
         example_mesh().export(folder / name)
-    (folder / "camera.json").write_text('{"fx": 260, "fy": 260, "cx": 119.5, "cy": 89.5}')
+    views = cr.sample_views(azimuth_step=90, elevations=[20])
+    cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False).save(folder / "truck.safetensors")
+    (folder / "camera.json").write_text(GOOD_FILES["camera.json"])
     (folder / "photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.png,30,25,210,160\n")
     for name in ("text.jpg", "text.obj", "truck.step"):
         (folder / name).write_text("not what the name says")
     (folder / "empty.png").touch()
     (folder / "empty").mkdir()
-    for name in ("photo.png", "truck.ply"):
+    for name in ("photo.png", "truck.ply", "truck.safetensors"):
         data = (folder / name).read_bytes()
         (folder / name.replace("photo", "cut").replace("truck", "cut")).write_bytes(data[: len(data) // 2])
     (folder / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -110,11 +154,8 @@ def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
 
     ``expected`` must occur in the message; None accepts a result as well.
     """
-    box = "--box 30 25 210 160"
-    words = shlex.split(line.replace("BOX", box))
-    words += ["--out", "out.safetensors" if line.startswith("bank") else "out"]
     start = time.perf_counter()
-    command = [sys.executable, "-m", "curvireg_torch", *words]
+    command = [sys.executable, "-m", "curvireg_torch", *shlex.split(line)]
     limit: dict[str, Any] = {"timeout": 10 * SECONDS, "preexec_fn": limited}
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=folder, **limit)
@@ -148,15 +189,14 @@ def damage(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 DAMAGED = {
-    "photo.png": "register {} truck.ply BOX",
-    "photo.jpg": "register {} truck.ply BOX",
-    "truck.ply": "register photo.png {} BOX",
-    "truck.obj": "register photo.png {} BOX",
-    "truck.stl": "register photo.png {} BOX",
-    "truck.off": "register photo.png {} BOX",
-    "truck.glb": "register photo.png {} BOX",
-    "camera.json": "register photo.png truck.ply BOX --camera {}",
-    "photos.csv": "register --list {} truck.ply",
+    "photo.png": "register {} --out out truck.ply --box 30 25 210 160",
+    "photo.jpg": "register {} --out out truck.ply --box 30 25 210 160",
+    **{
+        f"truck.{kind}": "register photo.png {} --out out --box 30 25 210 160"
+        for kind in ("ply", "obj", "stl", "off", "glb", "safetensors")
+    },
+    "camera.json": "register photo.png truck.ply --box 30 25 210 160 --camera {} --out out",
+    "photos.csv": "register --list {} --out out truck.ply",
 }
 """Files that are damaged, and the command that reads them."""
 
@@ -169,9 +209,8 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor(options.jobs) as pool:
         folder = Path(temporary)
-        write_files(folder)
-        cases = [tuple(line.split(" => ")) for line in CASES.strip().splitlines()]
-        answers = list(pool.map(lambda case: answer(case[0], folder, case[1]), cases))
+        wrong = cases(folder)
+        answers = list(pool.map(lambda case: answer(case[0], folder, case[1]), wrong))
         lines = []
         for k in range(options.damaged):
             rng = np.random.default_rng(k)
@@ -181,7 +220,7 @@ def main() -> int:
             lines.append(DAMAGED[name].format(damaged.name))
         answers += pool.map(lambda line: answer(line, folder, None), lines)
     failures = [found for found in answers if "failure" in found]
-    record = {"date": today(), "commit": commit(), "cases": len(cases), "damaged": len(lines)}
+    record = {"date": today(), "commit": commit(), "cases": len(wrong), "damaged": len(lines)}
     record |= {"codes": Counter(str(found["code"]) for found in answers), "failures": failures}
     write_json(options.out, record)
     print(json.dumps(record, indent=2))

@@ -147,50 +147,6 @@ def test_list_names_what_failed(register_list, capsys, monkeypatch):
     assert last.startswith("3 photographs: 1 ok, 2 failed")
 
 
-@pytest.mark.parametrize(
-    ("content", "messages"),
-    [
-        (None, ["no such file"]),
-        (b"", ["no column"]),
-        (b"photo,x0,y0,x1,y1\n\n", ["no photographs"]),
-        (b"a.png,1,2,3,4\n", ["no column photo"]),
-        (b"photo;x0;y0;x1;y1\na.png;1;2;3;4\n", ["no column", "commas"]),
-        (b"photo,x0,y0,x1\na.png,1,2,3\n", ["no column y1"]),
-        (b"photo,x0,y0,x1,y1,x0\na.png,1,2,3,4,5\n", ["two columns x0"]),
-        (b"photo,x0,y0,x1,y1,status\na.png,1,2,3,4,5\n", ["status", "rename"]),
-        (b"photo,x0,y0,x1,y1,found_mesh\na.png,1,2,3,4,5\n", ["found_mesh", "rename"]),
-        (b"photo,x0,y0,x1,y1\n\xff.png,1,2,3,4\n", ["UTF-8"]),
-        (b'photo,x0,y0,x1,y1\n"a.png,1,2,3,4\n', ["not CSV"]),
-        (b"photo,x0,y0,x1,y1\n" + b"a" * 140_000 + b",1,2,3,4\n", ["not CSV", "field larger"]),
-    ],
-)
-def test_list_reports_unusable_files_in_one_line(register, refused, tmp_path, content, messages):
-    path = tmp_path / "list.csv"
-    if content is not None:
-        path.write_bytes(content)
-    refused(register("--list", path, "truck.ply"), path.name, *messages)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--list", "a.csv", "a.stl", "b.stl"], "at most one MESH"),
-        (["--views", "rig.csv", "a.stl", "--list", "a.csv"], "neither --list nor --start"),
-        (["--views", "rig.csv", "a.stl", "--fov", "50"], "the rig holds the cameras"),
-        (["--list", "a.csv", "a.stl", "--box", "1", "2", "3", "4"], "leave --box"),
-        (["a.jpg"], "expected PHOTO MESH"),
-        (["--mesh", "a.stl"], "expected PHOTO MESH"),
-        (["a.jpg", "a.stl", "--bogus", "3"], "unrecognized arguments: --bogus"),
-        (["a.jpg", "a.stl", "--camera", "exif", "--fov", "50"], "expected one of --camera"),
-        (["a.jpg", "a.stl", "--box", "1", "2", "3", "4", "--instances", "2"], "applies only without a box"),
-    ],
-)
-def test_parse_refuses_options_that_exclude_each_other(register, words, message, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        register(*words)
-    assert message in capsys.readouterr().err
-
-
 LIMITED = [
     # column, cell, part of the message or the prior in the result
     ("azimuth", "140 220", {"azimuth": [140.0, 220.0], "elevation": [-10.0, 80.0]}),

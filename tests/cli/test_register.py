@@ -66,71 +66,10 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
     assert float(rotation_error(rotation(document()), scene(0)[2][:3, :3] @ up_rotation(up))) < 15
 
 
-@pytest.fixture(scope="module")
-def broken_files(folder):
-    (folder / "empty.obj").write_text("")
-    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    (folder / "nan.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n")
-    (folder / "broken.safetensors").write_bytes((folder / "truck.safetensors").read_bytes()[:1000])
-
-
-@pytest.mark.parametrize(
-    ("files", "options", "messages"),
-    [
-        ({"mesh": "empty.obj"}, [], ["empty.obj"]),
-        ({"mesh": "points.obj"}, [], ["points.obj", "faces"]),
-        ({"mesh": "nan.off"}, [], ["nan.off", "NaN"]),
-        ({"photo": "text.jpg"}, [], ["text.jpg"]),
-        ({"mesh": "broken.safetensors"}, [], ["broken.safetensors", "build"]),
-        ({"box": ["5", "5", "5", "9"]}, [], ["X0 < X1"]),
-        ({"box": ["900", "5", "950", "9"]}, [], ["entirely outside"]),
-        ({"box": ["5", "5", "16.9", "90"]}, [], ["0.png", "11.9 px", "at least 12"]),
-        ({}, ["--device", "gpu"], ["--device: torch cannot use 'gpu' on this machine; choose from cpu"]),
-        ({}, ["--camera", "325", "242", "572", "573"], ["swap the halves: 572 573 325 242"]),
-        ({}, ["--camera", *CAMERA, "--distance", "2", "1"], ["distance: expected 0 < NEAR <= FAR"]),
-        ({}, ["--field", "none"], ["none"]),
-        ({}, ["--camera", "cam.yaml"], ["cam.yaml: no such file", "--camera exif"]),
-        ({}, ["--format", "ros"], ["--format ros: needs a camera"]),
-        ({}, ["--preset", "paper"], ["built with other settings"]),
-        ({}, ["--pose", "upright"], ["--pose"]),
-        ({}, ["--within", "10"], ["within: expected near"]),
-        ({}, ["--side", "left", "--azimuth", "0", "10"], ["side: give it or azimuth"]),
-        ({}, ["--front", "x"], ["limits nothing"]),
-        ({}, ["--distance", "1", "2"], ["--distance: needs a camera"]),
-        ({"box": ()}, ["--start", "none.json", "--side", "front"], ["--start: refines"]),
-    ],
-)
-@pytest.mark.usefixtures("broken_files")
-def test_register_reports_bad_input_in_one_line(register_one, refused, files, options, messages):
-    refused(register_one(*options, "--no-refine", **files), *messages)
-
-
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
     monkeypatch.setattr("curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened"))
     refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
     refused(register_one("--camera", "exif"), "0.png", "no focal length")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["register", "a.jpg", "b.stl", "--json", "--top", "-3"], "--top: expected a whole number of at least 1"),
-        (["register", "a.jpg", "b.stl", "--json", "--instances", "0"], "--instances: expected a whole number"),
-        (["register", "a.jpg", "b.stl", "--json", "--jobs", "1.5"], "at least 1, got '1.5'"),
-        (["register", "a.jpg", "b.stl", "--json", "--every", "0"], "--every: expected a whole number of at least 1"),
-        (["evaluate", "bop", "a", "--out", "b", "--limit", "0"], "--limit: expected a whole number of at least 1"),
-        (["view", "--port", "65536"], "--port: expected a whole number from 0 to 65535, got '65536'"),
-        (["register", "a.jpg", "b.stl", "--json", "--near", "10"], "--near: expected AZIMUTH ELEVATION [THETA]"),
-        (["register", "a.jpg", "b.stl", "--json", "--dist", "1", "2"], "unrecognized arguments: --dist"),
-        (["register", "a.jpg", "b.stl", "--json", "--box", "1,2", "3"], "--box: expected X0 Y0 X1 Y1, finite numbers"),
-        (["register", "a.jpg", "b.stl", "--json", "--camera", "1", "2", "3"], "or give FILE"),
-        (["view", "--port", "-1"], "--port: expected a whole number from 0 to 65535, got '-1'"),
-    ],
-)
-def test_wrong_options_are_named(capsys, words, message):
-    with pytest.raises(SystemExit, match="2"):
-        main(words)
-    assert message in capsys.readouterr().err
 
 
 def test_register_warns_of_a_questionable_camera(register_one, document, capsys):
@@ -201,19 +140,3 @@ def test_register_writes_that_the_object_is_lost(register_one, document, start, 
     assert register_one(*start(shift=100.0), box=()) == 2
     assert document()["status"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{}", "rotation: expected numbers"),
-        ('{"rotation": [[1, 0, 0]], "translation": [0, 0, 1]}', "rotation: expected 9 finite"),
-        ('{"rotation": [[2, 0, 0], [0, 1, 0], [0, 0, 1]], "translation": [0, 0, 1]}', "rotation"),
-        ("[]", "an object"),
-    ],
-)
-def test_register_refuses_a_damaged_start(folder, register_one, start, capsys, content, message):
-    options = start()
-    (folder / "start.json").write_text(content)
-    assert register_one(*options, box=()) == 2
-    assert message in capsys.readouterr().err

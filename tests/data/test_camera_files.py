@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from curvireg_torch import load_camera
-from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
+from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError
 
 K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
 D = np.array([[-0.31, 0.12, 0.001, -0.002, 0.03]])
@@ -167,55 +167,18 @@ def test_bop(tmp_path):
     check(load_camera(file), ())
 
 
-def replaced(old, new):
-    assert old in ROS
-    return ROS.replace(old, new)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("a.yaml", "", "no camera matrix; expected YAML, XML or JSON of OpenCV, camera_info"),
-        ("a.yaml", "just some words\n", "expected 'key: value', got 'just some words'"),
-        ("a.png", b"\x89PNG\r\n\x1a\n\xff\xfe", "not a text file; expected"),
-        ("a.yaml", ROS[: ROS.index("rows")], "expected 9 numbers, or fx, fy, cx, cy, got 0"),
-        ("a.yaml", replaced("238.5, 0, 0, 1]", "238.5, 0, 0, 1"), "a list without its '\\]'"),
-        ("a.yaml", replaced("520.5", "five"), "camera_matrix: expected finite numbers, got .*'five'"),
-        ("a.yaml", replaced("520.5", "-520.5"), "FX, FY > 0"),
-        (
-            "a.yaml",
-            replaced("plumb_bob", "double_sphere"),
-            "'double_sphere' is not supported; choose from none, pinhole",
-        ),
-        ("a.yaml", replaced("plumb_bob", "equidistant"), "expected 4 finite coefficients of the model 'fisheye'"),
-        ("a.yaml", replaced(", 0.03]", ", 0.03, 1, 1]"), "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
-        ("a.yaml", replaced("-0.31", ".inf"), "distortion_coefficients: expected finite numbers, got .*'.inf'"),
-        ("a.yaml", replaced("640", "640.5"), "size of the image: expected width and height"),
-        ("a.yaml", KALIBR.replace("pinhole", "omni"), "several cameras; choose one as FILE:NAME from cam0, cam1"),
-        ("a.yaml:cam0", KALIBR.replace("pinhole", "omni"), "'omni' is not supported"),
-        ("a.yaml:cam7", KALIBR, "no camera 'cam7'; choose one as FILE:NAME from cam0, cam1"),
-        ("cameras.txt", COLMAP, "several cameras; choose one as FILE:NAME from 1, 2, 3, 4, 5, 6"),
-        ("cameras.txt", "1 FOV 640 480 500 500 320 240 0.1\n", "line 1: expected CAMERA_ID MODEL .* got '1 FOV"),
-        ("cameras.txt", "1 PINHOLE 640 480 500 320 240\n", r"PINHOLE \(4\), .* got '1 PINHOLE 640 480 500 320 240'"),
-        ("cameras.txt", COLMAP + "7 [PINHOLE 640 480\n", r"line 10: expected CAMERA_ID MODEL .* got '7 \[PINHOLE"),
-        ("a.json", '{"fx": 500, ', "damaged, or no calibration"),
-        ("a.json", '{"fx": "500", "fy": 500, "cx": 320, "cy": 240}', "fx: expected finite numbers, got .*'500'"),
+        ("a.yaml", ROS.replace("plumb_bob", "double_sphere"), "'double_sphere' is not supported; choose from none"),
         ("a.json", '{"K": ' + "[" * 100_000 + "]" * 100_000 + "}", "damaged|nested too deeply"),
-        ("a.xml", "<opencv_storage><camera_matrix>", "damaged, or no calibration"),
         ("a.xml", "<a>" * 100_000 + "</a>" * 100_000, "damaged|nested too deeply"),
-        ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines entities"),
-        ("a.yaml", b" " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
+        ("a.yaml", " " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
     ],
 )
-def test_bad_files_say_what_is_wrong(tmp_path, name, content, words):
-    file = tmp_path / name.partition(":")[0]
-    file.write_bytes(content.encode() if isinstance(content, str) else content)
+def test_malicious_files_are_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_text(content)
     with pytest.raises(InvalidInputError, match=words) as error:
         load_camera(tmp_path / name)
     assert str(error.value).startswith(f"{tmp_path / name}: ")
     assert "--camera exif" in str(error.value)
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(MissingFileError, match="no such file; check the path of the calibration"):
-        load_camera(tmp_path / "cam.yaml:left")

@@ -61,45 +61,6 @@ def test_choices_agree_with_the_presets():
     assert choices.DEFAULT in PRESETS
 
 
-@pytest.fixture
-def files(tmp_path, monkeypatch):
-    """Empty files: none of them is read."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("photo.jpg", "part.stl", "bank.safetensors", "list.csv", "odd.part"):
-        Path(name).touch()
-    Path("shots").mkdir()
-
-
-MISPLACED = "where a photograph is expected"
-SWAPPED = "seem to be swapped: the photograph comes first, the mesh last"
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["register", "part.stl", "photo.jpg"], f"part.stl: a mesh {MISPLACED}; it and photo.jpg {SWAPPED}"),
-        (["register", "part.stl", "shots/*.jpg"], f"it and shots/*.jpg {SWAPPED}"),
-        (["register", "--list", "part.stl", "list.csv"], f"a mesh where a list is expected; it and list.csv {SWAPPED}"),
-        (["view", "part.stl", "photo.jpg"], f"it and photo.jpg {SWAPPED}"),
-        (["register", "photo.jpg", "part.stl", "bank.safetensors"], "several by --mesh"),
-        (["register", "photo.jpg", "shots"], "shots: a folder where a mesh is expected"),
-        (["register", "list.csv", "part.stl"], "give it as --list list.csv"),
-        (["register", "photo.jpg", "none.stl"], "none.stl: no such file; check the path of the mesh"),
-        (["register", "none.jpg", "part.stl"], "none.jpg: no such file; check the path of the photograph"),
-        (["register", "--list", "none.csv", "part.stl"], "none.csv: no such file; check the path of the list"),
-        (["register", "photo.jpg", "--mesh", "part.stl", "--mesh", "none.stl"], "none.stl: no such file"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)  # fmt: skip
-@pytest.mark.usefixtures("files")
-def test_check_given_reports_missing_and_swapped_files_in_one_line(words, message, capsys):
-    out = [] if words[0] == "view" else ["--out", "out"]
-    assert main([*words, *out]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-    assert not Path("out").exists()
-
-
 def test_options_accept_numbers_with_commas():
     arguments = parse(
         ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
