@@ -91,7 +91,8 @@ def cases(folder: Path) -> list[tuple[str, str]]:
             (place / file).write_text(new if old == "*" else text.replace(old, new))
             command = COMMANDS.get(file, "register photo.png truck.ply BOX --camera {}")
             line = command.format(f"{place.name}/{name}", folder=f"{place.name}/{Path(name).parent}")
-        line += " --out out.safetensors" if line.startswith("bank") else "" if line.startswith("view") else " --out out"
+        if "--out" not in line and not line.startswith("view"):
+            line += " --out out.safetensors" if line.startswith("bank") else " --out out"
         found.append((line.replace("BOX", "--box 30 25 210 160"), expected))
     return found
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from curvireg_torch.cli import parse
-from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation.benchmarks import detection_recall
 from curvireg_torch.pipeline import DEFAULT, PRESETS
 from tests.evaluation.small import SMALL
@@ -65,18 +65,6 @@ def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, ca
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.evaluate", lambda *_, **__: summary)
     evaluate(*words)
     assert "no box is annotated" in capsys.readouterr().out
-
-
-def test_evaluate_checks_options_before_any_work(pascal, bop, evaluate, tmp_path):
-    with pytest.raises(MissingFileError, match="no such folder"):
-        evaluate("pascal3d", tmp_path / "nowhere")
-    with pytest.raises(InvalidInputError, match="cad: expected one of"):
-        evaluate("pascal3d", pascal.root, "--protocol", "cad=all")
-    with pytest.raises(InvalidInputError, match="one mesh"):
-        evaluate("bop", bop.root, "--protocol", "cad=any")
-    with pytest.raises(SystemExit):
-        evaluate("bop", bop.root, "--preset", "best")
-    assert not (tmp_path / "out").exists()
 
 
 def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):

@@ -142,23 +142,6 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
     assert rows[0]["status"] == status
 
 
-@pytest.mark.parametrize(
-    ("words", "source", "message"),
-    [
-        (["--out", "OUT"], "shots", "give --camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov"),
-        (["--camera", *CAMERA], "shots", "give --out DIR, --show or --json"),
-        (["--camera", *CAMERA, "--out", "OUT"], "nowhere.mp4", "nowhere.mp4: no such folder or video; or give the"),
-        (["--camera", *CAMERA, "--out", "OUT"], "99", "99: no such camera"),
-        (["--camera", *CAMERA, "--out", "OUT"], "rtsp://127.0.0.1:9/none", "the stream cannot be opened"),
-        (["--camera", "exif", "--out", "OUT"], "turn.avi", "no focal length in EXIF, which only photographs have"),
-    ],
-)
-def test_follow_refuses_what_it_cannot_follow(follow, tmp_path, capsys, words, source, message):
-    words = [str(tmp_path) if word == "OUT" else word for word in words]
-    assert follow(*words, source=source) == 2
-    assert message in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
 def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
     """Ctrl-C is the usual end of a live video."""

@@ -136,17 +136,6 @@ def test_list_without_any_result_ends_with_code_2(register_list, refused, tmp_pa
     assert "no such file" in table(tmp_path / "out")[0]["message"]
 
 
-def test_list_names_what_failed(register_list, capsys, monkeypatch):
-    monkeypatch.setattr("curvireg_torch.cli.register.MAX_FAILURES", 1)
-    assert register_list("some.csv", HEADER, ["photos/0.png", *box_of(0)], ["a.png", *EMPTY], ["b.png", *EMPTY]) == 0
-    first, second, last = capsys.readouterr().out.splitlines()
-    assert first.startswith("failed: row 2: ")
-    assert first.count("a.png") == 1
-    assert "no such file" in first
-    assert second == "failed: 1 more"
-    assert last.startswith("3 photographs: 1 ok, 2 failed")
-
-
 LIMITED = [
     # column, cell, part of the message or the prior in the result
     ("azimuth", "140 220", {"azimuth": [140.0, 220.0], "elevation": [-10.0, 80.0]}),

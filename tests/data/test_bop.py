@@ -65,13 +65,6 @@ def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_inf
     assert sample["visib_fract"] != sample["visib_fract"]
 
 
-def test_bop_dataset_prefers_colour_to_grey(tree):
-    scene = tree[0] / "test" / "000001"
-    (scene / "gray").mkdir()
-    (scene / "gray" / "000000.tif").write_bytes(b"")
-    assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
-
-
 def test_targets_select_the_most_visible_instances(tree):
     for targets in (None, True):
         dataset = BOPDataset(tree[0], targets=targets)
@@ -127,11 +120,6 @@ def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change,
     with pytest.raises(InvalidInputError, match=rf"models_info\.json: .*{match}") as caught:
         BOPDataset(tree[0])
     assert len(str(caught.value)) < 500
-
-
-def test_targets_take_instances_of_unknown_visibility_last(tree):
-    edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
-    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible
 
 
 MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from curvireg_torch.data import Pascal3DPlus
-from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
+from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import HALF, pascal_object, write_pascal3d, write_record
 
@@ -100,20 +100,6 @@ def test_pascal3d_skips_invalid_cad_indices(tree):
         entry = pascal_object("car", cad_index=cad_index)
         write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
         assert Pascal3DPlus(tree[0], categories=["car"]).skipped["missing_mesh"] == 3
-
-
-def test_annotation_has_no_image(tree):
-    dataset = Pascal3DPlus(tree[0])
-    assert set(dataset[0]) - set(dataset.annotation(0)) == {"image"}
-    dataset.annotation(0)["box"].zero_()
-    assert dataset.annotation(0)["box"].sum() > 0, "a sample is a copy"
-    with pytest.raises(IndexError):
-        dataset[len(dataset)]
-
-
-def test_pascal3d_reports_damaged_photographs_on_access(pascal):
-    with pytest.raises(ImageError, match="2008_000003"):
-        [pascal[i] for i in range(len(pascal))]
 
 
 def test_pascal3d_reports_missing_files_with_advice(tree, tmp_path):

@@ -6,7 +6,6 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from torch import nn
 
 import curvireg_torch
 
@@ -79,29 +78,3 @@ def test_reference_lists_every_public_name() -> None:
     assert {name for name, _ in listed} == public - {"__version__"}
     for name, dotted in listed:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
-
-
-LAYERS = sorted(
-    {
-        found
-        for package in ("filters", "features")
-        for name in vars(import_module(f"curvireg_torch.{package}"))
-        if inspect.isclass(found := getattr(import_module(f"curvireg_torch.{package}"), name))
-        and issubclass(found, nn.Module)
-    },
-    key=lambda layer: layer.__name__,
-)
-
-
-@pytest.mark.parametrize("layer", LAYERS, ids=lambda layer: layer.__name__)
-def test_layer_docstrings_have_args_shape_and_example(layer: type[nn.Module]) -> None:
-    text = inspect.cleandoc(layer.__doc__ or "")
-    sections = dict(re.findall(r"^(\w+):\n((?:    .*\n?|\n)+)", text, flags=re.MULTILINE))
-    assert {"Args", "Shape", "Example"} <= set(sections)
-    described = {
-        name
-        for line in re.findall(r"^    (\w[\w, ]*):", sections["Args"], flags=re.MULTILINE)
-        for name in line.split(", ")
-    }
-    assert described == set(inspect.signature(layer).parameters)
-    assert ">>>" in sections["Example"]

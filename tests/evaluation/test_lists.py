@@ -8,20 +8,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
-from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, runner
 from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.runner import Entry
-from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import SIZE, scene, unrefined
+from tests._support.scenes import scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
@@ -78,66 +74,6 @@ def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(InvalidInputError, match="holds the evaluation of a dataset"):
         register_rows([entry], tmp_path, registrar)
-
-
-@pytest.mark.parametrize(
-    ("camera", "source"),
-    [
-        (CAMERA, "given"),
-        (replace(CAMERA, size=SIZE), "file"),
-        (LENS, "file"),
-        (50.0, "fov"),
-        ("exif", "exif"),
-        (None, None),
-    ],
-)
-def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
-    def with_covariance(image, box, K, **_):
-        (result,) = registrar(image, box, K)
-        assert isinstance(result, Registration)
-        best, *others = result.hypotheses
-        best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
-        return [replace(result, probabilities=(1.0,), hypotheses=(best, *others))]
-
-    class Certain:
-        bank, pipeline = registrar.bank, registrar.pipeline
-        is_exact, symmetries_of = registrar.is_exact, registrar.symmetries_of
-        of_model = registrar.of_model
-        __call__ = staticmethod(with_covariance)
-
-    photo = read_photo(entry.photo)
-    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
-    one = replace(entry, camera=camera)
-    result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
-    assert document["inputs"]["camera_source"] == source
-    known = source in ("given", "file")
-    assert document["covariance"] == (torch.eye(6).tolist() if known else None)
-    assert (document["standard_deviations"] is not None) == known
-    assert (result.translation is not None) == (source is not None)
-    json.dumps(document, allow_nan=False)
-
-
-def test_page_shows_reliable_results_first_and_failures_last(registrar, entry, tmp_path, monkeypatch):
-    """Equally reliable ones are ordered by confidence, then by their row."""
-    confidence = {"a": 0.3, "b": 0.95, "c": None, "d": 0.85, "e": 0.5, "f": 0.95}
-
-    def register_entry(one, photo, registrar, **_):
-        value = confidence[one.name]
-        if value is None:
-            raise InvalidInputError("dark")
-        result, document = original(replace(one, name="photo.png"), photo, registrar, bank_seconds=0.0)
-        return result, {**document, "confidence": value, "reliable": value >= 0.8}
-
-    shown = []
-    original = runner.register_entry
-    monkeypatch.setattr(runner, "register_entry", register_entry)
-    monkeypatch.setattr(lists, "write_sheet", lambda _path, _title, entries, **_: shown.extend(entries))
-    counts = register_rows([replace(entry, name=name) for name in confidence], tmp_path / "out", registrar)
-    assert [one.name for one in shown] == ["b", "f", "d", "e", "a", "c"]
-    assert [one.number for one in shown] == [2, 6, 4, 5, 1, 3]
-    assert [one.kind for one in shown] == ["reliable"] * 3 + ["doubtful"] * 2 + ["failed"]
-    assert shown[-1].caption == "dark"
-    assert (counts.ok, len(counts.failures), counts.reliable) == (5, 1, 3)
 
 
 def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):

@@ -48,16 +48,6 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
 
 
-def test_average_recall_worked_example() -> None:
-    errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
-    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of the ten.
-    assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
-    assert metrics.average_recall(errors, metrics.ADD_THRESHOLDS) == pytest.approx(2 / 5)
-    pixels = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf], dtype=torch.float64)
-    assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
-    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
-
-
 @pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
 def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
     for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
@@ -191,10 +181,3 @@ WRONG: dict[str, Callable[[], object]] = {
 def test_metrics_refuse_wrong_input(message: str) -> None:
     with pytest.raises(InvalidInputError, match=f"^{message}"):
         WRONG[message]()
-
-
-def test_metrics_of_empty_sets() -> None:
-    empty = torch.empty(0, dtype=torch.float64)
-    assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)
-    assert math.isnan(metrics.median_error(empty))
-    assert math.isnan(metrics.average_recall(empty, metrics.MSSD_THRESHOLDS))

@@ -3,7 +3,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import Protocol
 from curvireg_torch.evaluation.protocol import hint_of_truth, perturbed_box
 from curvireg_torch.geometry import rotation_from_viewpoint
@@ -27,28 +26,12 @@ def test_parse_and_str_are_inverse(words, text):
     assert Protocol.parse(text.split()) == protocol
 
 
-@pytest.mark.parametrize(
-    "word", ["cad=best", "pose", "box=0.5", "box=-0.1", "box=nan", "box=big", "seed=1.5", "mesh=1"]
-)
-def test_parse_refuses_bad_words(word):
-    with pytest.raises(InvalidInputError):
-        Protocol.parse([word])
-
-
 def test_perturbed_box_depends_on_key_and_seed():
     assert torch.equal(perturbed_box(BOX, Protocol(), "a"), BOX)
     boxes = [perturbed_box(BOX, Protocol(box=0.1, seed=seed), key) for key in "abc" for seed in (0, 1)]
     assert len({tuple(box.tolist()) for box in boxes}) == 6
     assert torch.equal(boxes[0], perturbed_box(BOX, Protocol(box=0.1), "a"))
     assert boxes[0].dtype == BOX.dtype
-
-
-def test_perturbed_box_fills_the_range():
-    offsets = torch.stack([perturbed_box(BOX, Protocol(box=0.1), str(i)) - BOX for i in range(400)])
-    fraction = offsets / torch.tensor([100.0, 50.0, 100.0, 50.0])
-    assert fraction.abs().max() <= 0.1
-    assert fraction.abs().amax(0).min() > 0.095
-    assert fraction.mean(0).abs().max() < 0.01
 
 
 @pytest.mark.parametrize("hint", ["azimuth:45", "azimuth:5", "pose:30"])
@@ -70,10 +53,3 @@ def test_hint_of_truth_is_none_without_truth_or_hint():
     eye = torch.eye(3, dtype=torch.float64)
     assert hint_of_truth(eye, eye, Protocol(), "a") is None
     assert hint_of_truth(torch.nan * eye, eye, Protocol(hint="pose:5"), "a") is None
-
-
-@pytest.mark.parametrize("hint", ["azimuth", "azimuth:x", "azimuth:0", "azimuth:180", "side:45"])
-def test_protocol_refuses_unknown_hints(hint):
-    with pytest.raises(InvalidInputError, match="hint"):
-        Protocol.parse([f"hint={hint}"])
-    assert str(Protocol.parse(["hint=azimuth:45"])) == "cad=annotated pose=upright box=annotated hint=azimuth:45 seed=0"

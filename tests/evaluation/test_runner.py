@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
-from curvireg_torch.errors import InvalidInputError, MeshError
+from curvireg_torch.errors import MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.runner import Entry, View, run_entries
-from curvireg_torch.evaluation.store import Workers, run_processes
+from curvireg_torch.evaluation.store import Workers
 
 
 @pytest.fixture
@@ -60,16 +60,6 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
     return labels
 
 
-def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
-    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
-    assert registered(entries, tmp_path / "out") == []
-    assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
-    for size in (2, 8):
-        parts = [Workers(rank, size).part(["0a", "1a", "0b", "1b"]) for rank in range(size)]
-        assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
-        assert size == 8 or len(parts[0]) == 2
-
-
 @pytest.mark.parametrize(
     ("name", "again"),
     [
@@ -102,14 +92,6 @@ def test_missing_photographs_are_tried_again(entries, tmp_path):
     assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
     assert registered(entries, tmp_path / "out") == ["0a", "0b"]
     assert registered.store.read("0a")["digests"]["photo"] == ""
-
-
-def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "summary.json").write_text("of other results")
-    assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
-    assert not (tmp_path / "out" / "summary.json").exists()
-    assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
 
 ENTRY = Entry(
@@ -149,13 +131,3 @@ def test_request_covers_other_views(name):
     values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
     other = replace(VIEWS[0], **{name: values.get(name, 2.0 * torch.eye(4))})
     assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request()
-
-
-def test_run_processes(monkeypatch, capfd):
-    assert not run_processes(1, ["evaluate"])
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
-    assert not run_processes(2, ["evaluate"])
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID")
-    with pytest.raises(InvalidInputError, match="a process ended with 1"):
-        run_processes(2, ["nonsense"])
-    assert "nonsense" in capfd.readouterr().err

@@ -21,7 +21,6 @@ from curvireg_torch.utils.checks import (
     check_pose,
     check_positive,
     check_rotation,
-    check_square_pixels,
 )
 
 CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -53,14 +52,6 @@ def test_check_camera_matrix_refuses_what_is_no_camera(bad: str) -> None:
     for call in (check_camera_matrix, lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K)):
         with pytest.raises(InvalidInputError, match="camera matrix: expected"):
             call(BAD_CAMERAS[bad])
-
-
-def test_check_square_pixels_accepts_ten_per_cent() -> None:
-    for ratio in (1.0 / 1.099, 1.0, 1.099):
-        check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
-    for ratio in (1.0 / 1.101, 1.101):
-        with pytest.raises(InvalidInputError, match="square"):
-            check_square_pixels(torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))]))
 
 
 R = POSE[:3, :3]

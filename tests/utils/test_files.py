@@ -4,15 +4,12 @@ import resource
 import signal
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import pytest
 import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
-from curvireg_torch.evaluation.runner import POSE_SOURCES
-from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
 from curvireg_torch.utils.files import (
     check_writable,
@@ -79,19 +76,6 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
     (tmp_path / "file").write_bytes(OLD)
     with pytest.raises(OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"):
         check_writable(tmp_path / "file", "--out")
-
-
-@pytest.mark.parametrize("command", ["demo --out {blocked}/out", "bank {folder}/mesh.ply --out {blocked}/a"])
-def test_commands_check_the_output_folder_before_they_work(
-    command: str, path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("matching.cached_bank", "mesh.load_mesh"):
-        monkeypatch.setattr(f"curvireg_torch.{name}", Mock(side_effect=AssertionError("work has started")))
-    (path.parent / "mesh.ply").write_bytes(OLD)
-    words = command.format(blocked=path, folder=path.parent).split()
-    assert main(words) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert error.startswith(f"curvireg: error: {words[-2]} {path}")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -168,11 +152,3 @@ def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(FileNotFoundError):
         code_digest("no_such_room")
     code_digest.cache_clear()
-
-
-@pytest.mark.parametrize("sources", [cache._SOURCES, POSE_SOURCES])
-def test_code_digests_of_banks_and_results_cover_all_that_decides_them(sources: tuple[str, ...]) -> None:
-    assert {"errors.py", "features", "filters", "geometry", "mesh", "rendering", "terms"} - {"errors.py"} <= set(
-        sources
-    )
-    assert len(code_digest(*sources)) == 16

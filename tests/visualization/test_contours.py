@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.visualization.contours import contour_layer, draw_box
+from curvireg_torch.visualization.contours import contour_layer
 
 FOCAL, SIZE = 200.0, 120
 CAMERA = torch.tensor([[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]])
@@ -57,19 +57,3 @@ def test_contour_layer_draws_occluding_edges_but_no_steep_plane():
     assert orange.any(axis=1).all()
     assert set(np.nonzero(orange)[1]) <= {58, 59, 60, 61}
     assert not colour(contour_layer(facing(3.0, 3.0), CAMERA), ORANGE).any()
-
-
-def test_contour_layer_leaves_out_specks():
-    bump = facing(0.0, 0.0)
-    bump[60:62, 60:62] = 4.0
-    bump[15, 15] = 6.0  # the depth range
-    assert not colour(contour_layer(bump, CAMERA), ORANGE)[30:90, 30:90].any()
-
-
-@pytest.mark.parametrize("background", [0, 128, 255])
-def test_draw_box_shows_on_any_background(background):
-    picture = np.full((100, 100, 3), background, np.uint8)
-    draw_box(picture, (20, 30, 70, 80))
-    assert picture[50, 20].tolist() == [255] * 3
-    assert picture[50, 19].tolist() == [0] * 3
-    assert picture[50, 45].tolist() == [background] * 3

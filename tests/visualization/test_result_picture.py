@@ -10,7 +10,6 @@ from curvireg_torch import Registrar
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import registration_sheet
-from curvireg_torch.visualization.overlay import VERDICT_COLOURS
 from tests._support.scenes import CAMERA, scene, truck_bank, unrefined
 
 GREEN = (0, 255, 80)
@@ -66,12 +65,3 @@ def test_registration_sheet_draws_rivals_at_their_poses(registered):
     rows, columns = np.nonzero((sheet != other).any(axis=2))
     assert np.ptp(rows) < SIDE, "nothing else changes"
     assert np.ptp(columns) < SIDE
-
-
-def test_registration_sheet_has_the_verdict_in_its_colour(registered):
-    registrar, result, image, box = registered
-    for confidence, verdict in ((0.95, "likely"), (0.899, "unsure"), (0.49, "unsure"), (0.45, "no match")):
-        answers = (confidence, *[0.01] * (len(result.hypotheses) - 1))
-        sheet = registration_sheet(registrar, replace(result, probabilities=answers), image, box)
-        found = [word for word, colour in VERDICT_COLOURS.items() if (sheet[720:] == colour).all(axis=2).sum() > 500]
-        assert found == [verdict]
