@@ -17,15 +17,10 @@ WRITTEN = ("scripts/results", "docs", "README.md")
 """Paths that scripts write to. A change there does not affect what a script measures."""
 
 
-def replace_between(text: str, begin: str, end: str, body: str) -> str:
-    """Return ``text`` with ``body`` in place of what stands between the two markers."""
-    return f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}"
-
-
 def update_page(page: Path, name: str, body: str) -> None:
     """Write ``body`` between the markers ``name:begin`` and ``name:end`` of a Markdown page."""
-    text = page.read_text(encoding="utf-8")
-    page.write_text(replace_between(text, f"<!-- {name}:begin -->", f"<!-- {name}:end -->", body), encoding="utf-8")
+    begin, end, text = f"<!-- {name}:begin -->", f"<!-- {name}:end -->", page.read_text(encoding="utf-8")
+    page.write_text(f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}", encoding="utf-8")
 
 
 def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:

@@ -2,21 +2,17 @@
 
     python scripts/results_table.py --record DIR/summary.json NAME    store a summary of ``curvireg evaluate`` as NAME
     python scripts/results_table.py                                   write the table into the README
-    python scripts/results_table.py --check                           exit 1 if the README's table is out of date
 
 A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted changes), so record
-it right after measuring. The table is between ``<!-- results:begin -->`` and ``<!-- results:end -->``.
+it right after measuring.
 """
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-from scripts._shared import REPOSITORY, RESULTS, commit, replace_between, today, write_json
-
-BEGIN, END = "<!-- results:begin -->", "<!-- results:end -->"
+from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 
 PASCAL3D = (
     "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median | s/object",
@@ -35,23 +31,14 @@ BOP = (
 LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are not independent
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name")
-    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if the README is out of date")
     arguments = parser.parse_args()
-    results, readme = RESULTS, REPOSITORY / "README.md"
     if arguments.record:
         print(record(Path(arguments.record[0]), arguments.record[1]))
-        return 0
-    text = readme.read_text(encoding="utf-8")
-    expected = replace_between(text, BEGIN, END, table(results))
-    if arguments.check:
-        if expected != text:
-            print(f"results_table: {readme} differs from {results}; run scripts/results_table.py", file=sys.stderr)
-        return int(expected != text)
-    readme.write_text(expected, encoding="utf-8")
-    return 0
+    else:
+        update_page(REPOSITORY / "README.md", "results", table(RESULTS))
 
 
 def record(summary: Path, name: str) -> Path:
@@ -72,9 +59,7 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            rows = [columns, " | ".join(["---"] * (columns.count("|") + 1))]
-            rows += [" | ".join(cells(r["name"], r["summary"])) for r in chosen]
-            body = "\n".join(f"| {row} |" for row in rows)
+            body = "\n".join(table_lines([columns.split(" | "), *(cells(r["name"], r["summary"]) for r in chosen)]))
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])
@@ -129,4 +114,4 @@ def seconds_each(summary: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

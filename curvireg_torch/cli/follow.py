@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
     from ..registration import FailedRegistration, Registrar, Registration
 
-FOLDER_FPS = 10.0
-"""Frames per second of the overlay of a folder, or of a camera that does not tell."""
+FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camera that does not tell
 
 STATUSES = ("ok", "unsure", "lost", "failed")
 

@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from ..evaluation.runner import Entry
     from ..registration import Registrar
 
-MAX_FAILURES = 10
-"""Photographs of a list that could not be registered, of which the command prints the reason."""
-
-NONE_RELIABLE, SOME_FAILED = 3, 4
-"""Exit codes of ``--strict``."""
+MAX_FAILURES = 10  # photographs of a list that could not be registered, of which the command prints the reason
+NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
 
 STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
@@ -36,8 +33,7 @@ WEAK_CONTOURS = 0.35
 """Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
 blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
 
-DOUBTFUL_SCORE = 0.5
-"""Probability below which the object is more likely absent from a detected box than there."""
+DOUBTFUL_SCORE = 0.5  # probability below which the object is more likely absent from a detected box than there
 
 
 def add_register(commands: Any) -> None:

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 _FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
 _SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
 _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
-MAX_THUMBNAILS = 20
-"""Pages of a TIFF before its full picture."""
+MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation

@@ -37,14 +37,9 @@ from .protocol import Protocol, hint_of_truth, perturbed_box, random_numbers
 from .runner import Entry, View
 from .store import Row
 
-MIN_IOU = 0.5
-"""Intersection over union from which a box is right."""
-
-UNOCCLUDED = 0.95
-"""Visible fraction above which an object of a BOP set counts as whole."""
-
-SAME_PLACE = 0.1
-"""Diameters within which the positions in the world of one instance agree, in different photographs."""
+MIN_IOU = 0.5  # intersection over union from which a box is right
+UNOCCLUDED = 0.95  # visible fraction above which an object of a BOP set counts as whole
+SAME_PLACE = 0.1  # diameters within which the positions in the world of one instance agree, in different photographs
 
 Errors = Mapping[str, Tensor]
 

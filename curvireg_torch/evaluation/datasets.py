@@ -27,11 +27,8 @@ __all__ = ["evaluate", "report"]
 NOT_EVALUATED = ("other_class", "no_target")
 """Reasons by which datasets leave out objects that are not to be evaluated; nothing is wrong with these."""
 
-SHOWN_EACH = 30
-"""Best objects on the page, and worst ones."""
-
-RIGHT_DEG = 30.0
-"""Error of the rotation below which the page calls a pose right."""
+SHOWN_EACH = 30  # best objects on the page, and worst ones
+RIGHT_DEG = 30.0  # error of the rotation below which the page calls a pose right
 
 
 def evaluate(

@@ -31,8 +31,7 @@ POSE_COLUMNS = (*("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
 """Columns of ``results.csv`` after those of the list."""
 
-BEST_MESH = "found_mesh"
-"""A last column, if rows have several meshes: the best of them."""
+BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 
 
 def _entry(

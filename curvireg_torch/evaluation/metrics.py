@@ -34,17 +34,10 @@ __all__ = [
     "symmetric_rotation_error",
 ]
 
-BOUNDING_POINTS = 300
-"""Points by which symmetries are compared before all points are."""
-
-_CHUNK = 1 << 22
-"""Points transformed at once: 50 MB of float32 coordinates."""
-
-ADD_THRESHOLDS = (0.1,)
-"""Diameters: a pose with a smaller ADD or ADD-S is right."""
-
-MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
-"""Diameters of BOP's average recall of MSSD."""
+BOUNDING_POINTS = 300  # points by which symmetries are compared before all points are
+_CHUNK = 1 << 22  # points transformed at once: 50 MB of float32 coordinates
+ADD_THRESHOLDS = (0.1,)  #: diameters: a pose with a smaller ADD or ADD-S is right
+MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))  #: diameters of BOP's average recall of MSSD
 
 MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
 """Image widths of BOP's average recall of MSPD: 5, 10, ..., 50 px times width / 640."""

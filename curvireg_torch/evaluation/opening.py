@@ -25,11 +25,8 @@ if TYPE_CHECKING:
     from ..registration import Registrar
     from .runner import Entry
 
-WITHIN = 45.0
-"""Degrees of ``within`` beside ``near`` if none are given."""
-
-QUALIFIERS = {"front"}
-"""Arguments of :class:`PosePrior` that limit nothing by themselves."""
+WITHIN = 45.0  # degrees of ``within`` beside ``near`` if none are given
+QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by themselves
 
 
 class Numbers:

@@ -27,8 +27,7 @@ from .runner import box_of_result, image_item_of, register_image
 
 __all__ = ["RegisteredPhotograph", "register"]
 
-THUMBNAIL_SIDE = 480
-"""Pixels of the overlay's longer side in a notebook."""
+THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
 
 
 @dataclass(frozen=True, repr=False)

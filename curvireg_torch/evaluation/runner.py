@@ -45,8 +45,7 @@ REPORTS = ("summary.json", "predictions.csv", "results.csv", "index.html")
 CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
 """How the command line takes a camera."""
 
-OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
-"""Opens the registrar of some mesh files."""
+OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]  # opens the registrar of some mesh files
 
 
 @dataclass(frozen=True)

@@ -6,23 +6,15 @@ from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 
-RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")
-"""Renderers."""
-
-DEFAULT = "learned"
-"""The default preset."""
-
-PRESET_NAMES = ("learned", "classical", "fast", "paper")
-"""Of :data:`curvireg_torch.pipeline.PRESETS`."""
-
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres per unit."""
+RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")  # renderers
+DEFAULT = "learned"  # the default preset
+PRESET_NAMES = ("learned", "classical", "fast", "paper")  # of :data:`curvireg_torch.pipeline.PRESETS`
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}  # metres per unit
 
 IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp")
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
-MESHES_AND_BANKS = (*MESHES, ".safetensors")
-"""Suffixes of file names, in lower case."""
+MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 
 MESH_KINDS = ("exact", "similar")
 """Whether a mesh is that of the photographed object itself, or of another one of its kind."""

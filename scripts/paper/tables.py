@@ -152,13 +152,11 @@ PHOTO_FIELDS: dict[str, Callable[[], nn.Module]] = {
 }
 """The paper's filters of photographs, by their names there."""
 
-CURVE_OFFSETS = tuple(range(-100, 100, 5))
-"""Degrees about the object's z axis: 40 views, the true one in the middle."""
+CURVE_OFFSETS = tuple(range(-100, 100, 5))  # degrees about the object's z axis: 40 views, the true one in the middle
 
 CURVE_DETECTORS = ("mfc", "mcs", "ig", "sift", "sobel")
 
-Scores = defaultdict[str, defaultdict[str, list[float]]]
-"""Values by category and column."""
+Scores = defaultdict[str, defaultdict[str, list[float]]]  # values by category and column
 
 
 def detector_tables(cases: list[Case], settings: BankSettings, eps_px: float, progress: bool = True) -> list[Table]:

@@ -32,8 +32,7 @@ from torch import Tensor
 
 from scripts._shared import RESULTS, commit, today, write_json
 
-SECONDS, MEGABYTES = 20.0, 4000
-"""Processor seconds and memory that a command may take."""
+SECONDS, MEGABYTES = 20.0, 4000  # processor seconds and memory that a command may take
 
 GOOD_FILES = {
     "cam.yml": """%YAML:1.0

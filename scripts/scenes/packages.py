@@ -8,8 +8,7 @@ from scripts.scenes.materials import random_colour, random_picture
 from scripts.scenes.surfaces import Rng
 from scripts.scenes.textured import Texture, TexturedMesh
 
-WIDTH, HEIGHT = 512, 256
-"""Size of a label in px."""
+WIDTH, HEIGHT = 512, 256  # size of a label in px
 
 SIDES, FONTS = 72, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 LETTERS = "ABCDEFGHIKLMNOPRSTUVZ"
