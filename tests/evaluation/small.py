@@ -1,4 +1,4 @@
-"""``python -m tests.evaluation.small WORDS``: the command line with a small bank, and a way to kill it.
+"""Short evaluations; ``python -m tests.evaluation.small WORDS`` is the command line with a small bank, and can be killed.
 
 ``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last bytes are lost.
 """
@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 from curvireg_torch.cli import main
+from curvireg_torch.evaluation import evaluate
 from curvireg_torch.pipeline import DEFAULT, PRESETS, BankSettings, Pipeline, ViewPolicy
+from tests._support.lists import lines
 
 SMALL = Pipeline(
     views=ViewPolicy(directions=18, theta_step=360.0, azimuth_step=60.0, elevations=(10.0,)),
@@ -18,6 +20,19 @@ SMALL = Pipeline(
     search=False,
     contours=False,
 )
+
+
+def run(benchmark, out, **options):
+    return evaluate(benchmark, out, progress=False, **options)
+
+
+def rows_of(benchmark, out):
+    rows = {row["key"]: row for row in lines(out)}
+    return {entry.key: rows[entry.key] for entry in benchmark.entries if entry.key in rows}
+
+
+def without_seconds(rows):
+    return {key: {name: v for name, v in row.items() if name != "seconds"} for key, row in rows.items()}
 
 
 def kill_in_write(count: int) -> None:

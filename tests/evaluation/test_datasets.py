@@ -16,8 +16,7 @@ from curvireg_torch.registration import Registrar
 from tests._support.lists import bop_poses
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
-from .helpers import rows_of, run, without_seconds
-from .small import SMALL
+from .small import SMALL, rows_of, run, without_seconds
 
 
 def test_evaluate_pascal3d(pascal, tmp_path):
@@ -99,12 +98,6 @@ def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
     with pytest.raises(RenderingError):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
-
-
-def test_selection_is_spread(pascal):
-    benchmark = Pascal3DBenchmark(pascal, Protocol())
-    assert benchmark.selection(2) == [0, 2]
-    assert benchmark.selection(9) == [0, 1, 2, 3, 4]
 
 
 @pytest.fixture

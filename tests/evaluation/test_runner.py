@@ -1,6 +1,5 @@
 """The loop over entries, with a function in place of the registration."""
 
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -12,7 +11,6 @@ from curvireg_torch import Camera, PosePrior
 from curvireg_torch.errors import MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.runner import Entry, View, run_entries
-from curvireg_torch.evaluation.store import Workers
 
 
 @pytest.fixture
@@ -28,13 +26,11 @@ def entries(tmp_path):
     return [Entry(photo=tmp_path / p, meshes=(tmp_path / m,), label=f"{p[0]}{m[0]}") for p, m in pairs]
 
 
-def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
-    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after`` of them."""
+def registered(entries, folder, *, settings=None):
+    """The labels of the entries that a run registers, in their order."""
     labels = []
 
     def register(entry, registrar, _, *, bank_seconds):
-        if len(labels) == stop_after:
-            raise KeyboardInterrupt
         labels.append(entry.label)
         assert str(registrar) == entry.meshes[0].name
         first = sum(label[1] == entry.label[1] for label in labels) == 1
@@ -48,13 +44,8 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with (
-            patch.object(runner, "workers", lambda: nullcontext(workers or Workers())),
-            patch.object(runner, "_row", register),
-        ):
+        with patch.object(runner, "_row", register):
             registered.store = run_entries(entries, folder, open_registrar, **options)
-    except KeyboardInterrupt:
-        assert stop_after is not None
     finally:
         torch.set_num_threads(threads)
     return labels

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
 
 from curvireg_torch.data import Video
 from curvireg_torch.errors import LostObjectError
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.visualization import OverlayVideo
-from curvireg_torch.visualization.contours import OUTLINE
 from curvireg_torch.visualization.video import annotated_frame
 from tests._support.scenes import CAMERA, scene, truck_registrar
 
@@ -19,22 +17,6 @@ LOST = FailedRegistration(LostObjectError("not near the start"))
 def registered():
     image, box, _ = scene(0)
     return image, truck_registrar()([image], box[None], CAMERA)[0]
-
-
-def outline_box(picture):
-    """Columns and rows between which the outline is drawn, 4 numbers."""
-    rows, columns = np.nonzero((picture == OUTLINE).all(axis=2))
-    return np.array([columns.min(), rows.min(), columns.max(), rows.max()])
-
-
-def test_contours_stand_at_the_pose(registered):
-    image, result = registered
-    T, K = result.projection
-    depth = truck_registrar().describer.renderer.render(T[None], K, image.shape[-2:])[0, 0].numpy()
-    rows, columns = depth.nonzero()
-    expected = np.array([columns.min(), rows.min(), columns.max(), rows.max()])
-    grey = torch.full_like(image, 0.5)
-    assert np.abs(outline_box(annotated_frame(truck_registrar(), grey, result)) - expected).max() <= 1
 
 
 def test_overlay_video_has_every_frame(registered, tmp_path):
