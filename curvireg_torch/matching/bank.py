@@ -116,7 +116,7 @@ class ViewBank:
             mesh: a mesh or the path of one.
             views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
-            renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
+            renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
             pipeline: default ``Pipeline()``.
             progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
             device: where views are filtered and described, and where the bank is stored.

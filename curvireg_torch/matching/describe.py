@@ -18,19 +18,12 @@ from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import MeshContours
 
-__all__ = ["DescribedViews", "ViewDescriber", "depth_filter", "hog_layer"]
-
-VIEWS_AT_A_TIME = 64
-"""Views in memory at a time."""
-
+VIEWS_AT_A_TIME = 64  # Views in memory at a time
+# Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel
 VIEW_FACES = 8000
-"""Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel."""
-
-EQUAL_VIEWS = 1e-6
-"""Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
-
+EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
+# Distances to step back so that a perspective view approximates parallel projection to a few per mille
 PARALLEL_DISTANCE = 20.0
-"""Distances to step back so that a perspective view approximates parallel projection to a few per mille."""
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
@@ -92,13 +85,13 @@ class ViewDescriber:
     ) -> None:
         self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
-        self.renderer = self.view_renderer = make_renderer(mesh, renderer, device=device)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
             self._simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
-            self.view_renderer = make_renderer(self._simple, renderer, device=device)
+            self.view_renderer = make_renderer(self._simple, renderer)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:

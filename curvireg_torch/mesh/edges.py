@@ -6,19 +6,10 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-__all__ = ["MeshEdges", "simplified"]
-
-WELD = 1e-6
-"""Vertices nearer than this fraction of the mesh's longest side are one."""
-
-CREASE_ANGLE = 15.0
-"""Degrees between two faces from which their common edge is a crease."""
-
-SMOOTH_ANGLE = 40.0
-"""Degrees between two faces below which the surface counts as smooth across their edge."""
-
-MAX_EDGE_FACES = 4
-"""Faces of an edge that are looked at; polygon soups have edges with more than two."""
+WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are one
+CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
+SMOOTH_ANGLE = 40.0  # Degrees between two faces below which the surface counts as smooth across their edge
+MAX_EDGE_FACES = 4  # Faces of an edge that are looked at; polygon soups have edges with more than two
 
 
 class MeshEdges:

@@ -14,37 +14,23 @@ from torch import Tensor
 from ..geometry import rotation_from_axis_angle
 from .mesh import mesh_radius
 
-__all__ = ["mesh_symmetries"]
-
-POINTS, TESTED = 40_000, 2_000
-"""Random points of the surface, and how many of them are compared with all."""
-
+POINTS, TESTED = 40_000, 2_000  # Random points of the surface, and how many of them are compared with all
+# A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the surface: about 2 px of a
+# crop of 128 px, which hardly changes its contours. The pull tab of a can is less than the rest, a handle more.
 TOLERANCE, FRACTION = 0.03, 0.975
-"""A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the surface: about 2 px of
-a crop of 128 px, which hardly changes its contours. The pull tab of a can is less than the rest, a handle more."""
-
+# Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned meshes are tilted by a
+# degree or two and do not pass through the centroid: 104 symmetries of 76 meshes begin below 0.014.
 NEAR_SYMMETRY = 0.04
-"""Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned meshes are tilted by
-a degree or two and do not pass through the centroid: 104 symmetries of 76 meshes begin below 0.014."""
-
+# Iterations of ICP, the points that it moves, the fraction of them that it trusts in each iteration, and the degrees by
+# which it may change a rotation
 ALIGNMENT_STEPS, ALIGNED_POINTS, ALIGNED_FRACTION, MAX_TILT = 8, 500, 0.9, 5.0
-"""Iterations of ICP, the points that it moves, the fraction of them that it trusts in each iteration, and the degrees
-by which it may change a rotation."""
-
-ROUND = 36
-"""Rotations that stand for a body of revolution; steps of 10 degrees are those of a bank."""
-
-ORDERS = (2, 3, 4, 5, 6, 8)
-"""Orders of rotation that are looked for about each axis."""
-
-LARGEST_GROUP = 2 * ROUND
-"""Those of a cylinder. A cube has 24; a sphere has more, of which as many are found."""
-
+ROUND = 36  # Rotations that stand for a body of revolution; steps of 10 degrees are those of a bank
+ORDERS = (2, 3, 4, 5, 6, 8)  # Orders of rotation that are looked for about each axis
+LARGEST_GROUP = 2 * ROUND  # Those of a cylinder. A cube has 24; a sphere has more, of which as many are found.
+# A principal axis is well defined if its moment differs from the others by so large a fraction of the largest
 DEFINED = 0.05
-"""A principal axis is well defined if its moment differs from the others by so large a fraction of the largest."""
-
+# Trace of A^T B from which two rotations count as one: 5 degrees apart
 NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
-"""Trace of A^T B from which two rotations count as one: 5 degrees apart."""
 
 
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:

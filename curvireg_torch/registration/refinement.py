@@ -28,13 +28,9 @@ from .tracker import OUTSIDE, boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["LOST_CONFIDENCE", "nearest_view", "refine", "refine_item"]
-
+# Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank
 WIDE_ANGLES = (14.0, 22.0)
-"""Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank."""
-
-LOST_CONFIDENCE = 0.35
-"""Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md."""
+LOST_CONFIDENCE = 0.35  # Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
 
 
 @torch.no_grad()

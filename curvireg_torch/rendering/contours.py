@@ -12,35 +12,20 @@ from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
 from .embree import RayScene
 
-__all__ = ["ContourPoints", "MeshContours"]
-
-MAX_OCCLUDING, MAX_CREASES = 256, 128
-"""Points per pose on occluding contours and on creases."""
-
-OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256
-"""Places per pose at which visibility is tested; some are hidden."""
-
-ASIDE = 1.0
-"""Distance in px from the contour, on the outer side, at which a ray looks past the object."""
-
+MAX_OCCLUDING, MAX_CREASES = 256, 128  # Points per pose on occluding contours and on creases
+OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256  # Places per pose at which visibility is tested; some are hidden
+ASIDE = 1.0  # Distance in px from the contour, on the outer side, at which a ray looks past the object
+# Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface
 OCCLUSION_JUMP = 0.05
-"""Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface."""
-
-VISIBLE_TOLERANCE = 0.02
-"""Depth, in object radii, by which a crease may lie behind the surface that its ray hits."""
-
+VISIBLE_TOLERANCE = 0.02  # Depth, in object radii, by which a crease may lie behind the surface that its ray hits
+# Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides
 CREASE_SCALE = 1.0 / 64.0
-"""Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides."""
-
+# Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front
 CREASE_BEND = 0.36
-"""Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front."""
-
+# Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at most
+# a fifth of a pixel of that crop
 LEVELS = ((128, 2500), (256, 8000))
-"""Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at
-most a fifth of a pixel of that crop."""
-
-NEAR_PLANE = 1e-3
-"""Depth in object radii below which points are not projected."""
+NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from ..errors import InvalidInputError, MissingDependencyError, RenderingError
+from ..errors import InvalidInputError, RenderingError
 from ..mesh.colours import surface_colours
 from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_image, check_option, check_pose, check_tensor
@@ -26,24 +26,19 @@ class DepthRenderer(Protocol):
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth. The depth is
-        on the renderer's device, which is the CPU except for "torch"."""
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth."""
         ...
 
 
-def make_renderer(
-    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, device: torch.device | str = "cpu"
-) -> DepthRenderer:
+def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") -> DepthRenderer:
     """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be shared by threads:
 
     - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or needed.
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
       its first use cannot use it: start processes by "spawn".
-    - ``"torch"`` runs on ``device``. Forked processes must call ``torch.set_num_threads(1)`` first.
 
-    Raises:
-        RenderingError, MissingDependencyError: the backend does not work here.
+    Raises :class:`RenderingError` where the backend does not work.
     """
     if not isinstance(backend, str):
         return backend
@@ -52,10 +47,6 @@ def make_renderer(
         from .opengl import PyrenderRenderer
 
         return PyrenderRenderer(mesh)
-    if backend == "torch":
-        from .zbuffer import TorchRenderer
-
-        return TorchRenderer(mesh, device=device)
     try:
         from .embree import EmbreeRenderer, RasterRenderer
     except ImportError as error:

@@ -96,7 +96,7 @@ def test_render_depth_refuses_bad_arguments() -> None:
     ):
         with pytest.raises(InvalidInputError, match=message):
             cr.render_depth(box, *arguments)
-    with pytest.raises(InvalidInputError, match="'torch'"):
+    with pytest.raises(InvalidInputError, match="'embree'"):
         cr.render_depth(box, T, one, size, renderer="opengl")
     with pytest.raises(MeshError, match="degenerate"):
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
