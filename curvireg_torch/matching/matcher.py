@@ -20,7 +20,7 @@ from ..terms import (
     photograph_field,
     whole_box_shapes,
 )
-from ..utils.checks import as_boxes, check_photograph, check_pixels, check_symmetries
+from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
@@ -173,9 +173,6 @@ class ViewMatcher(nn.Module):
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.device, torch.float32)
-        for image in images:
-            check_photograph(image)
-        images = [image.to(self.device) for image in images]
         jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
         return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))

@@ -47,11 +47,8 @@ def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") 
         from .opengl import PyrenderRenderer
 
         return PyrenderRenderer(mesh)
-    try:
-        from .embree import EmbreeRenderer, RasterRenderer
-    except ImportError as error:
-        message = f"renderer {backend!r} needs the package embreex ({error}): pip install embreex"
-        raise MissingDependencyError(message) from error
+    from .embree import EmbreeRenderer, RasterRenderer
+
     return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh)
 
 
