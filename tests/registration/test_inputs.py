@@ -50,7 +50,7 @@ def test_camera_warnings_name_the_likely_mistake(camera, size, parts):
 )
 def test_boxes_that_show_few_pixels_are_refused_or_questioned(box, refused, warned):
     picture = torch.rand(1, *VGA)
-    assert bool(ImageItem(picture, torch.tensor(box), None).warnings) == warned
+    assert bool(ImageItem(picture, torch.tensor(box).float(), None).warnings) == warned
     item = image_items([picture], [box], None)[0]
     assert isinstance(item, InvalidInputError) == refused
     assert not refused or "at least 12 are needed" in str(item)
