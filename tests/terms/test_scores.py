@@ -17,7 +17,6 @@ from curvireg_torch.terms import (
     BoxShape,
     Correlation,
     Repeatability,
-    Whitening,
     box_shapes,
     ledoit_wolf,
     whole_box_shapes,
@@ -34,12 +33,6 @@ def test_correlation_is_the_cosine_of_the_better_crop():
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
 
 
-def test_correlation_score_is_an_exponential_of_standard_deviations():
-    score = Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
-    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
-    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
-
-
 def sample(count: int, length: int = 12) -> torch.Tensor:
     generator = torch.Generator().manual_seed(count)
     mixing = torch.randn(length, length, generator=generator)
@@ -53,17 +46,6 @@ def test_ledoit_wolf_equals_scikit_learn(count):
     expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
     np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(mean, x.mean(dim=0))
-
-
-def test_whitening_decorrelates():
-    x = sample(4000)
-    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
-    torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
-    torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
-    with pytest.raises(InvalidInputError, match="positive definite"):
-        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
-    with pytest.raises(InvalidInputError, match="covariance"):
-        Whitening(torch.zeros(3), torch.eye(2))
 
 
 def test_matcher_ranks_by_whitened_correlation(bank, photographs):
