@@ -175,10 +175,8 @@ def apparent_ridges(
 
     View-dependent curvature :math:`q_1` is the largest rate of change of the surface normal per step *on the screen*,
     the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step. Apparent ridges
-    are the maxima of :math:`q_1` along :math:`t_1`.
-
-    Judd et al. follow the zero crossings of :math:`D_{t_1} q_1` over the mesh's faces. Here N comes from the smoothed
-    depth, so :math:`q_1` is finite at an occluding contour; maxima are pixels, along :math:`t_1` rounded to 45 degrees.
+    are the maxima of :math:`q_1` along :math:`t_1`: here pixels, with :math:`t_1` rounded to 45 degrees and N from the
+    smoothed depth, in place of zero crossings over the mesh's faces.
 
     Args:
         depth, mask, camera_matrix, sigma, depth_scale: as in :func:`average_shading_gradient`.

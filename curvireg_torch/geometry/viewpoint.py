@@ -83,14 +83,8 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def up_rotation(up: str) -> Tensor:
-    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does.
-
-    glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
-
-    Example:
-        >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)).tolist()
-        [0.0, 0.0, 1.0]
-    """
+    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does. glTF's
+    front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
 
@@ -188,10 +182,8 @@ def sample_views(
 def uniform_views(
     count: int, *, thetas: Sequence[float] = (0.0,), distances: Sequence[float] = (DEFAULT_DISTANCE,)
 ) -> ViewSphere:
-    """Near-uniform view directions on the sphere, by the Fibonacci spiral.
-
-    No direction is farther than ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000
-    directions). With thetas in steps of ``s`` degrees no rotation is farther than that + ``s / 2``.
+    """Near-uniform view directions on the sphere, by the Fibonacci spiral. No direction is farther than
+    ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000 directions).
 
     Args:
         count: number of view directions; each is combined with every theta and distance.

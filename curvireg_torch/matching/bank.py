@@ -86,8 +86,8 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_compatible(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``. Views that
-        were passed by the caller (``pose="given"``) fit every view policy."""
+        """Raise :class:`BankError` unless settings and view policy are those of ``pipeline``; views that were passed by
+        the caller (``pose="given"``) fit every policy."""
         mine, theirs = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
             mine |= self.pipeline.views.key_fields()
@@ -113,16 +113,13 @@ class ViewBank:
         """Render, filter and describe every view, in chunks on as many threads as torch may use.
 
         Args:
-            mesh: a mesh or the path of one.
+            mesh: a mesh or the path of one, see :func:`curvireg_torch.load_mesh`.
             views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
             pipeline: default ``Pipeline()``.
             progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
             device: where views are filtered and described, and where the bank is stored.
-
-        Raises:
-            MeshError, MissingFileError, InvalidInputError, RenderingError.
 
         Example:
             >>> from curvireg_torch.geometry import sample_views
@@ -146,11 +143,13 @@ class ViewBank:
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
-            described = describe(*chunk)
-            tensors = vars(described) | {n: _pack(getattr(described, n)) for n in ("points", "silhouettes")}
-            return tensors | {
-                RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()
-            }
+            tensors = dict(vars(describe(*chunk)))
+            for name in ("points", "silhouettes"):  # (N, S, S) bool to (N, ceil(S * S / 8)) uint8
+                packed = np.packbits(tensors[name].flatten(1).cpu().numpy(), axis=1)
+                tensors[name] = torch.from_numpy(packed).to(device)
+            for name, module in reranking.items():
+                tensors[RERANKING + name] = module.describe(describe.shaded(*chunk)).half()
+            return tensors
 
         parts = []
         with (
@@ -284,11 +283,6 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
         raise ValueError("viewpoints that are not finite")
     if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():
         raise ValueError("descriptors that are all zero, or empty boxes")
-
-
-def _pack(mask: Tensor) -> Tensor:
-    """(N, S, S) bool to (N, ceil(S * S / 8)) uint8."""
-    return torch.from_numpy(np.packbits(mask.flatten(1).cpu().numpy(), axis=1)).to(mask.device)
 
 
 def _unpack(packed: Tensor, size: int) -> Tensor:

@@ -27,37 +27,22 @@ PARALLEL_DISTANCE = 20.0
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
-    """The filter that turns rendered depth into vector fields.
-
-    Example:
-        >>> type(depth_filter(BankSettings(depth_field="HFN"))).__name__
-        'HessianFrobeniusNorm'
-    """
+    """The filter that turns rendered depth into vector fields."""
     options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
     layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
     return layer
 
 
 def hog_layer(settings: BankSettings) -> HOG:
-    """The descriptor of views and photographs.
-
-    Example:
-        >>> hog_layer(BankSettings()).length
-        1764
-    """
+    """The descriptor of views and photographs."""
     return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
 
 
 @dataclass(frozen=True)
 class DescribedViews:
-    """N described views.
-
-    Attributes:
-        descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool.
-        boxes: (N, 4) float64 boxes of the object in normalised image coordinates (focal length 1), the object's centre
-            on the axis; model units for an orthographic camera.
-    """
+    """N described views: ``descriptors`` (N, D) float32; ``points``, ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4)
+    float64 of the object in normalised image coordinates (focal length 1), its centre on the axis; in model units for
+    an orthographic camera."""
 
     descriptors: Tensor
     points: Tensor
@@ -66,14 +51,8 @@ class DescribedViews:
 
 
 class ViewDescriber:
-    """Renders, filters and describes arbitrary views of one mesh.
-
-    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
-
-    Args:
-        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
-        settings, renderer, device: see :meth:`curvireg_torch.ViewBank.build`.
-    """
+    """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
+    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
@@ -84,7 +63,6 @@ class ViewDescriber:
         device: torch.device | str = "cpu",
     ) -> None:
         self._mesh = self._simple = mesh
-        self._coloured = has_colours(mesh)
         self.renderer = self.view_renderer = make_renderer(mesh, renderer)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
@@ -110,15 +88,9 @@ class ViewDescriber:
         return other
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cameras that look at the object's centre, cropped to its box as a photograph is.
-
-        Args:
-            rotations: (N, 3, 3) model -> camera, as in all methods.
-            distances: (N,) of the object's centre, in model units, as in all methods.
-
-        Returns:
-            T (N, 4, 4), K (N, 3, 3) of the crops, and boxes (N, 4), see :class:`DescribedViews`. All float64.
-        """
+        """Cameras that look at the object's centre, cropped to its box as a photograph is: T (N, 4, 4), K (N, 3, 3) of
+        the crops, and boxes (N, 4), all float64. As in all methods, ``rotations`` (N, 3, 3) are model -> camera,
+        ``distances`` (N,) those of the object's centre in model units."""
         R = rotations.double().cpu()
         t = -(R @ self.centre)
         t[:, 2] += distances.double().cpu()
@@ -127,11 +99,9 @@ class ViewDescriber:
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes.
-
-        They replace unknown cameras of photographs. For orthographic views the camera is far away. Returns
-        T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64.
-        """
+        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes. They
+        replace unknown cameras of photographs. For orthographic views the camera is far away. Returns T_cam_from_model
+        (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64."""
         T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
             z = distances.double().cpu()
@@ -150,14 +120,12 @@ class ViewDescriber:
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`.
-
-        With the mesh's colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`.
-        """
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`. With the mesh's
+        colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`."""
         S, projection = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
         grey = shade(self.view_renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
-        if not self._coloured:
+        if not has_colours(self._mesh):
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
         return torch.cat([grey, colour.to(grey)], dim=1)
@@ -206,11 +174,9 @@ class ViewDescriber:
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
-
-    Returns, on the CPU, the index (N,) of the first view of each view's group, and the number (N,) of clockwise 90
-    degree rotations, 0 to 3, from that view to this one.
-    """
+    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees. Returns, on the CPU, the
+    index (N,) of the first view of each view's group, and the number (N,) of clockwise 90 degree rotations, 0 to 3,
+    from that view to this one."""
     x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
     apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")

@@ -40,9 +40,8 @@ class Ranking:
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
             similarity of the boxes' aspect ratios in [0, 1], best view 1.
-        allowed: (B, N) bool, which views a pose prior leaves; None without one.
-        outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
-            without a prior.
+        allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,) the best of the others
+            more than 30 degrees from the best view, or -1.
     """
 
     scores: Tensor
@@ -107,20 +106,18 @@ class ViewMatcher(nn.Module):
 
     The box of each photograph is cropped as the views are, filtered and described; each ranking term compares it with
     all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms take the best over a few jittered crops.
-
     The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
     :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
         bank: the views of a mesh.
-        pipeline: field, terms and box jitter; default the bank's. Its bank settings and view policy must be those of
-            the bank, unless the bank's views were passed by the caller.
+        pipeline: field, terms and box jitter; default the bank's.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
             photographs as (B, 3, S, S).
         renderer: for views that a :class:`RerankingTerm` needs.
 
     Raises:
-        BankError: the bank was built with other settings or for another pose prior than the pipeline's.
+        BankError: the bank was built with other settings than the pipeline's, or for another view policy.
 
     Example:
         >>> import trimesh
@@ -151,11 +148,6 @@ class ViewMatcher(nn.Module):
         self.terms = tuple(term for term in pipeline.terms if term.weight > 0)
         self._terms = nn.ModuleDict({term.name: term.build(bank) for term in self.terms}).to(bank.device)
 
-    @property
-    def device(self) -> torch.device:
-        """The bank's device, where photographs are described and compared."""
-        return self.bank.device
-
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
 
@@ -172,7 +164,7 @@ class ViewMatcher(nn.Module):
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
         settings = self.bank.settings
-        boxes = as_boxes(boxes, len(images)).to(self.device, torch.float32)
+        boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
         jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
         return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
@@ -247,19 +239,19 @@ class ViewMatcher(nn.Module):
         """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
         if name in self.bank.reranking_features:
             features = self.bank.reranking_features[name]
-            return features if len(views) == len(features) else features[views.to(self.device)]
+            return features if len(views) == len(features) else features[views.to(self.bank.device)]
         cache = self._feature_cache.setdefault(name, {})
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
         module = cast(RerankingModule, self._terms[name])
 
         def describe(chunk: list[int]) -> Tensor:
-            views = torch.tensor(chunk, device=self.device)
+            views = torch.tensor(chunk, device=self.bank.device)
             return module.describe(self.describer.shaded(self.bank.rotations[views], self.bank.distances[views]))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
         chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
-        parts = map_on_threads(describe, chunks, device=self.device)
+        parts = map_on_threads(describe, chunks, device=self.bank.device)
         new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
         if len(cache) + len(new) > MAX_CACHED_VIEWS:
             cache.clear()
@@ -284,4 +276,4 @@ class ViewMatcher(nn.Module):
     @cached_property
     def describer(self) -> ViewDescriber:
         """Render and describe further views as the bank's; built on first use."""
-        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.device)
+        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,13 +34,11 @@ NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
 
 
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
-    """Rotations of a mesh that leave its shape as it is, up to small details; colours are not compared.
+    """Rotations of a mesh that leave its shape as it is, up to small details, without colours. (S, 4, 4) float64
+    transforms of the model frame, the identity first; S = 1 for a mesh without symmetries.
 
     The axes that are tried are those of the mesh file and the principal axes of its surface, each aligned by ICP. About
     each, bodies of revolution and rotations of order 2 to 6 and 8 are found; products of symmetries are symmetries too.
-
-    Returns:
-        (S, 4, 4) float64 transforms of the model frame, the identity first; S = 1 for a mesh without symmetries.
 
     Example:
         >>> mesh_symmetries(trimesh.creation.box((1, 2, 3))).shape  # half turns about three axes
@@ -60,7 +58,9 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
         round_axis = revolutions[0]
         upside_down = [(line, math.pi) for line in revolutions[1:]] + [turn for turn in turns if turn[1] == math.pi]
         turns = [(round_axis, 2.0 * math.pi / ROUND)]
-        turns += [(line.across(round_axis), angle) for line, angle in upside_down[:1]]
+        for (axis, point), angle in upside_down[:1]:  # about the nearest axis that is perpendicular
+            across = axis - (axis @ round_axis.axis) * round_axis.axis
+            turns.append((_Line(across / torch.linalg.vector_norm(across), point), angle))
     R = _group([rotation_from_axis_angle(angle * line.axis) for line, angle in turns])
     fixed = torch.from_numpy(centre) + radius * _common_point([line for line, _ in turns])
     transforms = torch.eye(4, dtype=torch.float64).repeat(len(R), 1, 1)
@@ -69,17 +69,11 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
     return transforms
 
 
-@dataclass(frozen=True)
-class _Line:
+class _Line(NamedTuple):
     """An axis of rotation: a unit vector (3,) and a point (3,) on it."""
 
     axis: Tensor
     point: Tensor
-
-    def across(self, other: "_Line") -> "_Line":
-        """The nearest axis that is perpendicular to the other one."""
-        axis = self.axis - (self.axis @ other.axis) * other.axis
-        return _Line(axis / torch.linalg.vector_norm(axis), self.point)
 
 
 def _common_point(lines: Sequence[_Line]) -> Tensor:

@@ -93,20 +93,23 @@ def image_items(
     masks: Any | None = None,
 ) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
-
     Arguments and errors are those of ``Registrar``; each is read and checked whenever it is asked for, so that many
     large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed. A box
-    of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is refused.
-    """
+    of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is refused."""
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
-    n = len(images)
-    boxes = None if boxes is None else _boxes(boxes, n)
+    n, no_box = len(images), boxes is None
+    if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
+        if len(boxes) != n:
+            raise InvalidInputError(f"boxes: expected {n}, one for each image or None, got {len(boxes)}")
+        boxes = [None if is_missing(box) else as_boxes([box], 1)[0] for box in boxes]
+    else:
+        boxes = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
     masks = [None] * n if masks is None else list(masks)
     if len(masks) != n:
         raise InvalidInputError(f"masks: expected {n}, one for each image or None, got {len(masks)}")
-    if boxes is None and any(m is None for m in masks) and any(m is not None for m in masks):
+    if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
         raise InvalidInputError(f"masks: image {masks.index(None)} has neither mask nor box; register it separately")
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
@@ -116,7 +119,7 @@ def image_items(
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
-            item = image_item(images[i], None if boxes is None else boxes[i], cameras[i], priors[i], masks[i])
+            item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
                 small = min(item.size) < MIN_BOX_SIDE
                 where = "the photograph has" if small else "the part of the photograph in the box has"
@@ -127,15 +130,6 @@ def image_items(
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
     return OnDemand(item, n)
-
-
-def _boxes(given: Any, count: int) -> Sequence[Tensor | None]:
-    """A box for each image, None where there is none."""
-    if not (isinstance(given, list | tuple) and any(is_missing(box) for box in given)):
-        return list(as_boxes(given, count))
-    if len(given) != count:
-        raise InvalidInputError(f"boxes: expected {count}, one for each image or None, got {len(given)}")
-    return [None if is_missing(box) else as_boxes([box], 1)[0] for box in given]
 
 
 def is_missing(box: Any) -> bool:

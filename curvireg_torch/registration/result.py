@@ -339,15 +339,9 @@ class FailedRegistration:
 
 
 def ambiguity(rotations: Tensor) -> str | None:
-    """How poses (K, 3, 3) differ, in words; None for a single one.
-
-    "half turn": by a rotation of nearly 180 degrees; "mirror": they are seen from directions that are mirror images at
-    a coordinate plane of the mesh; "several": anything else, or more than two.
-
-    Example:
-        >>> ambiguity(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))]))
-        'half turn'
-    """
+    """How poses (K, 3, 3) differ, in words; None for a single one. "half turn": by a rotation of nearly 180 degrees;
+    "mirror": they are seen from directions that are mirror images at a coordinate plane of the mesh; "several":
+    anything else, or more than two."""
     if len(rotations) < 2:
         return None
     if len(rotations) > 2:
@@ -427,15 +421,8 @@ def verdict(probability: float | None, none: float | None, reliable: bool) -> st
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which a (3, 3) rotation shows the object, in degrees that the option ``--azimuth`` takes.
-
-    ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`.
-
-    Example:
-        >>> from curvireg_torch.geometry import rotation_from_viewpoint
-        >>> pose_in_words(rotation_from_viewpoint(310.0, 20.0, 0.0))
-        'seen from the front-left (azimuth 310°), 20° above the horizon'
-    """
+    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left (azimuth 310°), 20°
+    above the horizon"; ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`."""
     R = rotation.detach().cpu().double()
     azimuth, elevation, theta = (round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT))
     side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"

@@ -72,13 +72,13 @@ def fit_texture(
     """Fit one pose to the mesh's colours and to contours together.
 
     The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
-    correlation, which the strength of the light does not change. Robust least squares move the pose to where most of
-    them are found, then to the edges as well; a second round searches nearer. The fit counts, and is not None, if in
-    the end more corners are in place than at the start, and enough of them, and the edge support is as before.
+    correlation. Robust least squares move the pose to where most of them are found, then to the edges as well; a second
+    round searches nearer. The fit counts, and is not None, if in the end more corners are in place than at the start,
+    and enough of them, and the edge support is as before.
 
     ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
-    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and others that may be better (:func:`turned`); the
-    other arguments are those of :func:`fit_contours`, for one photograph.
+    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and :func:`turned` ones; the other arguments are those
+    of :func:`fit_contours`, for one photograph.
     """
     crops, _, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
     texture = _TextureRounds(draw, renderer, problem, _as_array(crops[0]))

@@ -56,16 +56,8 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
 
     If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
     r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
-    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius.
-
-    Args:
-        log_ratio: (P, L) r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1.
-        radius: in px, at most h.
-
-    Example:
-        >>> ends = torch.tensor([[2.0, 2.0, 2.0, 2.0, 2.0, -2.0, -2.0]])              # after the pixel at offset 1
-        >>> bool(1.4 < line_posterior(ends, 3)[0] < 1.5)
-        True
+    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius px. ``log_ratio`` (P, L) is
+    r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1, h >= ``radius``.
     """
     half = log_ratio.shape[-1] // 2
     log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
@@ -305,7 +297,8 @@ class Tracker:
 
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
-        self._poses = [*self._poses[-1:], pose.state.T]
+        self.last_pose = pose.state.T
+        self._poses = [*self._poses[-1:], self.last_pose]
         depth = self.renderer.render(pose.state.T, pose.frame.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
         self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
@@ -316,19 +309,13 @@ class Tracker:
         measured = problem.measured_edges(pose.state, SEARCH_RADII[-1])
         return pose_covariance(measured, points, pose.state.T, problem.K, self.centre, radius=self.radius)[0][0]
 
-    @property
-    def last_pose(self) -> Tensor:
-        """(1, 4, 4) of the last frame."""
-        return self._poses[-1]
-
     def predictions(self) -> list[Tensor]:
         """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
-        last = self._poses[-1]
         if len(self._poses) < 2:
-            return [last]
+            return [self.last_pose]
         (R0, c0), (R1, c1) = ((T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses)
         R = R1 @ R0.mT @ R1
-        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), last]
+        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), self.last_pose]
 
     def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose around a start (1, 4, 4)."""

@@ -69,14 +69,6 @@ class _Level:
         length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
         return length
 
-    def smooth_normals(
-        self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
-    ) -> np.ndarray:
-        """Normals (N, M, 2) across the contour of a smooth surface, whose vertices' normals are interpolated."""
-        n = self.edges.normals
-        normal = n[ends[..., 0]] + fraction[..., None] * (n[ends[..., 1]] - n[ends[..., 0]])
-        return _across(normal @ R.transpose(0, 2, 1), K)
-
     def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
         xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
@@ -87,15 +79,12 @@ class _Level:
 
 
 class MeshContours:
-    """Occluding contours and creases of a mesh, at any pose.
+    """Occluding contours and creases of a clean mesh (:func:`curvireg_torch.load_mesh`), at any pose.
 
     An edge of the mesh lies on an occluding contour where all of its faces are on one side of it, seen from the camera;
-    creases are edges between faces that meet at an angle (``MeshEdges``). Points are placed along these edges,
-    evenly in the image. A ray one pixel outside an occluding contour tells the outline (nothing hit), an inner
-    occluding contour (hit far behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
-
-    Args:
-        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
+    creases are edges between faces that meet at an angle. Points are placed along these edges, evenly in the image. A
+    ray one pixel outside an occluding contour tells the outline (nothing hit), an inner occluding contour (hit far
+    behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 63.5], [0, 100.0, 63.5], [0, 0, 1]], dtype=torch.float64)
@@ -116,9 +105,7 @@ class MeshContours:
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
     ) -> ContourPoints:
         """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
-
-        ``density`` is a fraction of the usual number of points.
-        """
+        ``density`` is a fraction of the usual number of points."""
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         R = T[:, :3, :3]
         level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
@@ -138,8 +125,9 @@ class MeshContours:
             a, b = (edges.vertices[ends[..., k]] @ R.transpose(0, 2, 1) + position[:, None] for k in (0, 1))
             at = a + fraction[..., None] * (b - a)
             normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
-            if occluding:
-                smooth = level.smooth_normals(index, fraction, ends, R, K)
+            if occluding:  # of a smooth surface, interpolate the vertices' normals
+                n0, n1 = edges.normals[ends[..., 0]], edges.normals[ends[..., 1]]
+                smooth = _across((n0 + fraction[..., None] * (n1 - n0)) @ R.transpose(0, 2, 1), K)
                 smooth *= np.where((smooth * normal).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
                 agree = edges.is_smooth[index] & ((smooth * normal).sum(axis=-1) > 0.5)
                 normal = np.where(agree[..., None], smooth, normal)

@@ -97,8 +97,7 @@ def render_depth(
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Rigid poses (N, 4, 4) and cameras (N, 3, 3), checked, as float64 on the CPU."""
-    if T.ndim != 3 or T.shape[1:] != (4, 4):
-        raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
+    check_tensor(T, "T_cam_from_model", (None, 4, 4))
     if len(size) != 2 or min(size) < 1:
         raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
     check_camera_matrix(K)
@@ -123,10 +122,9 @@ def render_colour(
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,
 ) -> Tensor:
-    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel.
-
-    A mesh without colours (:func:`has_colours`) is white. So is every mesh with a renderer that does not report which
-    face a pixel shows; "auto" and "embree" do. Arguments and errors are those of :func:`render_depth`.
+    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel. A mesh
+    without colours is white, and so is every mesh with a renderer that does not report which face a pixel shows; "auto"
+    and "embree" do. Arguments and errors are those of :func:`render_depth`.
 
     Returns:
         (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
@@ -160,10 +158,8 @@ def render_colour(
 
 
 def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1.
-
-    Normals come from neighbouring pixels and are exact for planes. Of the two neighbours along an axis, the one nearer
-    in depth is used, so that creases and contours stay sharp.
+    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1. Normals come from
+    neighbouring pixels, of two along an axis the one nearer in depth, and are exact for planes.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background; the result has its shape and dtype.

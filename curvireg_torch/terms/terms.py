@@ -139,14 +139,9 @@ class Views(Protocol):
 
 @dataclass(frozen=True)
 class Term(ABC):
-    """One factor of the score S = prod S_t^w_t of a view for a photograph.
-
-    A new term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
-    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it.
-
-    Attributes:
-        weight: w >= 0; a term of weight 0 is left out.
-    """
+    """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its ``weight`` w is 0. A new
+    term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
+    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
 
     name: ClassVar[str]
     weight: float = 1.0
@@ -165,11 +160,9 @@ class Term(ABC):
 
 @dataclass(frozen=True)
 class RerankingTerm(Term):
-    """A term that needs a picture of every view that it compares.
-
-    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank the term compares
-    only the best distinct views of the other terms; every other view gets the score of the nearest compared view, and
-    NaN as raw score.
+    """A term that needs a picture of every view that it compares. A bank of up to ``exhaustive_limit`` views stores the
+    features of all its views. In a larger bank the term compares only the best distinct views of the other terms; every
+    other view gets the score of the nearest compared view, and NaN as raw score.
 
     Attributes:
         exhaustive_limit: largest number of views that are all compared.
@@ -389,17 +382,11 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))`.
-
-    d is the difference of the logs of width / height of the boxes of photograph and view. All views score 1 if the
-    photograph's box reaches its border.
-
-    Attributes:
-        sigma: 0.2 corresponds to a box that is a fifth too wide.
-    """
+    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))` with the difference d of the logs of
+    width / height of the boxes of photograph and view. All views score 1 if the photograph's box reaches its border."""
 
     name: ClassVar[str] = "box"
-    sigma: float = 0.2
+    sigma: float = 0.2  # corresponds to a box that is a fifth too wide
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -428,19 +415,14 @@ class _BoxShapeModule(nn.Module):
 
 @dataclass(frozen=True)
 class Appearance(RerankingTerm):
-    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view.
-
-    A mesh with colours is rendered in grey and in its colours, and the better match counts for each view: a print
+    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view. A mesh
+    with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
-    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views.
-
-    Attributes:
-        weights: digest of the network's weights.
-    """
+    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views."""
 
     name: ClassVar[str] = "appearance"
     weight: float = 2.0
-    weights: str = SHA256[:16]
+    weights: str = SHA256[:16]  # digest of the network's
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -468,7 +450,7 @@ class _AppearanceModule(RerankingModule):
         if Appearance.name not in query.reranking_features:  # shared by ranking and rescoring
             query.reranking_features[Appearance.name] = describe(query.crops, self.backbone)
         crops = query.reranking_features[Appearance.name]
-        similarities = similarity(crops[:, None], features.reshape(-1, crops.shape[1]))
+        similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 
 

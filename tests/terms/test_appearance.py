@@ -45,7 +45,7 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     torch.testing.assert_close(small_bank.reranking_features["appearance"], expected, atol=2e-3, rtol=0)
     query = matcher.query(*photograph(0))
     ranking = matcher.rank(query)
-    raw = similarity(describe(query.crops, Backbone())[:, None], expected)
+    raw = similarity(describe(query.crops, Backbone()), expected)
     torch.testing.assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
     small_bank.save(tmp_path / "bank.safetensors")
     loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(*photograph(0))

@@ -81,32 +81,6 @@ def test_repeatability_score_has_the_closed_form():
         Repeatability(mode="other")
 
 
-class PointViews:
-    """Views of ``size`` px; view i has feature points at the (row, column) indices ``points[i]``."""
-
-    def __init__(self, size, *points):
-        self.settings = SimpleNamespace(image_size=size)
-        self.points, self.descriptors = torch.zeros(len(points), size, size, dtype=torch.bool), torch.zeros(1)
-        for view, (rows, columns) in zip(self.points, points, strict=True):
-            view[rows, columns] = True
-
-    def __len__(self):
-        return len(self.points)
-
-    def points_at(self, index):
-        return self.points[index]
-
-
-@pytest.mark.parametrize(("size", "cell"), [(129, 2), (194, 3)])
-def test_repeatability_counts_points_in_cut_cells_once(size, cell):
-    """One point in the cut corner, one at a cut side, two in whole cells; the view's points fill the last column."""
-    assert 0 < size % cell < cell
-    term = Repeatability().build(PointViews(size, (slice(None), -1)))
-    assert term.cell == cell
-    query = PointViews(size, ([size - 1, 0, 0, 2 * cell], [size - 1, size - 1, 0, cell])).points[None]
-    assert term(SimpleNamespace(points=query)).item() == 0.5
-
-
 def box_score(shapes, boxes, **options):
     return BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
 
