@@ -32,8 +32,6 @@ from .least_squares import (
     step_fraction,
 )
 
-__all__ = ["ContourFit", "ContourProblem", "ContourState", "EdgeField", "ObjectMask", "contour_support", "fit_contours"]
-
 CROP_SIZE = 256
 """Side of the crop in px; the first rounds use half of it."""
 
@@ -183,8 +181,7 @@ def _sampled_lines(
 
 @dataclass(frozen=True)
 class ContourState:
-    """N poses ``T`` (N, 4, 4), nearby poses ``seen`` (N, 4, 4) at which contours were last found, and those contour
-    points."""
+    """Poses ``T`` (N, 4, 4), nearby ones ``seen`` at which contours were last found, and the contour points there."""
 
     T: Tensor
     seen: Tensor
@@ -375,14 +372,12 @@ def fit_contours(
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search radius shrinks from round to round, and the contours are found again where
-    they have moved. The fit begins at half size from each start and from six poses rotated away from it, and at a
-    quarter of the size where it may be farther away; the best (by edge support, with a mask weighted as below) and the
-    next best that differs from it continue, and end at full size. If no fit improves the edge support, the start is
-    kept.
+    they have moved. The fit begins at half size from each start and from six poses rotated away from it; the best, by
+    edge support, and the next best that differs from it continue, and end at full size. If no fit improves the edge
+    support, the start is kept.
 
-    Prints, shadows and clutter have edges too. With an ``object_mask``, an edge counts for the outline as far as the
-    object lies on its inner side alone, and for creases and inner contours as far as the object lies on both sides
-    (``ObjectMask``); this weights the least squares and the choice among the fits, not the reported support.
+    Prints and clutter have edges too. With an ``object_mask`` they are weighted (``ObjectMask``) in the least squares
+    and in the choice among the fits, not in the reported support.
 
     The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
     true pose R, t,
@@ -465,6 +460,19 @@ def fit_contours(
         measured, state.points, state.T, full.K, contours.centre, radius=contours.radius
     )
     return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
+
+
+@torch.no_grad()
+def quick_support(
+    contours: MeshContours, image: Tensor, box: Tensor, K: Tensor, T: Tensor, *, margin: float, mask: Tensor | None
+) -> Tensor:
+    """(N,) edge support, with the weights of the ``mask``, that poses ``T`` (N, 4, 4) with cameras ``K`` (N, 3, 3)
+    reach by a short fit at a quarter of the size; it tells in a tenth of the time which of them are worth a fit."""
+    crops, inside, full = full_size_problem(
+        contours, [image], box[None], K, torch.zeros(len(T), dtype=torch.long), margin
+    )
+    quarter = smaller_problem(replace(full, mask=None if mask is None else ObjectMask(mask)), crops, inside, 4)
+    return quarter.supports(quarter.descend(quarter.state(T), QUARTER_SIZE_RADII))[1]
 
 
 @torch.no_grad()

@@ -32,6 +32,7 @@ from .confidence import (
     is_calibrated,
     registration_confidence,
 )
+from .contour_fit import quick_support
 from .detection import Detector, detect
 from .inputs import ImageItem, check_crop, image_items
 from .poses import (
@@ -59,6 +60,10 @@ __all__ = ["Registrar"]
 MIN_REFINED = 3
 """Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on rivals. Of 15
 photographs of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
+
+SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
+"""Best distinct views of an exact mesh to which contours are fitted for a moment, and weight of their edge support, for
+which the most promising ones become hypotheses."""
 
 SAME_BOX_OVERLAP = 0.85
 """Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
@@ -91,8 +96,8 @@ class _Work:
 class Registrar:
     """Registers photographs to a mesh, or to the best of several.
 
-    The views of the bank are ranked for each box; the best distinct ones become hypotheses, to which contours are
-    fitted (:func:`fit_contours`), and whose evidence decides their order. With a camera matrix the result is rotation
+    The views of the bank are ranked for each box; of the best distinct ones the most promising become hypotheses, to
+    which contours are fitted (:func:`fit_contours`), and whose evidence decides their order. With a camera matrix the result is rotation
     and translation with their covariance; without, the rotation.
 
     Args:
@@ -327,7 +332,8 @@ class Registrar:
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
         work = self._rank(item, query, ranking)
-        starts, outside = self._starts(work)
+        mask = self.object_mask(query, [item]) if self.pipeline.contours else None
+        starts, outside = self._starts(work, mask)
         poses = starts
         if self.pipeline.search:
             self.report_progress("search")
@@ -337,7 +343,6 @@ class Registrar:
                 poses = work.limits.moved_inside(poses)
         if self.pipeline.contours:
             self.report_progress("contours")
-            mask = self.object_mask(query, [item])
             poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
         features = self._features(work, poses)
         if self.pipeline.contours and work.exact:
@@ -366,24 +371,36 @@ class Registrar:
         symmetries = self.symmetries_of(exact=exact)
         return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries)
 
-    def _starts(self, work: _Work) -> tuple[Poses, Tensor]:
-        """Poses of the best distinct views, and (H,) bool: the last one may lie outside the limits.
+    def _starts(self, work: _Work, mask: Tensor | None) -> tuple[Poses, Tensor]:
+        """Poses of the most promising distinct views, and (H,) bool: the last one may lie outside the limits.
 
         That is the best view outside; it is never reported, and tells whether the limits are wrong.
         """
         count = max(MIN_REFINED, self.pipeline.hypotheses)
-        view, rank = best_views(work.ranking, self.bank, count=count, symmetries=work.symmetries)
+        screened = max(SCREENED_VIEWS, count) if self.pipeline.contours and work.exact else count
+        view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
         poses = self._of_views(work, view, rank)
+        if work.limits is not None:
+            poses = work.limits.moved_inside(poses)
+        poses = self._screened(work, poses, mask, count)
         outside = torch.zeros(len(poses), dtype=torch.bool)
         if work.limits is None:
             return poses, outside
-        poses = work.limits.moved_inside(poses)
         assert work.ranking.outside is not None
         view = work.ranking.outside.cpu()
         if int(view) < 0:
             return poses, outside
         other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True)
+
+    def _screened(self, work: _Work, poses: Poses, mask: Tensor | None, count: int) -> Poses:
+        """The ``count`` poses whose rank and edge support after a short fit promise most."""
+        if len(poses) <= count:
+            return poses
+        given = (self.describer.contours, work.item.image, work.item.box, poses.cameras, poses.T)
+        support = quick_support(*given, margin=self.bank.settings.margin, mask=mask)
+        promise = poses.rank + SCREENING_WEIGHT * support
+        return poses[promise.argsort(descending=True, stable=True)[:count]]
 
     def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
         return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)

@@ -8,11 +8,13 @@ import trimesh
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
 from curvireg_torch.errors import CurviregError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
+from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
+from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.result import result_document, used_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
@@ -91,6 +93,21 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     monkeypatch.setattr(registrar_module, "fit_poses", counted)
     assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
     assert counts == [3, 1], "the best is fitted twice"
+
+
+@pytest.mark.parametrize("weight", [0.0, registrar_module.SCREENING_WEIGHT])
+def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight):
+    registrar, item = truck_registrar(), ImageItem(IMAGE, BOX, CAMERA)
+    query = registrar.matcher.query([IMAGE], BOX[None])
+    ranking, bank = registrar.matcher.rank(query), registrar.bank
+    right = are_near(bank.rotations, bank.rotations[ranking.order[0, 0]])
+    seventh = distinct_views(ranking.order[0], bank.rotations, count=7)[-1]
+    scores = torch.where(right, 0.999 * ranking.scores[0, seventh], ranking.scores[0])[None] ** 0.1
+    lowered = replace(ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True))
+    monkeypatch.setattr(registrar_module, "SCREENING_WEIGHT", weight)
+    result = registrar.register(item, query, lowered)
+    assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == (weight > 0)
+    assert len(result.hypotheses) == registrar.pipeline.hypotheses
 
 
 def test_the_best_pose_is_not_one_outside_the_limits():
