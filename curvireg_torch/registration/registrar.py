@@ -97,8 +97,8 @@ class Registrar:
     """Registers photographs to a mesh, or to the best of several.
 
     The views of the bank are ranked for each box; of the best distinct ones the most promising become hypotheses, to
-    which contours are fitted (:func:`fit_contours`), and whose evidence decides their order. With a camera matrix the result is rotation
-    and translation with their covariance; without, the rotation.
+    which contours are fitted (:func:`fit_contours`), and whose evidence decides their order. With a camera matrix the
+    result is rotation and translation with their covariance; without, the rotation.
 
     Args:
         bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, its path, or a list of meshes or paths, of

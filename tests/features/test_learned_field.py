@@ -1,6 +1,7 @@
 """The learned field: the layer contract, its weights, and its output on a simple image."""
 
 import math
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -84,3 +85,11 @@ def test_learned_field_of_a_square_is_its_outline(field):
     mask = field.mask(x)[0, 0]
     assert mask[40:88, 40:88].mean() > 0.8
     assert mask[:8].mean() < 0.2
+
+
+@pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
+def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
+    field = LearnedCurvilinearSaliency()
+    field.network.forward = Mock(side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2))
+    assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
+    assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128

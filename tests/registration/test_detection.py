@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotatio
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
-from curvireg_torch.registration.detection import Found, _add, _allowed_views, _medoids
+from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views, _medoids
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, unrefined
@@ -293,3 +294,12 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
     assert [one.score for one in found] == kept
     _add(found, at(40.0, 0.1))  # elsewhere
     assert [one.score for one in found] == [*kept, 0.1]
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
+def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
+    one, other = as_found(found[2]), as_found(found[2])
+    again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
+    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
+    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
+    assert best is (one if kept else other)

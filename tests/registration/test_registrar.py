@@ -15,6 +15,7 @@ from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
+from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.result import result_document, used_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
