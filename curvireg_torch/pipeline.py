@@ -25,7 +25,7 @@ from .filters import (
 )
 from .geometry import ViewSphere, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
-from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
+from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT
 from .utils.files import tensor_digest
@@ -247,13 +247,13 @@ class Pipeline:
             )
         return FIELDS[self.field]()
 
-    def reranking_terms(self, count: int) -> list[RerankingTerm]:
-        """The reranking terms whose features a bank of ``count`` views holds for every view."""
-        return [term for term in self.terms if isinstance(term, RerankingTerm) and count <= term.exhaustive_limit]
+    def stored_appearance(self, count: int) -> Appearance | None:
+        """The appearance term, if a bank of ``count`` views holds the features of all its views."""
+        return next((t for t in self.terms if isinstance(t, Appearance) and count <= t.exhaustive_limit), None)
 
     def bank_key_fields(self, count: int) -> dict[str, Any]:
         """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
-        return {**asdict(self.bank), "reranking": [term.name for term in self.reranking_terms(count)]}
+        return {**asdict(self.bank), "appearance": self.stored_appearance(count) is not None}
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain numbers, strings, lists and dictionaries for JSON."""

@@ -23,8 +23,7 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
-RERANKING = "reranking."  # Prefix of the names of reranking features among a bank's tensors
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 6
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
@@ -38,8 +37,8 @@ class ViewBank:
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
-            large bank. Meshes with colours have grey features followed by coloured ones.
+        appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank. Meshes with colours
+            have grey features followed by coloured ones.
     """
 
     def __init__(
@@ -49,8 +48,7 @@ class ViewBank:
         self.descriptors = tensors["descriptors"].float()
         self.boxes = tensors["boxes"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
-        reranking = (name for name in tensors if name.startswith(RERANKING))
-        self.reranking_features = {name.removeprefix(RERANKING): tensors[name] for name in reranking}
+        self.appearance = tensors.get("appearance")
 
     def __len__(self) -> int:
         return len(self.views)
@@ -139,7 +137,8 @@ class ViewBank:
             pipeline = pipeline.with_pose_prior("given")
         describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
-        reranking = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
+        term = pipeline.stored_appearance(len(views))
+        appearance = None if term is None else term.build().to(device)
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
@@ -147,8 +146,8 @@ class ViewBank:
             for name in ("points", "silhouettes"):  # (N, S, S) bool to (N, ceil(S * S / 8)) uint8
                 packed = np.packbits(tensors[name].flatten(1).cpu().numpy(), axis=1)
                 tensors[name] = torch.from_numpy(packed).to(device)
-            for name, module in reranking.items():
-                tensors[RERANKING + name] = module.describe(describe.shaded(*chunk)).half()
+            if appearance is not None:
+                tensors["appearance"] = appearance.describe(describe.shaded(*chunk)).half()
             return tensors
 
         parts = []
@@ -176,7 +175,7 @@ class ViewBank:
             "boxes": self.boxes,
             "points": self._points,
             "silhouettes": self._silhouettes,
-            **{RERANKING + name: features for name, features in self.reranking_features.items()},
+            **({} if self.appearance is None else {"appearance": self.appearance}),
         }
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -273,7 +272,8 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
     """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
     N, masks = len(views), -(-(settings.image_size**2) // 8)
     widths = {"descriptors": hog_layer(settings).length, "boxes": 4, "points": masks, "silhouettes": masks}
-    widths |= {name: tensors[name].shape[-1] for name in tensors if name.startswith(RERANKING)}
+    if "appearance" in tensors:
+        widths["appearance"] = tensors["appearance"].shape[-1]
     for name, width in widths.items():
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.

@@ -400,8 +400,8 @@ class Rig:
             similarity = (views @ photograph.descriptor).double().cpu()
             appearance, ranking = torch.zeros_like(similarity), photograph.result.ranking
             if Appearance.name in ranking.terms:
-                pictures, only = matcher.describer.shaded(R, distance), torch.zeros(len(T)).long()
-                appearance = matcher.reranking_score(Appearance.name, photograph.query, ranking, pictures, only)
+                pictures = matcher.describer.shaded(R, distance)
+                appearance = matcher.appearance_score(photograph.query, ranking, pictures)
             parts.append(torch.stack([similarity, appearance]))
         similarity, appearance = torch.stack(parts, dim=1)
         return torch.stack([self.ranks(T), similarity, support, appearance], dim=-1)

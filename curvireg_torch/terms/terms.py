@@ -35,7 +35,7 @@ class QueryFeatures:
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
-        reranking_features: features of the crops that reranking terms have computed, by the term's name.
+        computed: features of the crops that terms have computed, by the term's name.
     """
 
     regions: Tensor
@@ -43,7 +43,7 @@ class QueryFeatures:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
-    reranking_features: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
+    computed: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
     @property
     def crops(self) -> Tensor:
@@ -156,44 +156,6 @@ class Term(ABC):
     @abstractmethod
     def log_score(self, raw: Tensor) -> Tensor:
         """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it."""
-
-
-@dataclass(frozen=True)
-class RerankingTerm(Term):
-    """A term that needs a picture of every view that it compares. A bank of up to ``exhaustive_limit`` views stores the
-    features of all its views. In a larger bank the term compares only the best distinct views of the other terms; every
-    other view gets the score of the nearest compared view, and NaN as raw score.
-
-    Attributes:
-        exhaustive_limit: largest number of views that are all compared.
-        top, min_angle: in a larger bank, number of compared views and minimal angle between them in degrees.
-    """
-
-    exhaustive_limit: int = 1000
-    top: int = 64
-    min_angle: float = 20.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self.min_angle, "min_angle", zero_ok=True)
-        check_integer(self.top, f"{self.name}: top")
-        check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
-
-    @abstractmethod
-    def build(self, views: Views | None) -> "RerankingModule":
-        """The module that describes and compares. It does not depend on the views."""
-
-
-class RerankingModule(nn.Module, ABC):
-    """Describes pictures of views, and compares photographs with them."""
-
-    @abstractmethod
-    def describe(self, pictures: Tensor) -> Tensor:
-        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
-
-    @abstractmethod
-    def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
-        """(B, N) raw scores of B photographs and the (N, D) features of N views."""
 
 
 def log_unit_score(similarity: Tensor) -> Tensor:
@@ -414,42 +376,57 @@ class _BoxShapeModule(nn.Module):
 
 
 @dataclass(frozen=True)
-class Appearance(RerankingTerm):
+class Appearance(Term):
     """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view. A mesh
     with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
-    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views."""
+    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views.
+
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank only the best
+    distinct views of the other terms are compared, ``top`` of them, at least ``min_angle`` degrees apart; every other
+    view gets the score of the nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
+    """
 
     name: ClassVar[str] = "appearance"
     weight: float = 2.0
-    weights: str = SHA256[:16]  # digest of the network's
+    exhaustive_limit: int = 1000
+    top: int = 64
+    min_angle: float = 20.0
+    weights: str = SHA256[:16]
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_positive(self.min_angle, "min_angle", zero_ok=True)
+        check_integer(self.top, f"{self.name}: top")
+        check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
         if self.weights != SHA256[:16]:
             raise InvalidInputError(f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}")
 
-    def build(self, views: Views | None) -> RerankingModule:
-        return _AppearanceModule()
+    def build(self, views: Views | None = None) -> "AppearanceModule":
+        return AppearanceModule()
 
     def log_score(self, raw: Tensor) -> Tensor:
         return log_unit_score(raw)
 
 
-class _AppearanceModule(RerankingModule):
+class AppearanceModule(nn.Module):
+    """Describes pictures of views, and compares photographs with them."""
+
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone()
 
     def describe(self, pictures: Tensor) -> Tensor:
+        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
         grey, colour = pictures[:, :1], pictures[:, 1:]
         features = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
         return torch.cat(features, dim=1)
 
     def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
-        if Appearance.name not in query.reranking_features:  # shared by ranking and rescoring
-            query.reranking_features[Appearance.name] = describe(query.crops, self.backbone)
-        crops = query.reranking_features[Appearance.name]
+        """(B, N) raw scores of B photographs and the (N, D) features of N views."""
+        if Appearance.name not in query.computed:  # shared by ranking and rescoring
+            query.computed[Appearance.name] = describe(query.crops, self.backbone)
+        crops = query.computed[Appearance.name]
         similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 

@@ -130,7 +130,7 @@ def with_nan(x):
         ("boxes", lambda x: x[:, [2, 1, 0, 3]], "empty"),
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
-        ("reranking.appearance", with_nan, "appearance: .* not finite"),
+        ("appearance", with_nan, "appearance: .* not finite"),
         ("mesh.faces", lambda x: x + 10**6, "not a mesh"),
     ],
 )
