@@ -142,7 +142,7 @@ class ViewBank:
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
-            tensors = dict(vars(describe(*chunk)))
+            tensors = describe(*chunk)
             for name in ("points", "silhouettes"):  # (N, S, S) bool to (N, ceil(S * S / 8)) uint8
                 packed = np.packbits(tensors[name].flatten(1).cpu().numpy(), axis=1)
                 tensors[name] = torch.from_numpy(packed).to(device)

@@ -1,7 +1,6 @@
 """Views of one mesh: framed as a photograph's crop is, rendered, filtered and described."""
 
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -36,18 +35,6 @@ def depth_filter(settings: BankSettings) -> nn.Module:
 def hog_layer(settings: BankSettings) -> HOG:
     """The descriptor of views and photographs."""
     return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
-
-
-@dataclass(frozen=True)
-class DescribedViews:
-    """N described views: ``descriptors`` (N, D) float32; ``points``, ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4)
-    float64 of the object in normalised image coordinates (focal length 1), its centre on the axis; in model units for
-    an orthographic camera."""
-
-    descriptors: Tensor
-    points: Tensor
-    silhouettes: Tensor
-    boxes: Tensor
 
 
 class ViewDescriber:
@@ -152,8 +139,10 @@ class ViewDescriber:
         return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
-    def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
-        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once."""
+    def __call__(self, rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
+        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once.
+        ``descriptors`` (N, D) float32; ``points`` and ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4) float64 of the
+        object in normalised image coordinates (focal length 1), its centre on the axis; orthographic in model units."""
         source, quarters = quarter_turns(rotations, distances)
         rendered = source == torch.arange(len(source))
         depth, boxes = self.depth(rotations[rendered], distances[rendered])
@@ -170,7 +159,7 @@ class ViewDescriber:
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
             boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
-        return DescribedViews(descriptors, points, silhouettes, boxes)
+        return {"descriptors": descriptors, "points": points, "silhouettes": silhouettes, "boxes": boxes}
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:

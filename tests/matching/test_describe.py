@@ -22,10 +22,10 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     ]  # two directions, 0 and 35
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
-        assert (together.descriptors[i] - alone.descriptors[0]).norm() < 0.02 * alone.descriptors[0].norm()
-        assert (together.points[i] ^ alone.points[0]).float().mean() < 0.01
-        assert (together.silhouettes[i] ^ alone.silhouettes[0]).float().mean() < 0.001
-        torch.testing.assert_close(together.boxes[i], alone.boxes[0], rtol=0, atol=1e-6 * describe.radius)
+        assert (together["descriptors"][i] - alone["descriptors"][0]).norm() < 0.02 * alone["descriptors"][0].norm()
+        assert (together["points"][i] ^ alone["points"][0]).float().mean() < 0.01
+        assert (together["silhouettes"][i] ^ alone["silhouettes"][0]).float().mean() < 0.001
+        torch.testing.assert_close(together["boxes"][i], alone["boxes"][0], rtol=0, atol=1e-6 * describe.radius)
 
 
 def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
@@ -35,6 +35,6 @@ def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     quick = ViewDescriber(fine, BankSettings())
     assert len(fine.faces) > 2 * VIEW_FACES
     expected, found = (each(views.rotations, views.distance * exact.radius) for each in (exact, quick))
-    assert float((expected.silhouettes ^ found.silhouettes).float().mean()) < 1e-3
-    assert float(torch.cosine_similarity(expected.descriptors, found.descriptors).min()) > 0.995
-    torch.testing.assert_close(found.boxes, expected.boxes)
+    assert float((expected["silhouettes"] ^ found["silhouettes"]).float().mean()) < 1e-3
+    assert float(torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min()) > 0.995
+    torch.testing.assert_close(found["boxes"], expected["boxes"])
