@@ -127,16 +127,10 @@ class ViewDescriber:
         return render_colour(self._mesh, T, K, size, renderer=self.renderer)
 
     @torch.no_grad()
-    def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 2, S, S) fields of the framed views."""
-        out: Tensor = self._filter(self.depth(rotations, distances)[0])
-        return out
-
-    @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) descriptors of the framed views."""
         chunks = zip(rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True)
-        return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
+        return torch.cat([self.descriptor(self._filter(self.depth(R, z)[0])) for R, z in chunks])
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
