@@ -22,11 +22,6 @@ class Positive(nn.Module):
         return value.log()
 
 
-def _options(function: Callable[..., Any]) -> dict[str, Any]:
-    """Keyword-only options and their defaults."""
-    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY}
-
-
 class FunctionModule(nn.Module):
     """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``. It holds
     the function's options, refuses what the function refuses, and has its documentation. A twin writes its constructor
@@ -40,23 +35,19 @@ class FunctionModule(nn.Module):
             return
         cls._function = staticmethod(function)
         declared = cls.__init__
-        signature = inspect.signature(declared)
-        wanted, stated = _options(function), _options(declared)
-        if wanted != {name: default for name, default in stated.items() if name != "learnable"}:
-            raise TypeError(f"{cls.__name__}: expected the options of its function, {wanted}, got {stated}")
+        defaults = {name: p.default for name, p in inspect.signature(declared).parameters.items() if name != "self"}
 
         @functools.wraps(declared)
-        def construct(self: "FunctionModule", *args: Any, **options: Any) -> None:
-            bound = signature.bind(self, *args, **options)
-            bound.apply_defaults()
-            values = {name: value for name, value in bound.arguments.items() if name not in ("self", "learnable")}
-            FunctionModule.__init__(self, learnable if bound.arguments.get("learnable") else (), **values)
+        def construct(self: "FunctionModule", **options: Any) -> None:
+            declared(self, **options)  # refuses other names
+            values = {**defaults, **options}
+            FunctionModule.__init__(self, learnable if values.pop("learnable", False) else (), **values)
             # The function refuses wrong options: it is called with no image, or with as many as there are cameras.
             camera = values.get("camera_matrix")
             count = len(camera) if isinstance(camera, Tensor) and camera.ndim == 3 else 0
             function(torch.zeros(count, 1, 1, 1, device=getattr(camera, "device", "cpu")), **values)
 
-        cls.__init__ = construct  # type: ignore[method-assign]
+        cls.__init__ = construct  # type: ignore[method-assign, assignment]
         if cls.__doc__:
             flag = f" ``learnable`` makes {' and '.join(learnable)} positive parameters." if learnable else ""
             usage = f"The constructor takes the options, a call the images.{flag}"
