@@ -60,8 +60,10 @@ class _Residual(nn.Module):
 
 
 class FieldNetwork(nn.Module):
-    """A small U-Net with additive skips, which predicts a field and the object's mask; ``widths`` are the channels at
-    strides 2, 4, 8 and 16.
+    """A small U-Net with additive skips, which predicts a field and the object's mask.
+
+    Args:
+        widths: channels at strides 2, 4, 8 and 16.
 
     Shape:
         Input (B, 3, H, W) in [0, 1], H and W multiples of 16; output (B, 3, H/2, W/2): channels 0 and 1 are the field
