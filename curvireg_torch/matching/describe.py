@@ -50,6 +50,7 @@ class ViewDescriber:
         device: torch.device | str = "cpu",
     ) -> None:
         self._mesh = self._simple = mesh
+        self._coloured = has_colours(mesh)
         self.renderer = self.view_renderer = make_renderer(mesh, renderer)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
@@ -112,7 +113,7 @@ class ViewDescriber:
         S, projection = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
         grey = shade(self.view_renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
-        if not has_colours(self._mesh):
+        if not self._coloured:
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
         return torch.cat([grey, colour.to(grey)], dim=1)
@@ -120,7 +121,7 @@ class ViewDescriber:
     @property
     def draws_colours(self) -> bool:
         """Whether the mesh has colours, and :meth:`draw` can show them."""
-        return hasattr(self.renderer, "faces_at") and has_colours(self._mesh)
+        return self._coloured and hasattr(self.renderer, "faces_at")
 
     def draw(self, T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
         """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""
