@@ -122,6 +122,8 @@ def add_view(commands: Any) -> None:
 def view(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
+    for path in (path for path in photos if path.suffix.lower() == ".csv"):
+        raise InvalidInputError("a table where a photograph is expected; drop a rig file on the page", subject=path)
     check_given(photos, meshes)
     check_viewer("view")
     from ..utils.threads import one_torch_thread

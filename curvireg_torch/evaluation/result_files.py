@@ -18,6 +18,9 @@ from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .store import to_json
 
+RigPicture = tuple[Tensor, Tensor, Tensor, str] | None
+"""Pixels, camera matrix, ``T_cam_from_world`` and name of a photograph of a rig; None if it could not be read."""
+
 MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
 
 
@@ -40,30 +43,36 @@ def write_result(
 
 
 def write_views(
-    out: Path,
-    document: dict[str, Any],
-    registrar: Registrar,
-    result: Registration,
-    photographs: Sequence[tuple[Tensor, Tensor, Tensor, str] | None],
+    out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, photographs: Sequence[RigPicture]
 ) -> None:
-    """Write the files of one pose in several photographs: pixels, camera matrix, ``T_cam_from_world`` and name of each,
-    or None for one that could not be read."""
-    registrar = registrar.of_model(result.model)
-    mesh, renderer = registrar.bank.mesh, registrar.describer.renderer
-    assert result.transform is not None
-    T, read = result.transform, [(one, view) for one, view in zip(photographs, result.views, strict=True) if one]
-    shown = []
-    for (image, K, _, name), view in read:
-        score = "" if view.edge_support is None else f"edge support {view.edge_support:.2f}"
-        box = None if view.box is None else view.box.tolist()
-        shown.append(((view.T_cam_from_model, K), image, box, f"{name}: {view.failure or score}"))
-    cameras = [(P, K, image) for (image, K, P, _), view in read if not view.failure]
+    """Write the files of one pose in several photographs."""
+    few = len(registrar.of_model(result.model).bank.mesh.faces) <= MAX_GLB_FACES
     _write(
         out,
         document,
-        lambda: png(views_sheet(renderer, shown)),
-        lambda: scene_glb(mesh, T, cameras) if len(mesh.faces) <= MAX_GLB_FACES else None,
+        lambda: views_picture(registrar, result, photographs),
+        lambda: views_glb(registrar, result, photographs) if few else None,
     )
+
+
+def views_picture(registrar: Registrar, result: Registration, photographs: Sequence[RigPicture]) -> bytes:
+    """``overlay.png`` of several photographs: those that could be read, with the contours at the pose."""
+    shown = []
+    for one, view in zip(photographs, result.views, strict=True):
+        if one is not None:
+            image, K, _, name = one
+            score = "" if view.edge_support is None else f"edge support {view.edge_support:.2f}"
+            box = None if view.box is None else view.box.tolist()
+            shown.append(((view.T_cam_from_model, K), image, box, f"{name}: {view.failure or score}"))
+    return png(views_sheet(registrar.of_model(result.model).describer.renderer, shown))
+
+
+def views_glb(registrar: Registrar, result: Registration, photographs: Sequence[RigPicture]) -> bytes:
+    """``pose.glb`` of several photographs, with the cameras of those that count."""
+    assert result.transform is not None
+    pairs = zip(photographs, result.views, strict=True)
+    cameras = [(one[2], one[1], one[0]) for one, view in pairs if one is not None and not view.failure]
+    return scene_glb(registrar.of_model(result.model).bank.mesh, result.transform, cameras)
 
 
 def _write(

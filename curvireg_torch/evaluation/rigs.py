@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from ..data import load_camera
 from ..data.bop import bop_box, entry_at
@@ -20,6 +19,7 @@ from ..registration.result import result_document
 from ..utils.checks import check_pose
 from ..utils.files import check_table_size, finite_numbers, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, csv_cells, numbers_of
+from .result_files import RigPicture
 from .runner import View, register_views
 
 ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
@@ -150,7 +150,7 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
 
 def register_rig(
     path: Path, rig: Sequence[View], registrar: Registrar, *, bank_seconds: float
-) -> tuple[Registration, dict[str, Any], list[tuple[Tensor, Tensor, Tensor, str] | None]]:
+) -> tuple[Registration, dict[str, Any], list[RigPicture]]:
     """Register the photographs of a rig together, see :func:`.runner.register_views`.
 
     Returns the registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph,
@@ -164,7 +164,7 @@ def register_rig(
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
     document["frame"] = "world"
     document["inputs"] = {"rig": str(path), "box": None}
-    found = []
+    found: list[RigPicture] = []
     for row, view, one, camera in zip(document["views"], rig, seen, cameras, strict=True):
         row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
         row["T_cam_from_world"] = view.T_cam_from_world.tolist()

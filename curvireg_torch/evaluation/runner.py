@@ -58,6 +58,7 @@ class View:
     box: Sequence[float] | None  # x0, y0, x1, y1 in px
     camera: Camera
     T_cam_from_world: Tensor  # (4, 4) float64, lengths in the mesh's unit
+    image: Tensor | None = None  # its pixels, if it was read already
 
 
 @dataclass(frozen=True)
@@ -203,7 +204,7 @@ def register_views(
     for view in views:
         one, camera = None, view.camera
         with suppress(CurviregError, OSError):  # the registrar reports what cannot be read, and goes on without it
-            one = read_photo(view.photo, as_stored=as_stored).image
+            one = read_photo(view.photo, as_stored=as_stored).image if view.image is None else view.image
         try:
             if one is not None:
                 camera = camera.at((one.shape[-2], one.shape[-1]))

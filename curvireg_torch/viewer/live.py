@@ -19,6 +19,8 @@ HOST = "127.0.0.1"
 TICK_SECONDS = 0.04  # between two looks for a new frame
 QUALITY = 80  # of the JPEG files
 STOP_SECONDS = 5.0  # that the server may take to end
+WAITING = "Waiting for the first frame."
+ENDED = "The video has ended. This was its last frame; you can close the page."
 
 
 class LivePage:
@@ -29,7 +31,7 @@ class LivePage:
 
     def __init__(self, registrar: Registrar) -> None:
         self.registrar, self.frame, self.number, self.ratio = registrar, b"", 0, 1.0
-        self._wanted = True
+        self._wanted, self._ended = True, False
 
     def __enter__(self) -> Self:
         app.get("/frame")(self._send)
@@ -41,6 +43,8 @@ class LivePage:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended = True
+        self._thread.join(5 * TICK_SECONDS)  # windows show it
         self._server.should_exit = True
         self._thread.join(STOP_SECONDS)
         self._listener.close()
@@ -57,10 +61,17 @@ class LivePage:
         return Response(self.frame, media_type="image/jpeg", headers={"Cache-Control": "no-store"})
 
     def _build(self) -> None:
+        ui.dark_mode(None)
+        ui.add_css("body:has(.ended) #popup { display: none !important }")  # not reconnecting
+        note = ui.label(WAITING).props("data-testid=note")
         picture: Any = ui.interactive_image().props("data-testid=live")
         picture.shown = 0
 
         def refresh() -> None:
+            note.set_visibility(self._ended or not self.number)
+            if self._ended:
+                note.set_text(ENDED)
+                note.classes("ended")
             if picture.shown != self.number:
                 picture.shown = self.number
                 picture.set_source(f"frame?{self.number}")

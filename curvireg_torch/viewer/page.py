@@ -23,6 +23,7 @@ STAGES: Mapping[str, str] = {
     "contours": "fitting contours",
 }
 BOX_HINT = "Drag a rectangle around the object. Without one the whole photograph is searched: slower, less certain."
+BOX_HINT_IN_RIG = "Drag a rectangle around the object. Where there is none, the other photographs say where to look."
 
 
 def build_page(workspace: Workspace) -> None:
@@ -33,10 +34,8 @@ def build_page(workspace: Workspace) -> None:
     text("a", "To the photograph", "skip", href="#work")
     ui.dark_mode(None)
     with region("header", "top"):
-        with region("div"):
-            text("h1", "curvireg")
-            text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
-        button("Sample", workspace.load_sample, "sample-again", "quiet")
+        text("h1", "curvireg")
+        text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
     with region("div", "work", id="work"):
         stage = Stage(workspace)
         with region("div", "side"):
@@ -76,7 +75,11 @@ class Steps:
                         file_chooser("Choose files", f"upload-{name}")
                         self.messages[name] = self._message(name)
                     if name == "photograph":
-                        self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet below")
+                        self.facts["rig"] = text("p", "", "facts", data_testid="rig-facts")
+                        self.messages["rig"] = self._message("rig")
+                        with region("div", "row below"):
+                            self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
+                            self.no_rig = button("Without the rig", workspace.remove_rig, "no-rig", "quiet")
                     if name == "mesh":
                         self.use_mm = button(
                             "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
@@ -100,24 +103,35 @@ class Steps:
         """Show the state of the workspace."""
         session, workspace, shot = self.session, self.workspace, self.session.shot
         for part, element in self.messages.items():
-            set_text(element, workspace.messages.get(part, ""))
+            set_text(element, workspace.messages.get(part, session.rig_gaps() if part == "rig" else ""))
         done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        set_text(self.facts["box"], BOX_HINT if shot.box is None else " ".join(f"{v:g}" for v in shot.box))
+        set_text(
+            self.facts["box"],
+            " ".join(f"{v:g}" for v in shot.box or ()) or (BOX_HINT_IN_RIG if shot.view else BOX_HINT),
+        )
+        together = len(session.together())
+        counted = f"{together} photograph{'s' * (together > 1)}"
+        set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
+        self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
-        self.no_photo.set_visibility(len(session.shots) > 1)
+        self.no_photo.set_visibility(shot.photo is not None)
         self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
-        set_text(self.find, "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose")
+        words = "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"
+        set_text(self.find, words if shot.view is None else f"Find the pose in {counted}")
         set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
         self._show_progress()
 
     def _describe_photo(self) -> str:
         shot = self.session.shot
         if shot.photo is None:
-            return "A picture with the whole object in it, or several of the same object."
+            return (
+                "A picture with the whole object in it, or several. Of several, a rig file (a CSV table, COLMAP, BOP) "
+                "makes one pose."
+            )
         H, W = shot.size
         return "; ".join([f"{self.session.name(shot.path)}: {W} x {H} px", *shot.photo.notes])
 
@@ -141,7 +155,7 @@ class Steps:
         elif workspace.receiving:
             words = f"receiving {', '.join(workspace.receiving.values())}"
         elif session.shot.result is not None:
-            changed = session.shot.result.request != session.request()
+            changed = session.shot.result.inputs != session.inputs()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)

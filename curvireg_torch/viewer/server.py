@@ -8,6 +8,7 @@ import tempfile
 import threading
 import warnings
 import webbrowser
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 from urllib.parse import unquote, urlsplit
@@ -56,7 +57,8 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
         with one_torch_thread(), warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show_warning
-            server.run(sockets=[listener])
+            with suppress(KeyboardInterrupt):  # uvicorn raises it again once the server has ended
+                server.run(sockets=[listener])
 
 
 def make_server(

@@ -1,4 +1,4 @@
-"""Photographs, mesh, results and the chosen poses. It needs no page and no NiceGUI."""
+"""Photographs, mesh, rig and options, what is registered with them, and how. It needs no page and no NiceGUI."""
 
 import math
 import shlex
@@ -13,184 +13,30 @@ import trimesh
 from torch import Tensor
 
 from ..data import read_photo
-from ..data.images import Photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
-from ..evaluation.runner import register_entry
-from ..geometry import rotation_error, rotation_from_axis_angle, undistorted
+from ..evaluation.result_files import RigPicture
+from ..evaluation.rigs import read_rig, register_rig
+from ..evaluation.runner import View, register_entry
+from ..geometry import undistorted
 from ..geometry.calibration import Camera
-from ..geometry.cameras import rotation_towards, transform
+from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
-from ..registration import Hypothesis, Registrar, Registration, fit_contours
+from ..registration import Registrar, Registration
 from ..registration.result import used_box
-from ..visualization import contour_overlay, pose_glb
-from ..visualization.encoding import png
 from ..visualization.pose_glb import mesh_glb
+from .shot import Numbers, Result, Shot, numbers
 
-__all__ = ["Answer", "Numbers", "Point", "Result", "Session", "Shot", "dragged_box"]
+__all__ = ["Session"]
 
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
-MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
-NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
-Numbers = tuple[float, float, float, float]
-Point = tuple[float, float]
+Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
 
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
-
-    pose: Hypothesis
-    number: int = 0
-    edits: tuple[str, ...] = ()
-
-    def registration(self, found: Registration) -> Registration:
-        """Return what was ``found`` with this pose first; nobody knows how probable a pose is that was set by hand."""
-        if self.number == 0 and not self.edits:
-            return found
-        order = sorted(range(len(found.hypotheses)), key=lambda k: k != self.number)
-        probabilities = () if self.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
-        hypotheses = (self.pose, *(found.hypotheses[k] for k in order[1:]))
-        return replace(found, hypotheses=hypotheses, probabilities=probabilities, confidence_features={})
-
-
-@dataclass(frozen=True)
-class Result:
-    """A registration with its inputs."""
-
-    registrar: Registrar
-    registration: Registration
-    document: dict[str, Any]  # the content of result.json, if the first answer is chosen
-    image: Tensor  # (3, H, W) uint8
-    box: Tensor  # (4,) px, with which the pose was found
-    request: RegisterOptions  # what was asked for
-
-    def moved(
-        self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
-    ) -> Tensor:
-        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
-
-        :class:`InvalidInputError` if the object would touch the camera.
-        """
-        describer = self.registrar.describer
-        angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
-        centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
-        if float(centre[2]) < NEAREST * describer.radius:
-            raise InvalidInputError("the object would touch the camera; move it away")
-        T = T.clone()
-        T[:3, :3] = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
-        T[:3, 3] = centre - T[:3, :3] @ describer.centre
-        return T
-
-    def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
-        """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
-        describer, (dx, dy) = self.registrar.describer, (end[0] - start[0], end[1] - start[1])
-        if max(abs(dx), abs(dy)) < 1.0:  # a click
-            return T
-        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
-        radii = depth / float(K[0, 0]) / describer.radius  # that one pixel is long
-        if turns:
-            return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
-        return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
-
-    def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
-        """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
-        describer = self.registrar.describer
-        centre = T[:3, :3] @ describer.centre + T[:3, 3]
-        shift = ((1.0 / factor - 1.0) * centre / describer.radius).tolist()
-        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift)
-
-
-@dataclass(eq=False)
-class Shot:
-    """A photograph, without the distortion of a calibrated camera, and what belongs to it.
-
-    ``box_before`` and ``answer_before`` are those before the last change by hand.
-    """
-
-    path: Path = Path()
-    photo: Photo | None = None
-    box: Numbers | None = None
-    box_before: Numbers | None = None
-    result: Result | None = None
-    answer: Answer | None = None
-    answer_before: Answer | None = None
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(H, W) of the photograph."""
-        assert self.photo is not None
-        return int(self.photo.image.shape[-2]), int(self.photo.image.shape[-1])
-
-    def set_box(self, box: Numbers | None) -> None:
-        """Replace the box."""
-        if box != self.box:
-            self.box_before, self.box = self.box, box
-
-    def require_result(self) -> tuple[Result, Answer]:
-        """The result and the chosen pose; an error if there is none yet."""
-        if self.result is None or self.answer is None:
-            raise InvalidInputError("there is no result yet; register first")
-        return self.result, self.answer
-
-    def choose(self, number: int) -> None:
-        """Make a hypothesis the answer, by its number from 0."""
-        assert self.result is not None
-        self.answer_before = None
-        self.answer = Answer(self.result.registration.hypotheses[number], number)
-
-    def place(self, T: Tensor, edit: str = "moved") -> None:
-        """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
-        result, answer = self.require_result()
-        describer, (before, K) = result.registrar.describer, answer.pose.projection
-        old, centre = (pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T))
-        degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        radii = float(torch.linalg.vector_norm(centre - old)) / describer.radius
-        allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
-        pose = replace(
-            answer.pose,
-            rotation=T[:3, :3].clone() if has_translation else allocentric,
-            translation=T[:3, 3].clone() if has_translation else None,
-            score=float("nan"),
-            evidence={},
-            allocentric_rotation=allocentric,
-            distance=float(torch.linalg.vector_norm(centre)),
-            projection=(T, K),
-            edge_support=None,
-            covariance=None,
-        )
-        edit = f"{edit}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        self.answer_before, self.answer = answer, Answer(pose, answer.number, (*answer.edits, edit))
-
-    def fit(self) -> None:
-        """Fit the contours at the answer to the photograph's edges."""
-        result, answer = self.require_result()
-        (T, K), registrar = answer.pose.projection, result.registrar
-        margin = registrar.bank.settings.margin
-        fit = fit_contours(registrar.describer.contours, result.image, result.box, K, T[None], margin=margin)
-        supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
-        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
-
-    def undo(self) -> None:
-        """Take back the last change by hand; a second call repeats it."""
-        if self.answer_before is not None:
-            self.answer, self.answer_before = self.answer_before, self.answer
-
-    def glb(self) -> bytes:
-        """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
-        result, answer = self.require_result()
-        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, result.image)
-
-    def overlay(self) -> bytes:
-        """The contours at the answer on the photograph, as a PNG file."""
-        result, answer = self.require_result()
-        return png(contour_overlay(result.registrar, answer.pose, result.image, result.box))
 
 
 @dataclass
@@ -201,7 +47,8 @@ class Session:
         options: of ``curvireg view``, with the camera of all photographs; :meth:`set_camera` changes it.
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
-        searched: the one in which a registration runs.
+        rig_path, rig: the file of a rig, and its rows; none if it could not be read.
+        searched: those in which a registration runs.
         progress, cancelled: stage, done and total of a registration; True ends it at its next step.
     """
 
@@ -209,7 +56,9 @@ class Session:
     folder: Path | None = None
     shots: list[Shot] = field(default_factory=list)
     shot: Shot = field(default_factory=Shot)
-    searched: Shot | None = None
+    rig_path: Path | None = None
+    rig: tuple[View, ...] = ()
+    searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: trimesh.Trimesh | None = None
     progress: tuple[str, int, int] = ("", 0, 1)
@@ -230,15 +79,20 @@ class Session:
         """What the user calls a file."""
         return Path(path).name if self.folder in Path(path).parents else str(path)
 
+    def usable_name(self, path: Path) -> str:
+        """:meth:`name`, in commands and programs; the sample is there as long as the page is."""
+        return str(path) if path.parent == self.folder else self.name(path)
+
     def close(self) -> None:
-        """Forget the photographs and the mesh."""
+        """Forget the photographs, the rig and the mesh."""
         self.shots, self.shot, self.mesh_path, self.mesh = [], Shot(), None, None
+        self.rig_path, self.rig = None, ()
 
     def open_photo(self, path: Path, box: Numbers | None = None) -> Shot:
         """Add a photograph, and show it; a box in it loses its distortion too."""
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
             raise InvalidInputError(f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path)
-        self.shot = Shot(path, *self._read(path, self.options.camera, box))
+        self.shot = self._opened(path, box, self._row_of(path, self.shots))
         self.shots.append(self.shot)
         return self.shot
 
@@ -251,38 +105,105 @@ class Session:
         if shot is self.shot:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
-    def _read(
-        self, path: Path, camera: Numbers | Camera | None, box: Numbers | None = None
-    ) -> tuple[Photo, Numbers | None]:
-        """A photograph and a box without the distortion of a calibrated camera, which must fit the photograph."""
-        photo = read_photo(path, dtype=torch.uint8)
+    def _opened(self, path: Path, box: Numbers | None, view: View | None) -> Shot:
+        """A photograph and a box, those of a ``view`` of a rig if there is one, without the distortion of the camera,
+        which must fit the photograph."""
+        photo, camera = read_photo(path), self.options.camera
+        if view is not None:
+            camera, box = view.camera, box if box is not None or view.box is None else numbers(view.box)
         if not isinstance(camera, Camera):
-            return photo, box
+            return Shot(path, photo, box, view)
         try:
             image, moved, _, _ = undistorted(photo.image, camera, None if box is None else torch.tensor(box))
         except InvalidInputError as error:
-            raise error.with_subject(path) from error
+            raise error.with_subject(path if view is None else view.name) from error
         if moved is not None and camera.distorts:
-            x0, y0, x1, y1 = (round(float(v), 1) for v in moved)
-            box = x0, y0, x1, y1
-        return replace(photo, image=image, notes=(*photo.notes, *["undistorted"] * camera.distorts)), box
+            box = numbers([round(float(v), 1) for v in moved])
+        notes = (*photo.notes, *["undistorted"] * camera.distorts)
+        return Shot(path, replace(photo, image=image, notes=notes), box, view)
+
+    def _open_again(self, shot: Shot, view: View | None) -> Shot:
+        """A photograph with another camera, or row of a rig. Its box stays unless distortion is removed, or no longer
+        is; its result only where no rig is concerned."""
+        opened = self._opened(shot.path, None, view)
+        if opened.is_undistorted or shot.is_undistorted:
+            return opened
+        if view is not None or shot.view is not None:
+            return replace(opened, box=shot.box or opened.box, box_before=shot.box_before)
+        return shot
+
+    def _replace_shots(self, shots: list[Shot]) -> None:
+        if self.shots:
+            self.shot, self.shots = shots[self.shots.index(self.shot)], shots
+
+    def open_rig(self, path: Path | None) -> None:
+        """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to photographs by their file
+        names. A rig that cannot be used has no rows."""
+        self.rig_path, self.rig = path, ()
+        self._replace_shots([self._open_again(shot, None) if shot.view else shot for shot in self.shots])
+        if path is None:
+            return
+        folder = path if path.is_dir() else path.parent
+        try:
+            rig = tuple(read_rig(path, self.mesh_path))
+            names = [_key(view.photo) for view in rig]
+            if twice := [view.name for view, key in zip(rig, names, strict=True) if names.count(key) > 1]:
+                message = f"{' and '.join(twice[:2])} have the same file name; rename the photographs"
+                raise InvalidInputError(message, subject=path)
+            self.rig, shots = rig, list[Shot]()
+            for shot in self.shots:
+                view = self._row_of(shot.path, shots)
+                shots.append(self._open_again(shot, view) if view else shot)
+        except CurviregError as error:
+            self.rig = ()
+            subject = str(error.subject or "").replace(f"{folder}/", "")
+            raise error.with_subject(subject.replace(str(path), self.rig_name)) from error
+        self._replace_shots(shots)
+
+    def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
+        """The row of the rig with the file name of a photograph, if none of ``shots`` has it."""
+        taken = [_key(shot.path) for shot in shots if shot.view is not None]
+        rows = [view for view in self.rig if _key(view.photo) == _key(path) and _key(path) not in taken]
+        return rows[0] if rows else None
+
+    def together(self, shot: Shot | None = None) -> list[Shot]:
+        """The photographs that are registered with one, by default the shown one: those of the rig, or it alone."""
+        shot = shot or self.shot
+        return [shot] if shot.view is None else [one for view in self.rig for one in self.shots if one.view is view]
 
     @property
-    def is_undistorted(self) -> bool:
-        """Whether the distortion of the camera is removed from photographs."""
-        return isinstance(self.options.camera, Camera) and self.options.camera.distorts
+    def rig_name(self) -> str:
+        """What the user calls the rig."""
+        path = self.rig_path
+        return "" if path is None else "scene_camera.json" if path.is_dir() else path.name
+
+    def rig_gaps(self) -> str:
+        """Which photographs of the rig are not open, and which are not of it, in words."""
+        if not self.rig:
+            return ""
+        used = {_key(shot.path) for shot in self.shots if shot.view is not None}
+        missing = [view.photo.name for view in self.rig if _key(view.photo) not in used]
+        others = [shot.path.name for shot in self.shots if shot.view is None]
+        gaps = []
+        if missing:
+            gaps.append(f"not open: {_listed(missing)}; drop what is missing here" + ", or go on without" * bool(used))
+        if others:
+            gaps.append(f"not in the rig: {_listed(others)}; registered alone")
+        return "; ".join(gaps)
 
     def set_camera(self, camera: Numbers | Camera | None = None, guess: str | float | None = None) -> None:
-        """Change the camera of all photographs: four numbers, a calibrated one, or a guess.
+        """Change the camera of all photographs that have none in a rig: four numbers, a calibrated one, or a guess.
 
         Boxes and results stay unless distortion is removed, or no longer is; after an error nothing has changed.
         """
-        was_undistorted, shots = self.is_undistorted, self.shots
-        if isinstance(camera, Camera) or was_undistorted:
-            shots = [Shot(shot.path, *self._read(shot.path, camera)) for shot in self.shots]
-        self.options = replace(self.options, camera=camera, guess=guess)
-        if self.shots and (self.is_undistorted or was_undistorted):
-            self.shot, self.shots = shots[self.shots.index(self.shot)], shots
+        before, self.options = self.options, replace(self.options, camera=camera, guess=guess)
+        try:
+            calibrated = isinstance(camera, Camera) or isinstance(before.camera, Camera)
+            shots = [self._open_again(shot, None) if calibrated and not shot.view else shot for shot in self.shots]
+        except CurviregError:
+            self.options = before
+            raise
+        self._replace_shots(shots)
 
     def open_mesh(self, path: Path) -> str:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
@@ -296,7 +217,9 @@ class Session:
             facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
         self.mesh_path, self.mesh = path, mesh
         for shot in self.shots:
-            shot.result = shot.answer = None
+            shot.result = None
+        if self.rig_path is not None and self.rig_path.is_dir():  # boxes of a BOP scene are those of the mesh
+            self.open_rig(self.rig_path)
         return facts
 
     @property
@@ -337,50 +260,90 @@ class Session:
         frame, radius = self.object_frame(), mesh_radius(self.mesh)
         return mesh_glb(self.mesh, transform(frame, -frame @ mesh_centre(self.mesh)) / radius)
 
+    def inputs(self, shot: Shot | None = None) -> tuple[RegisterOptions, tuple[Numbers | None, ...]]:
+        """The :meth:`request` of a photograph and the boxes of all that are registered with it."""
+        return self.request(shot), tuple(each.box for each in self.together(shot))
+
     def request(self, shot: Shot | None = None) -> RegisterOptions:
         """The registration that the inputs describe, in the photograph that is shown, or in another."""
-        shot, camera = shot or self.shot, self.options.camera
+        shot, camera, guess = shot or self.shot, self.options.camera, self.options.guess
+        if shot.view is not None:  # the rig has boxes and cameras
+            camera = guess = None
         if isinstance(camera, Camera):
             K = camera.matrix if shot.photo is None else camera.at(shot.size).matrix
             camera = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-        photos = () if shot.photo is None else (shot.path,)
+        photos = () if shot.photo is None else tuple(each.path for each in self.together(shot))
         meshes = () if self.mesh_path is None else (self.mesh_path,)
-        return replace(self.options, photos=photos, meshes=meshes, box=shot.box, camera=camera)
+        box = None if shot.view is not None else shot.box
+        return replace(self.options, photos=photos, meshes=meshes, box=box, camera=camera, guess=guess)
 
     def command(self) -> str:
-        """The command line that gives the same result; none takes the box of an undistorted photograph."""
-        return "" if self.is_undistorted else _command_line(self.request(), self.name)
+        """The command line that gives the same result; none takes the box of an undistorted photograph, or boxes and
+        photographs that a rig does not have."""
+        if self.shot.view is None:
+            return "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
+        shots = self.together()
+        if self.rig_path is None or len(shots) < len(self.rig) or not all(shot.has_box_of_view for shot in shots):
+            return ""
+        return _command_line(self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name)
 
     def register(self) -> Registration:
-        """Find the pose in the photograph that is shown, as ``curvireg register`` does."""
-        start, shot, camera = time.perf_counter(), self.shot, self.options.camera
-        request = self.request(shot)  # another photograph may be shown meanwhile
+        """Find the pose in the photograph that is shown, as ``curvireg register`` does, or in those of its rig."""
+        start, shot, inputs = time.perf_counter(), self.shot, self.inputs()
+        request, shots, command = inputs[0], self.together(), self.command()  # another may be shown meanwhile
         if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
-        photo, command = shot.photo, "" if self.is_undistorted else _command_line(request, self.name)
         check_camera(request.camera, request.guess)
-        self.searched = shot
+        if shot.view is not None and (request.limits or {}).keys() - QUALIFIERS:
+            raise InvalidInputError("a hint: photographs of a rig take none; press No hint")
+        self.searched = tuple(shots)
         try:
             registrar = self._open_registrar(request)
             registrar.progress = self._report_progress
-            entry = request.entry(request.photos[0])
-            meshes = tuple(Path(self.name(path)) for path in entry.meshes)
-            entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-            ready = time.perf_counter() - start
-            registration, document = register_entry(entry, photo, registrar, bank_seconds=ready)
+            register = self._register_alone if shot.view is None else self._register_rig
+            found, boxes = register(shots, request, registrar, time.perf_counter() - start)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
-            self.cancelled, self.searched = False, None
+            self.cancelled, self.searched = False, ()
+        result = Result(registrar, *found, inputs)
+        result.document["viewer"] = {"command": command}
+        for each, box in zip(shots, boxes, strict=True):
+            each.result, each.found_box = result, box
+        shot.choose(0)
+        return result.registration
+
+    def _register_alone(
+        self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
+    ) -> tuple[Found, list[Tensor | None]]:
+        ((shot,), camera) = shots, self.options.camera
+        assert shot.photo is not None
+        entry = request.entry(request.photos[0])
+        meshes = tuple(Path(self.name(path)) for path in entry.meshes)
+        entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
+        registration, document = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
         if isinstance(camera, Camera):
             document["camera"] = camera.at(shot.size).describe()
             document["inputs"]["camera_source"] = "file"
-        document["viewer"] = {"command": command}
-        box = torch.tensor(used_box(document))
-        shot.result = Result(registrar, registration, document, photo.image, box, request)
-        shot.choose(0)
-        return registration
+        return (registration, document, ()), [torch.tensor(used_box(document))]
+
+    def _register_rig(
+        self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
+    ) -> tuple[Found, list[Tensor | None]]:
+        views = []
+        for shot in shots:
+            assert shot.view is not None
+            assert shot.photo is not None
+            camera = Camera(shot.view.camera.at(shot.size).matrix, size=shot.size)
+            views.append(replace(shot.view, photo=shot.path, box=shot.box, camera=camera, image=shot.photo.image))
+        registration, document, photographs = register_rig(Path(self.rig_name), views, registrar, bank_seconds=seconds)
+        document["mesh"] = self.name(request.meshes[0])
+        for row, shot in zip(document["views"], shots, strict=True):
+            row["photo"] = self.name(row["photo"])
+            row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
+        boxes = [view.box for view in registration.views]
+        return (registration, document, photographs), boxes
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
@@ -388,7 +351,10 @@ class Session:
         document, registration = dict(result.document), answer.registration(result.registration)
         if registration is not result.registration:
             document |= registration.to_dict()
-            if document["inputs"]["camera_source"] in ("exif", "fov"):
+            if registration.views:
+                rows = zip(result.document["views"], document["views"], strict=True)
+                document["views"] = [{**row, **moved} for row, moved in rows]
+            if document["inputs"].get("camera_source") in ("exif", "fov"):
                 document["covariance"] = document["standard_deviations"] = None
             if "detection" in document:
                 first, *others = document["detection"]["instances"]
@@ -400,23 +366,36 @@ class Session:
     def python(self) -> str:
         """A Python program that gives the answer."""
         result, answer = self.shot.require_result()
-        request, prior = result.request, result.registration.prior
-        photo, mesh = repr(self.name(request.photos[0])), repr(self.name(request.meshes[0]))
-        if "undistorted" in result.document["inputs"]["picture"]["notes"]:
-            photo = f"cr.geometry.undistorted(cr.data.read_photo({photo}).image, cr.load_camera('CALIBRATION')).image"
+        (request, boxes), prior = result.inputs, result.registration.prior
+        mesh, rows = repr(self.usable_name(request.meshes[0])), result.document["views"]
+        photos = [repr(self.usable_name(path)) for path in request.photos]
+        if self.shot.is_undistorted:
+            read = "cr.geometry.undistorted(cr.data.read_photo({}).image, cr.load_camera('CALIBRATION')).image"
+            photos = list(map(read.format, photos))
         model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r})"
         model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
         pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
         pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
         pipeline = f"{pipeline}.with_pose_prior({request.pose!r})" if request.pose else pipeline
         pipeline = "None" if request.bank_decides and not request.pose else pipeline
+        if result.photographs:
+            call = [
+                f"cameras = {[row['camera']['matrix'] for row in rows]}",
+                f"T_cam_from_world = {[row['T_cam_from_world'] for row in rows]}",
+                f"photos, boxes = [{', '.join(photos)}], {list(boxes)}",
+                "result = registrar.register_views(photos, boxes, cameras, T_cam_from_world)",
+            ]
+        else:
+            call = [
+                f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
+                f"box, camera = {request.box}, {result.document['inputs']['camera']}",
+                f"result = cr.register({photos[0]}, registrar, box=box, camera=camera, prior=prior)",
+            ]
         lines = [
             "import curvireg_torch as cr",
             "",
             f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
-            f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
-            f"box, camera = {request.box}, {result.document['inputs']['camera']}",
-            f"result = cr.register({photo}, registrar, box=box, camera=camera, prior=prior)",
+            *call,
             f"pose = result.hypotheses[{answer.number}].pose_dict()",
             *([f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []),
         ]
@@ -441,35 +420,19 @@ class Session:
         return self._registrar[1]
 
 
-def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
-    """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from inside, or a new one."""
-    (x, y), (u, v) = start, end
-    x0, y0, x1, y1 = box or (math.inf, math.inf, -math.inf, -math.inf)
-    if x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach:
-        left, right = _near_edges(x, x0, x1, reach)
-        top, bottom = _near_edges(y, y0, y1, reach)
-        if not (left or right or top or bottom):
-            x0, y0, x1, y1 = x0 + u - x, y0 + v - y, x1 + u - x, y1 + v - y
-        x0, y0 = u if left else x0, v if top else y0
-        x1, y1 = u if right else x1, v if bottom else y1
-    else:
-        x0, y0, x1, y1 = x, y, u, v
-    if min(abs(x1 - x0), abs(y1 - y0)) < MIN_SIDE:
-        return box
-    return round(min(x0, x1), 1), round(min(y0, y1), 1), round(max(x0, x1), 1), round(max(y0, y1), 1)
+def _key(photo: Path) -> str:
+    """What files of one photograph have in common: those of BOP sets have different suffixes."""
+    return photo.stem.lower()
 
 
-def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool, bool]:
-    """Whether the low or the high edge is near; inside, at most a third of the box is near to an edge."""
-    inside = min(reach, (high - low) / 3)
-    return at <= low + inside, at > low + inside and at >= high - inside
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
-def _command_line(options: RegisterOptions, name: Callable[[Path], str]) -> str:
+def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:
     """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
-    words = ["curvireg", "register"]
-    for paths, placeholder in ((options.photos, "PHOTO"), (options.meshes, "MESH")):
-        words += list(map(name, paths)) or [placeholder]
+    words = ["curvireg", "register", *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"])]
+    words += list(map(name, options.meshes)) or ["MESH"]
     limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
     values: dict[str, Any] = {
         "box": options.box,

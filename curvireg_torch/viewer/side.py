@@ -13,8 +13,8 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .session import Answer, Numbers, Result
-from .widgets import button, fold, region, set_text, text
+from .shot import Answer, Numbers, Result, Shot
+from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
 
 __all__ = ["Answers", "Inputs", "Preview"]
@@ -31,8 +31,11 @@ VERDICTS = {
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
 UNDISTORTED = "None: the command line takes the box in the photograph as it was taken, the page in the undistorted one."
+NOT_IN_RIG = (
+    "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and open all photographs."
+)
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
-CAMERA_HINT = "With it the position is found. All photographs have the same: drop a calibration file, or type."
+CAMERA_HINT = "With it the position is found. All photographs have the same: type it, or choose a calibration."
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
@@ -43,8 +46,8 @@ class Answers:
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace, self.session = workspace, workspace.session
-        self.shown_result: Result | None = None
-        self.shown_answer: Answer | None = None
+        self.shown_cards: tuple[Result | None, Shot | None] = None, None
+        self.shown_answer: tuple[Answer | None, Shot | None] = None, None
         with region("section", "answers", aria_label="answer", data_testid="answers") as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
@@ -64,26 +67,28 @@ class Answers:
         document = {"result.json": lambda: to_json(session.document()).encode()}
         make = {"picture": session.shot.overlay, "pose.glb": session.shot.glb, **document}[kind]
         if content := await self.workspace.run("pose", make):
-            ui.download.from_url(self.workspace.serve(name, content, media_type), name)
+            ui.download.from_url(f"./{self.workspace.serve(name, content, media_type)}", name)
 
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""
-        result, answer = self.session.shot.result, self.session.shot.answer
+        shot, answer = self.session.shot, self.session.shot.answer
         self.section.set_visibility(answer is not None)
-        if answer is not self.shown_answer:
-            self.shown_answer = answer
+        if self.shown_answer[0] is not answer or self.shown_answer[1] is not shot:
+            self.shown_answer = answer, shot
             if answer is not None:
                 self._describe()
-        if result is not self.shown_result:
-            self.shown_result = result
-            if result is not None:
-                await self._draw_cards()
+        if self.shown_cards[0] is not shot.result or self.shown_cards[1] is not shot:
+            self.shown_cards = shot.result, shot
+            if shot.result is not None:
+                await self._draw_cards(shot)
         for number, card in enumerate(self.cards.default_slot.children):
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
         result, answer = self.session.shot.require_result()
-        document, pose = self.session.document(), answer.pose
+        document, shot, pose = self.session.document(), self.session.shot, answer.pose
+        if shot.view is not None:
+            pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = verdict(document["confidence"], document["none"], document["reliable"])
         word = "by hand" if answer.edits else word
         set_text(self.word, word)
@@ -97,9 +102,14 @@ class Answers:
         lines.append(f"azimuth {azimuth:.1f}, elevation {elevation:.1f}, theta {theta:.1f} degrees")
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
-            lines.append(f"translation {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}")
+            frame = "translation" if shot.view is None else "translation in the world"
+            lines.append(f"{frame} {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}")
         numbers = {"score": document["score"], "edge support": document["edge_support"]}
         lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
+        if shot.view is not None:
+            for row in document["views"]:
+                counts = "" if row["similarity"] is None else f"prefers the pose by {row['contribution']:.2f}"
+                lines += [f"{self.session.name(row['photo'])}: {said}" for said in [row["failure"] or counts] if said]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
         self.repairs.clear()
@@ -118,25 +128,30 @@ class Answers:
             self.workspace.start_search()
 
         if document.get("prior", {}).get("contradiction") is not None:
-            front = {name: value for name, value in (options.limits or {}).items() if name == "front"}
+            limits = dict(options.limits or {})
+            front = {name: value for name, value in limits.items() if name == "front"}
+            if "viewpoint" in limits:
+                azimuth, *rest = limits["viewpoint"]
+                around = {**limits, "viewpoint": ((azimuth + 180.0) % 360.0, *rest)}
+                found["Turn the hint around"] = lambda: search_with(limits=around)
             found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
-        if options.camera is None and options.guess is None and session.has_exif:
+        if shot.view is options.camera is options.guess is None and session.has_exif:
             found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
         if word == "no match":
             found["Draw the box again"] = lambda: shot.set_box(None)
         return found
 
-    async def _draw_cards(self) -> None:
-        shot = self.session.shot
-        result, _ = shot.require_result()
+    async def _draw_cards(self, shot: Shot) -> None:
+        (result, _), photo, box = shot.require_result(), shot.photo, shot.found_box
+        assert photo is not None
+        image, around = photo.image, [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
         def make() -> list[bytes]:
-            box = result.box.tolist()
-            return [thumbnail(renderer, pose.projection, result.image, box) for pose in hypotheses]
+            return [thumbnail(renderer, shot.projection_of(pose), image, around) for pose in hypotheses]
 
         pictures = await self.workspace.run("page", make) or ()
         self.cards.clear()
@@ -167,7 +182,9 @@ class Inputs:
             self.camera = ui.input("fx fy cx cy in px, or the horizontal field of view in degrees")
             self.camera.props("dense data-testid=camera").on_value_change(self._typed)
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
-            self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
+            with region("div", "row"):
+                file_chooser("From a file", "upload-camera")
+                self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -201,15 +218,15 @@ class Inputs:
 
     def _camera(self) -> tuple[float, ...]:
         """What the field shows: four numbers, the field of view, or nothing."""
-        guess = self.session.options.guess
+        guess = self.session.request().guess
         return self.session.request().camera or ((guess,) if isinstance(guess, float) else ())
 
     def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
-        session = self.session
-        set_text(self.command, session.command() or UNDISTORTED)
+        session, view = self.session, self.session.shot.view
+        set_text(self.command, session.command() or (UNDISTORTED if view is None else NOT_IN_RIG))
         set_text(self.python, "" if session.shot.answer is None else session.python())
-        now = (session.shot.path, session.options)
+        now = (session.shot.path, view is None, session.options)
         if now == self.shown:
             return
         self.shown, camera = now, self._camera()
@@ -217,11 +234,14 @@ class Inputs:
             self.camera.value = " ".join(repr(value).removesuffix(".0") for value in camera)
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
-        self.exif.set_visibility(session.has_exif)
+        self.camera.set_enabled(view is None)
+        self.exif.set_visibility(session.has_exif and view is None)
         set_text(self.camera_facts, self._describe_camera())
 
     def _describe_camera(self) -> str:
         camera, guess, photo = self.session.options.camera, self.session.options.guess, self.session.shot.photo
+        if self.session.shot.view is not None:
+            return "of each photograph, from the rig" + ", without its distortion" * self.session.shot.is_undistorted
         if guess == "exif" and photo is not None:
             focal = f"{photo.focal_35mm:g} mm of a 35 mm camera" if photo.focal_35mm else "has no focal length"
             return f"guessed from the photograph's EXIF, {focal}: no covariance"
@@ -305,6 +325,6 @@ class Preview:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")
-                scene.text(name, "font-weight: bold").move(*end)
+                scene.text(name, "font-weight: bold; color: #1b1f23").move(*end)
         scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
         self.scene = scene

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import Camera
-from ..registration import Hypothesis, Registrar
+from ..registration import Registrar
 from ..rendering import shade
 from ..visualization.contours import contour_layer
 from ..visualization.encoding import jpeg, png, shrink
 from ..visualization.overlay import LEGEND, to_uint8
-from .session import Numbers, Point, Shot, dragged_box
+from .shot import Numbers, Point, Shot, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 
@@ -146,8 +146,8 @@ class Stage:
             shot.set_box(None)
 
     def _change_pose(self, what: Any, point: Point) -> None:
-        result, answer = self.session.shot.require_result()
-        kind, (T, K) = what["type"], answer.pose.projection
+        (result, _), (T, K) = self.session.shot.require_result(), self.session.shot.projection
+        kind = what["type"]
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
         try:
@@ -180,11 +180,11 @@ class Stage:
         if self._following:
             return
         self._following, drawn = True, None
-        result, answer = self.session.shot.require_result()
+        (result, _), (_, K) = self.session.shot.require_result(), self.session.shot.projection
         try:
             while self.moved is not None and self.moved is not drawn:
                 drawn = self.moved
-                paths = await asyncio.to_thread(contour_paths, result.registrar, drawn, answer.pose.projection[1])
+                paths = await asyncio.to_thread(contour_paths, result.registrar, drawn, K)
                 self._show_layers(shown=False)
                 self._draw_shapes(paths)
         finally:
@@ -193,11 +193,11 @@ class Stage:
     def _commit(self) -> None:
         """Make the pose that was moved the answer."""
         moved, self.moved, self.pressed = self.moved, None, None
-        answer = self.session.shot.answer
-        if moved is None or answer is None or self.session.shot.photo is not self.shown.get("photo"):
+        shot = self.session.shot
+        if moved is None or shot.answer is None or shot.photo is not self.shown.get("photo"):
             return
-        if moved is not answer.pose.projection[0]:
-            self.session.shot.place(moved)
+        if not moved.equal(shot.projection[0]):
+            shot.place(moved)
 
     def _changed(self, name: str, value: Any) -> bool:
         """Whether something differs from what the page shows, which it does not afterwards."""
@@ -217,6 +217,7 @@ class Stage:
             self.mode = "box"
         if self._changed("photo", shot.photo):
             self.pressed = self.moved = None
+            self.shown |= {"result": "of another photograph", "answer": ""}  # those of a rig share them
             await self._show_photo()
         if self._changed("result", shot.result):
             self.pressed = self.moved = None
@@ -247,8 +248,12 @@ class Stage:
             for number, picture in enumerate(pictures):
                 url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
                 test_id = f"photograph-{number + 1}"
-                with self.strip, region("button", "thumbnail", type="button", data_testid=test_id) as thumbnail:
-                    region("img", src=url, alt=self.session.name(shots[number].path))
+                name = self.session.name(shots[number].path)
+                with (
+                    self.strip,
+                    region("button", "thumbnail", type="button", title=name, data_testid=test_id) as thumbnail,
+                ):
+                    region("img", src=url, alt=name)
                 thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
         for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
             thumbnail.props(f"aria-pressed={'true' if shot is self.session.shot else 'false'}")
@@ -268,8 +273,9 @@ class Stage:
         for mode, element in self.modes.items():
             element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
         set_enabled(self.modes["pose"], shot.answer is not None)
-        self.fit.set_visibility(is_pose)
-        moved = shot.answer_before is not None or self.moved is not None
+        self.fit.set_visibility(is_pose and shot.view is None)
+        before = None if shot.result is None else shot.result.answer_before
+        moved = before is not None or self.moved is not None
         set_enabled(self.undo, moved if is_pose else shot.box_before != shot.box)
 
     async def _show_photo(self) -> None:
@@ -284,8 +290,9 @@ class Stage:
     async def _render_answer(self) -> None:
         if self.session.shot.answer is None:
             return
-        size, (result, answer) = self.session.shot.size, self.session.shot.require_result()
-        if layers := await self.workspace.run("page", lambda: pose_layers(result.registrar, answer.pose, size)):
+        shot = self.session.shot
+        registrar, projection = shot.require_result()[0].registrar, shot.projection
+        if layers := await self.workspace.run("page", lambda: pose_layers(registrar, projection, shot.size)):
             self.mask = layers[2]
             for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):
                 element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
@@ -335,9 +342,11 @@ def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:
     return "".join(parts)
 
 
-def pose_layers(registrar: Registrar, pose: Hypothesis, size: tuple[int, int]) -> tuple[bytes, bytes, np.ndarray]:
+def pose_layers(
+    registrar: Registrar, projection: tuple[Tensor, Tensor], size: tuple[int, int]
+) -> tuple[bytes, bytes, np.ndarray]:
     """Two transparent PNGs over a photograph of ``size`` (H, W), the shaded mesh and its contours, and where it is."""
-    T, K = pose.projection
+    T, K = projection
     scale = min(1.0, LAYER_SIDE / max(size))
     small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
     K = Camera(K, size=size).at(small).matrix

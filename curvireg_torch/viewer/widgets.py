@@ -1,6 +1,6 @@
 """Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from html import escape
 from typing import Any
 
@@ -14,14 +14,16 @@ __all__ = ["button", "file_chooser", "fold", "region", "set_enabled", "set_text"
 
 def region(tag: str, classes: str = "", **values: str) -> Any:
     """An element that holds others; attributes are written with ``_`` for ``-``."""
-    words = [f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items()]
-    return ui.element(tag).classes(classes).props(" ".join(words))
+    return ui.element(tag).classes(classes).props(_attributes(values))
 
 
 def text(tag: str, content: str = "", classes: str = "", **values: str) -> Any:
     """An element with text."""
-    words = [f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items()]
-    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(" ".join(words))
+    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(_attributes(values))
+
+
+def _attributes(values: Mapping[str, str]) -> str:
+    return " ".join(f'{name.replace("_", "-")}="{escape(value)}"' for name, value in values.items())
 
 
 def set_text(element: Any, content: str) -> None:
@@ -52,5 +54,5 @@ def file_chooser(label: str, test_id: str) -> None:
     """A button that opens the dialogue for files; ``page.js`` sends them."""
     with region("label", "button file"):
         ui.label(label)
-        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".zip"))
+        accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip"))
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")

@@ -18,17 +18,16 @@ from typing import Any
 from ..data import load_camera
 from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..synthetic import demo_scene
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.files import write_file
-from ..visualization.encoding import png
-from ..visualization.overlay import to_uint8
+from . import sample
 from .session import Session
 
 __all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
+RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
 MAX_NAME = 60  # characters of the name of an uploaded file
 
 _caught: ContextVar[list[Any]] = ContextVar("caught")
@@ -44,7 +43,7 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
-        messages: about a part of the work: "file", "photograph", "mesh", "pose", or the "page" itself.
+        messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving, mesh_facts: folders and names of files that are being received; the mesh in words.
         started: when the search began, in seconds of ``time.monotonic``.
@@ -135,8 +134,8 @@ class Workspace:
             self._remove_unused()
 
     async def _open_upload(self, path: Path) -> None:
-        suffix, session = path.suffix.lower(), self.session
-        kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".zip")
+        suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
+        kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
         self.messages.pop("file", None)
         if suffix in kinds and self._before_sample is not None:
             await self.run("file", self._leave_sample, stop=True)
@@ -144,8 +143,15 @@ class Workspace:
             self.messages["file"] = (
                 f"{path.name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
                 f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers) nor a "
-                f"calibration ({', '.join(CALIBRATIONS)})"
+                f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
             )
+        elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
+            if path.name == "scene_camera.json" and session.options.unit == "m":
+                await self.set_option("unit", "mm")  # of BOP sets
+            await self._open_rig(path.parent if path.name == "scene_camera.json" else path)
+        elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
+            path.replace((rig if rig.is_dir() else rig.parent) / path.name)
+            await self._open_rig(rig)
         elif suffix in CALIBRATIONS:
             await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
         elif suffix == ".zip":
@@ -158,10 +164,20 @@ class Workspace:
 
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
-        used = [path for path in (self.session.mesh_path, *(shot.path for shot in self.session.shots)) if path]
+        session = self.session
+        used = [path for path in (session.mesh_path, session.rig_path, *(shot.path for shot in session.shots)) if path]
         for folder in set(self.folder.glob("upload-*")) - self.receiving.keys():
-            if not any(folder in path.parents for path in used):
+            if not any(folder in (path, *path.parents) for path in used):
                 shutil.rmtree(folder)
+
+    async def _open_rig(self, path: Path | None) -> None:
+        if await self.run("rig", lambda: self.session.open_rig(path), stop=True):
+            self.messages.pop("pose", None)
+
+    async def remove_rig(self) -> None:
+        """Forget the rig: each photograph is registered alone."""
+        await self._open_rig(None)
+        self._remove_unused()
 
     async def open_photo(self, path: Path) -> None:
         """Add a photograph, and show it."""
@@ -177,7 +193,7 @@ class Workspace:
     async def remove_photo(self) -> None:
         """Close the photograph that is shown; a search in it is stopped."""
         shot = self.session.shot
-        if await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot is self.session.searched):
+        if await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot in self.session.searched):
             self.messages.pop("pose", None)
             self._remove_unused()
 
@@ -202,21 +218,21 @@ class Workspace:
             self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
     async def load_sample(self) -> None:
-        """Open the scene of ``curvireg demo``, with its box and camera."""
+        """Open the photograph of the sample, its mesh and its box."""
         self.messages.clear()
         await self.run("file", self._open_sample, stop=True)
 
     def _open_sample(self) -> None:
-        scene, session, photo, mesh = demo_scene(), self.session, self.folder / "sample.png", self.folder / "sample.ply"
-        write_file(photo, png(to_uint8(scene.image)))
-        write_file(mesh, scene.mesh.export(file_type="ply"))
-        K, (x0, y0, x1, y1) = scene.camera_matrix, (round(float(v), 1) for v in scene.box)
-        sample: dict[str, Any] = {"unit": "m", "up": None, "pose": "upright", "limits": None, "guess": None}
-        sample["camera"] = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
+        session, photo, mesh = self.session, self.folder / sample.PHOTO.name, self.folder / "cup.ply"
+        write_file(photo, sample.PHOTO.read_bytes())
+        write_file(mesh, sample.cup().export(file_type="ply"))
+        options: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
         self._before_sample = self._before_sample or session.options
         session.close()
-        session.options = replace(session.options, **sample)
-        session.open_photo(photo).set_box((x0, y0, x1, y1))
+        session.options = replace(session.options, **options, camera=None, guess=sample.VIEW)
+        shot = session.open_photo(photo, sample.BOX)
+        assert shot.photo is not None
+        shot.photo = replace(shot.photo, notes=(sample.CREDIT,))
         self.mesh_facts = session.open_mesh(mesh)
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:

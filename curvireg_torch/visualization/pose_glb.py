@@ -113,13 +113,15 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
     faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
     plain = trimesh.Trimesh(np.asarray(mesh.triangles).reshape(-1, 3), faces, process=False)
-    rgb = np.full((len(faces), 3, 3), 190, np.uint8)
+    rgb = np.full((len(faces), 3, 3), 190 / 255)
     colours = surface_colours(mesh)
     if colours is not None:
         index, zero = np.arange(len(faces), dtype=np.int32), np.zeros(len(faces), np.float32)
         corners = [colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))]
-        rgb = (np.stack(corners, axis=1) * 255).round().astype(np.uint8)
-    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgb.reshape(-1, 3))
+        rgb = np.stack(corners, axis=1)
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)  # glTF's vertex colours; sRGB before
+    vertex_colors = (linear.reshape(-1, 3) * 255).round().astype(np.uint8)
+    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=vertex_colors)
     return plain
 
 

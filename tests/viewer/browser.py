@@ -107,13 +107,20 @@ class Browser:
         value = "dark" if dark else "light"
         command("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": value}]})
 
-    def picture(self, name):
-        """Write a picture for the documentation into the folder that CURVIREG_PICTURES names, if it does."""
+    def picture(self, name, part=None):
+        """Write pictures for the documentation, in light and in dark colours and on a phone, where ``part`` is in view,
+        into the folder that CURVIREG_PICTURES names, if it does."""
         if folder := os.environ.get("CURVIREG_PICTURES"):
-            time.sleep(1)
-            self.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
-            pixels = cv2.imdecode(np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
-            cv2.imwrite(str(Path(folder) / f"{name}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 80])
+            for end, size in (("", (1440, 900)), ("-dark", (1440, 900)), ("-phone", (390, 844))):
+                self.emulate(*size, dark=end == "-dark")
+                self.driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mouseMoved", "x": 1, "y": 1})
+                self.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
+                if part and end == "-phone":
+                    self.driver.execute_script("arguments[0].scrollIntoView({block: 'end'})", self.part(part))
+                time.sleep(1)
+                pixels = cv2.imdecode(np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
+                cv2.imwrite(str(Path(folder) / f"{name}{end}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 60])
+            self.emulate(1440, 900)
 
     def drag(self, start, end, size, held=None):
         """Drag the mouse between pixels of the photograph, whose width is ``size`` px; call ``held`` before the end."""

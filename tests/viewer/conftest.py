@@ -45,14 +45,15 @@ def address(folder, request):
         wait_for(address)
         yield address
     finally:
-        server.send_signal(signal.SIGTERM)
+        server.send_signal(signal.SIGINT)
         try:
             server.wait(20)
         except subprocess.TimeoutExpired:
             server.kill()
             server.wait()
         server.stdout.close()
-    assert "Traceback" not in (folder / "log").read_text()
+    log = (folder / "log").read_text().replace("WARNING:  Invalid HTTP request received.\n", "")  # one test sends it
+    assert (server.returncode, log) == (0, "")
     assert not list((folder / "temporary").glob("curvireg-view-*")), "the server removes its folder"
 
 

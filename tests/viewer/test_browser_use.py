@@ -1,9 +1,13 @@
 """The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
 
+import json
 import re
+from pathlib import Path
 
 import pytest
+import torch
 
+from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import demo_scene, example_mesh
 from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
@@ -32,9 +36,18 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
     browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("sample.png: 960 x 720 px"), "photograph")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("coffee.jpg: 600 x 400 px"), "photograph")
+    assert "CC0" in browser.text("photograph-facts")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
+    browser.picture("viewer-sample")
+
+
+def hinted_azimuth(browser):
+    """Say that it looks like this; returns the azimuth of the hint."""
+    browser.click("looks-like-this")
+    browser.wait(lambda: browser.text("hint-facts").startswith("Hint: seen from azimuth"), "hint")
+    return float(re.search(r"azimuth ([\d.]+)", browser.text("hint-facts"))[1])
 
 
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
@@ -47,17 +60,13 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
         const all = [...document.querySelectorAll('.nicegui-scene div')];
         return all.filter(e => !e.children.length && e.textContent).map(e => e.textContent)"""
     browser.wait(lambda: {"up", "front"} <= set(browser.driver.execute_script(labels)), "axes")
-
-    def azimuth():
-        browser.click("looks-like-this")
-        browser.wait(lambda: browser.text("hint-facts").startswith("Hint: seen from azimuth"), "hint")
-        return float(re.search(r"azimuth ([\d.]+)", browser.text("hint-facts"))[1])
-
-    before = azimuth()
+    before = hinted_azimuth(browser)
     assert f"--near {before:g} " in browser.text("command")
     ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(45, 0).release().perform()
-    browser.wait(lambda: 20 < (before - azimuth()) % 360 < 120, "turned")
-    browser.picture("viewer-model")
+    browser.wait(lambda: 20 < (before - hinted_azimuth(browser)) % 360 < 120, "turned")
+    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(-45, 20).release().perform()
+    browser.wait(lambda: abs(before - hinted_azimuth(browser)) < 20, "turned back, and seen from higher up")
+    browser.picture("viewer-model", "fold-model")
     browser.click("no-hint")
     browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
     browser.click("mark-front")
@@ -85,11 +94,10 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     browser.driver.refresh()
     browser.wait(lambda: [browser.text(name) for name in names] == before, "everything again")
     images = browser.part("photograph").find_elements("css selector", "img")
-    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [960] * 3, "layers")
+    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [600] * 3, "layers")
     browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
     assert browser.text("progress") == "done"
-    browser.emulate(1440, 900)
-    browser.picture("viewer")
+    browser.picture("viewer", "answer-1")
 
 
 def test_contours_follow_the_mesh_that_is_dragged(browser):
@@ -98,19 +106,53 @@ def test_contours_follow_the_mesh_that_is_dragged(browser):
 
     def follows():
         browser.wait(lambda: browser.driver.find_element("css selector", ".canvas path.outline"), "contours", 20)
-        browser.picture("viewer-drag")
 
-    browser.drag((20, 20), (80, 60), 960, held=follows)
+    browser.drag((20, 20), (60, 45), 600, held=follows)
     browser.wait(lambda: "moved: rotated" in browser.text("facts"), "turned")
+    assert browser.text("verdict") == "by hand"
+    browser.picture("viewer-hand")
     browser.click("undo")
     browser.wait(lambda: browser.text("facts") == before, "as before")
+
+
+def test_the_program_is_copied(browser):
+    permissions = {"permissions": ["clipboardReadWrite", "clipboardSanitizedWrite"]}
+    browser.driver.execute_cdp_cmd("Browser.grantPermissions", permissions)
+    browser.driver.find_element("css selector", ".verdict [data-copy=python]").click()
+    script = "navigator.clipboard.readText().then(arguments[0], arguments[0])"
+    copied = browser.driver.execute_async_script(script)
+    assert copied.startswith("import curvireg_torch as cr\n")
+    files = re.findall(r"'([^']+coffee\.jpg|[^']+cup\.ply)'", copied)
+    assert [Path(file).is_file() for file in files] == [True, True], "it runs as long as the page is open"
+
+
+def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(browser):
+    from selenium.webdriver import ActionChains
+
+    browser.emulate(1440, 900)
+    before, canvas = browser.text("certainty"), browser.part("preview").find_element("css selector", "canvas")
+    start = hinted_azimuth(browser)
+    browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
+    drag = ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
+    drag.release().perform()  # half the height is half a turn
+    browser.wait(lambda: 140 < (start - hinted_azimuth(browser)) % 360 < 220, "seen from behind")
+    browser.click("register")
+    browser.wait(lambda: browser.text("progress") == "done", "contradicted")
+    browser.wait(lambda: browser.part("turn-the-hint-around"), "repair")
+    assert browser.text("verdict") != "likely"
+    browser.click("turn-the-hint-around")
+    browser.wait(lambda: browser.text("verdict") == "likely", "the right way round")
+    browser.click("no-hint")
+    browser.click("register")
+    browser.wait(lambda: browser.text("progress") == "done", "as before")
+    browser.wait(lambda: browser.text("certainty") == before, "as before")
+    assert browser.messages() == []
 
 
 def test_dark_colours_follow_the_system(browser):
     browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
-    browser.picture("viewer-dark")
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
@@ -137,7 +179,6 @@ def test_a_small_screen_stacks_everything(browser):
     parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
-    browser.picture("viewer-phone")
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
@@ -179,8 +220,8 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     assert browser.driver.execute_script("return arguments[0].scrollLeft", viewport) > 100
     browser.driver.find_element("css selector", "[data-zoom=fit]").click()
     browser.wait(lambda: image.size["width"] == width, "as before")
-    browser.drag((100, 500), (300, 650), 960)
-    browser.wait(lambda: browser.box() == pytest.approx([100, 500, 300, 650], abs=2), "drawn box")
+    browser.drag((10, 250), (120, 350), 600)
+    browser.wait(lambda: browser.box() == pytest.approx([10, 250, 120, 350], abs=2), "drawn box")
 
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
@@ -199,8 +240,6 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         assert browser.text(f"message-{part}").startswith(f"{name}: ")
         assert str(folder) not in browser.text(f"message-{part}")
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
-    browser.emulate(1440, 900)
-    browser.picture("viewer-mistakes")
     browser.drop(folder / "photo.png")
     browser.wait(lambda: browser.text("message-photograph") == "", "gone")
     mesh = example_mesh()
@@ -208,6 +247,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     mesh.export(folder / "large.ply")
     browser.upload("mesh", folder / "large.ply")
     browser.wait(lambda: "give the unit (mm?)" in browser.text("message-mesh"), "a question")
+    browser.picture("viewer-repair", "step-mesh")
     browser.click("use-mm")
     browser.wait(lambda: browser.text("mesh-facts").endswith(" mm, rendered in grey"), "in mm")
     browser.wait(lambda: browser.messages() == [], "all gone")
@@ -240,17 +280,67 @@ def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(
         browser.wait(lambda n=left: count() == n, f"{left} left")
     browser.click("photograph-2")
     browser.wait(lambda: browser.box() is not None, "the last one")
-    browser.emulate(1440, 900)
-    browser.picture("viewer-strip")
+    browser.picture("viewer-box", "step-box")
     (folder / "cam.yaml").write_text(
         "%YAML:1.0\n---\nimage_width: 960\nimage_height: 720\n"
         "camera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n"
         "  data: [1000., 0., 479.5, 0., 1000., 359.5, 0., 0., 1.]\n"
         "distortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n  dt: d\n  data: [-0.3, 0.1, 0., 0., 0.]\n"
     )
-    browser.drop(folder / "cam.yaml")
+    browser.upload("camera", folder / "cam.yaml")
     browser.wait(lambda: browser.text("photograph-facts").endswith("; undistorted"), "undistorted")
     browser.unfold("camera")
     browser.wait(lambda: browser.text("camera-facts") == "from a calibration file, without its distortion", "facts")
     browser.click("no-photo")
     browser.wait(lambda: not browser.part("strip").is_displayed(), "one photograph needs no strip")
+
+
+def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
+    browser.click("no-photo")
+    browser.wait(lambda: browser.part("sample").is_displayed(), "empty again")
+    scenes = [demo_scene(seed) for seed in (4, 5)]  # the world is the mesh's own frame
+    lines = ["photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"]
+    for seed, scene in zip((4, 5), scenes, strict=True):
+        R, t = scene.truth[:3, :3].flatten().tolist(), (1000.0 * scene.truth[:3, 3]).tolist()  # in mm
+        box = scene.box.tolist() if seed == 4 else [""] * 4
+        lines.append(",".join(map(str, [f"table-{seed}.png", *box, 1040, 1040, 479.5, 359.5, *R, *t])))
+    (folder / "rig.csv").write_text("\n".join(lines))
+    browser.drop(*map(folder.joinpath, ["table-4.png", "table-5.png", "table.ply", "rig.csv"]))
+    browser.wait(lambda: browser.text("rig-facts") == "rig.csv: one pose in 2 photographs", "the rig")
+    browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "the mesh")
+    assert browser.text("register") == "Find the pose in 2 photographs"
+    browser.click("register")
+    browser.wait(lambda: browser.text("progress") == "done", "one pose")
+    extent = """
+        const image = arguments[0], canvas = document.createElement('canvas');
+        [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+        const context = canvas.getContext('2d');
+        context.drawImage(image, 0, 0);
+        const alpha = context.getImageData(0, 0, canvas.width, canvas.height).data.filter((_, k) => k % 4 === 3);
+        const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
+        const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
+        const y = drawn.map(k => Math.floor(k / canvas.width));
+        return [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))]"""
+    for number, scene in enumerate(scenes, start=1):
+        browser.click(f"photograph-{number}")
+        solid = browser.part("photograph").find_elements("css selector", "img")[1]
+        box = pytest.approx(scene.box.tolist(), abs=4)
+        browser.wait(lambda box=box, solid=solid: browser.driver.execute_script(extent, solid) == box, f"mesh {number}")
+        assert browser.part("answers").is_displayed()
+    browser.click("download-result.json")
+    document = json.loads(browser.downloaded("result.json"))
+    assert (document["frame"], [view["photo"] for view in document["views"]]) == (
+        "world",
+        ["table-4.png", "table-5.png"],
+    )
+    assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
+    browser.click("download-pose.glb")
+    assert browser.downloaded("pose.glb").count(b'"photograph ') == 2
+    browser.picture("viewer-rig")
+    (folder / "rig.csv").write_text("\n".join([*lines[:2], lines[2].replace(",1040,", ",wide,")]))
+    browser.upload("photograph", folder / "rig.csv")
+    wrong = "rig.csv: row 2: table-5.png: fx: expected a number, got 'wide'"
+    browser.wait(lambda: browser.text("message-rig").startswith(wrong), "the row that is wrong")
+    assert browser.text("register") == "Find the object and its pose"
+    browser.click("no-rig")
+    browser.wait(lambda: browser.messages() == [], "as without a rig")

@@ -21,7 +21,8 @@ from curvireg_torch.geometry import Camera, rotation_error, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
-from curvireg_torch.viewer.session import Answer, Session, dragged_box
+from curvireg_torch.viewer.session import Session
+from curvireg_torch.viewer.shot import Answer, dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -121,7 +122,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
     before, describer = session.shot.answer.pose, session.shot.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
-    assert session.shot.answer_before is None
+    assert session.shot.result.answer_before is None
     moved = session.shot.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
     session.shot.place(moved)
     pose = session.shot.answer.pose
@@ -144,7 +145,7 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
         session.shot.undo()
         assert session.shot.answer.pose is answer
     session.shot.choose(1)
-    assert (session.shot.answer.edits, session.shot.answer_before) == ((), None)
+    assert (session.shot.answer.edits, session.shot.result.answer_before) == ((), None)
     with pytest.raises(InvalidInputError, match="touch the camera"):
         session.shot.result.moved(moved, translation=(0, 0, -100))
 
@@ -203,7 +204,7 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
     assert (second.box, second.result) == (None, None)
     second.set_box((10.0, 20.0, 90.0, 80.0))
     session.shot = first
-    assert session.request() == first.result.request
+    assert session.request() == first.result.inputs[0]
     assert second.box == (10.0, 20.0, 90.0, 80.0)
     third = session.open_photo(folder / "photo.png")
     session.shot = first
@@ -261,7 +262,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert session.shot.photo.notes == ("undistorted",)
     with pytest.raises(InvalidInputError, match="another aspect ratio"):
         session.set_camera(Camera(K, size=(480, 640 + 90)))
-    assert session.is_undistorted, "nothing has changed"
+    assert session.shot.is_undistorted, "nothing has changed"
     session.shot.set_box(tuple(scene(0)[1].tolist()))
     session.register()
     document = session.document()

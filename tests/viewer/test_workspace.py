@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
@@ -109,24 +110,56 @@ def test_an_upload_of_more_than_it_announced_is_refused(workspace):
 
 
 def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
-    session, own = workspace.session, replace(RegisterOptions(), unit="ft", pose="any", limits={"theta": (-10.0, 10.0)})
+    limits = {"theta": (-10.0, 10.0)}
+    own = replace(
+        RegisterOptions(), unit="ft", pose="any", limits=limits, camera=(9.0, 9.0, 5.0, 5.0), mesh_is="similar"
+    )
+    session = workspace.session
     session.options = own
     for _ in range(2):
         asyncio.run(workspace.load_sample())
-        assert (session.options.unit, session.options.pose, session.options.limits) == ("m", "upright", None)
-        assert names(workspace) == ["sample.png"]
-    assert session.shot.photo.image.shape == (3, 720, 960)
-    assert "faces" in workspace.mesh_facts
-    assert session.shot.box[0] < session.shot.box[2]
-    assert session.options.camera[:2] == (1040.0, 1040.0)
+        options = session.options
+        assert (options.unit, options.pose, options.limits, options.mesh_is) == ("mm", "upright", None, None)
+        assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
+    assert session.shot.photo.image.shape == (3, 400, 600)
+    assert "CC0" in session.shot.photo.notes[0]
+    assert workspace.mesh_facts.endswith("mm, rendered in its colours")
     assert workspace.messages == {}
     asyncio.run(upload(workspace, scene, "notes.pdf", b"x"))
     assert session.options.pose == "upright", "it replaces nothing"
     asyncio.run(upload(workspace, scene / "photo.png"))
     assert session.options == own
     assert (names(workspace), session.mesh_path, session.shot.box) == (["photo.png"], None, None)
+    assert session.request().guess is None
     asyncio.run(upload(workspace, scene / "truck.ply"))
     assert workspace.mesh_facts.endswith(" ft, rendered in grey")
+
+
+def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
+    """Outline of the cup and its handle, marked by eye in the photograph, in px."""
+    marked = [
+        (173, 116),
+        (177, 163),
+        (183, 193),
+        (200, 220),
+        (409, 117),
+        (400, 166),
+        (380, 214),
+        (280, 286),
+        (302, 283),
+    ]
+    handle = [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    asyncio.run(workspace.load_sample())
+    result = workspace.session.register()
+    assert result.reliable
+    assert workspace.session.shot.found_box.tolist() == list(module.sample.BOX)
+    T, K = workspace.session.shot.projection
+    vertices = torch.tensor(workspace.session.mesh.vertices) @ T[:3, :3].mT + T[:3, 3]
+    seen = (vertices @ K.mT)[:, :2] / vertices[:, 2:]
+    distances = torch.cdist(torch.tensor([*marked, *handle]).double(), seen).amin(dim=1)
+    assert float(distances.mean()) < 4
+    assert float(distances[len(marked) :].max()) < 8, "the handle is at the handle"
 
 
 def test_warnings_and_defects_become_messages(workspace, capsys):
@@ -228,7 +261,7 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
             search.begun.clear()
             running = workspace.start_search()
             await asyncio.to_thread(search.begun.wait, 10)
-            workspace.session.searched = workspace.session.shot  # as ``register`` sets it
+            workspace.session.searched = (workspace.session.shot,)  # as ``register`` sets it
             try:
                 await close()
                 ended.append(running.done())
@@ -249,7 +282,7 @@ def test_a_sample_that_fails_leaves_the_work_as_it_is(workspace, scene, monkeypa
     def fail():
         raise OSError("disk full")
 
-    monkeypatch.setattr(module, "demo_scene", fail)
+    monkeypatch.setattr(module.sample, "cup", fail)
 
     async def work():
         await upload(workspace, scene / "photo.png", "a.png")

@@ -3,8 +3,10 @@
   // --- Files: chosen, dropped anywhere, or pasted.
   const address = () => location.pathname.replace(/\/$/, "") + "/upload";
 
+  const isRig = (file) => /(^(images\.txt|scene_camera\.json)|\.csv)$/i.test(file.name);
+
   async function sendFiles(files) {
-    for (const file of files) {
+    for (const file of files.sort((a, b) => isRig(b) - isRig(a))) {  // what belongs to a rig comes after it
       const headers = { "x-file-name": encodeURIComponent(file.name) };
       await fetch(address(), { method: "POST", body: file, headers }).catch(() => {});  // the server shows the reason
     }
@@ -167,7 +169,17 @@
 
   // --- Texts to copy.
   addEventListener("click", (event) => {
-    const source = event.target.dataset?.copy;
-    if (source) navigator.clipboard?.writeText(document.querySelector(`[data-testid="${source}"]`).textContent);
+    const button = event.target, source = button.dataset?.copy;
+    if (!source) return;
+    const element = document.querySelector(`[data-testid="${source}"]`), label = button.textContent;
+    if (navigator.clipboard) {
+      navigator.clipboard.writeText(element.textContent);
+    } else {  // a page from another machine, without encryption
+      element.closest("details").open = true;
+      getSelection().selectAllChildren(element);
+      document.execCommand("copy");
+    }
+    button.textContent = "copied";
+    setTimeout(() => (button.textContent = label), 1500);
   });
 })();

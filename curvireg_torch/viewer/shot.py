@@ -1,0 +1,258 @@
+"""A photograph of the page with its box, its result and the chosen pose, and how these are moved by hand."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..data.images import Photo
+from ..errors import InvalidInputError
+from ..evaluation.opening import RegisterOptions
+from ..evaluation.result_files import RigPicture, views_glb, views_picture
+from ..evaluation.runner import View
+from ..geometry import rotation_error, rotation_from_axis_angle
+from ..geometry.cameras import rotation_towards
+from ..registration import Hypothesis, Registrar, Registration, fit_contours
+from ..visualization import contour_overlay, pose_glb
+from ..visualization.encoding import png
+
+__all__ = ["Answer", "Numbers", "Point", "Result", "Shot", "dragged_box", "numbers"]
+
+MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
+NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
+
+Numbers = tuple[float, float, float, float]
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
+
+    pose: Hypothesis
+    number: int = 0
+    edits: tuple[str, ...] = ()
+
+    def registration(self, found: Registration) -> Registration:
+        """Return what was ``found`` with this pose first; nobody knows how probable a pose is that was set by hand."""
+        if self.number == 0 and not self.edits:
+            return found
+        order = sorted(range(len(found.hypotheses)), key=lambda k: k != self.number)
+        probabilities = () if self.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
+        hypotheses = (self.pose, *(found.hypotheses[k] for k in order[1:]))
+        views = found.views
+        if views:  # the same pose in the world, which nobody has compared with the photographs
+            from_found = torch.linalg.inv(found.transform) @ self.pose.transform
+            unknown: dict[str, Any] = {"edge_support": None, "similarity": None, "contribution": 0.0}
+            views = tuple(replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown) for v in views)
+        rest: dict[str, Any] = {"confidence_features": {}, "views": views}
+        return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
+
+
+@dataclass
+class Result:
+    """A registration with its inputs, of one photograph or of those of a rig, and its chosen answer.
+
+    ``answer_before`` is that before the last change by hand.
+    """
+
+    registrar: Registrar
+    registration: Registration
+    document: dict[str, Any]  # the content of result.json, if the first answer is chosen
+    photographs: Sequence[RigPicture]  # of a rig
+    inputs: tuple[RegisterOptions, tuple[Numbers | None, ...]]  # what was asked for, in which boxes
+    answer: Answer | None = None
+    answer_before: Answer | None = None
+
+    def moved(
+        self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
+    ) -> Tensor:
+        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
+
+        :class:`InvalidInputError` if the object would touch the camera.
+        """
+        describer = self.registrar.describer
+        angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
+        centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
+        if float(centre[2]) < NEAREST * describer.radius:
+            raise InvalidInputError("the object would touch the camera; move it away")
+        T = T.clone()
+        T[:3, :3] = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
+        T[:3, 3] = centre - T[:3, :3] @ describer.centre
+        return T
+
+    def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
+        """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
+        describer, (dx, dy) = self.registrar.describer, (end[0] - start[0], end[1] - start[1])
+        if max(abs(dx), abs(dy)) < 1.0:  # a click
+            return T
+        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
+        radii = depth / float(K[0, 0]) / describer.radius  # that one pixel is long
+        if turns:
+            return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
+        return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
+
+    def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
+        """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
+        describer = self.registrar.describer
+        centre = T[:3, :3] @ describer.centre + T[:3, 3]
+        shift = ((1.0 / factor - 1.0) * centre / describer.radius).tolist()
+        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift)
+
+
+@dataclass(eq=False)
+class Shot:
+    """A photograph, without the distortion of a calibrated camera, and what belongs to it.
+
+    ``box_before`` is that before the last change by hand, ``view`` its row of a rig, ``found_box`` (4,) the box with
+    which the pose was found. Photographs of a rig share their result.
+    """
+
+    path: Path = Path()
+    photo: Photo | None = None
+    box: Numbers | None = None
+    view: View | None = None
+    box_before: Numbers | None = None
+    result: Result | None = None
+    found_box: Tensor | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the photograph."""
+        assert self.photo is not None
+        return int(self.photo.image.shape[-2]), int(self.photo.image.shape[-1])
+
+    @property
+    def is_undistorted(self) -> bool:
+        """Whether the distortion of the camera was removed from the photograph."""
+        return self.photo is not None and "undistorted" in self.photo.notes
+
+    @property
+    def has_box_of_view(self) -> bool:
+        """Whether the box is that of the row of the rig, and was not drawn."""
+        given = None if self.view is None or self.view.box is None else numbers(self.view.box)
+        if given is not None and self.is_undistorted:
+            return self.box is not None and self.box_before is None
+        return self.box == given
+
+    @property
+    def answer(self) -> Answer | None:
+        """The chosen answer of the result."""
+        return None if self.result is None else self.result.answer
+
+    @property
+    def projection(self) -> tuple[Tensor, Tensor]:
+        """(4, 4) ``T_cam_from_model`` of the answer in this photograph, and (3, 3) camera matrix."""
+        return self.projection_of(self.require_result()[1].pose)
+
+    def projection_of(self, pose: Hypothesis) -> tuple[Tensor, Tensor]:
+        """Like :attr:`projection` of any pose of the result."""
+        if self.view is None or pose.transform is None:
+            return pose.projection
+        return self.view.T_cam_from_world @ pose.transform, self.view.camera.at(self.size).matrix
+
+    def set_box(self, box: Numbers | None) -> None:
+        """Replace the box."""
+        if box != self.box:
+            self.box_before, self.box = self.box, box
+
+    def require_result(self) -> tuple[Result, Answer]:
+        """The result and the chosen pose; an error if there is none yet."""
+        if self.result is None or self.result.answer is None:
+            raise InvalidInputError("there is no result yet; register first")
+        return self.result, self.result.answer
+
+    def choose(self, number: int) -> None:
+        """Make a hypothesis the answer, by its number from 0."""
+        assert self.result is not None
+        self.result.answer_before = None
+        self.result.answer = Answer(self.result.registration.hypotheses[number], number)
+
+    def place(self, T: Tensor, edit: str = "moved") -> None:
+        """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
+        result, answer = self.require_result()
+        describer, (before, K) = result.registrar.describer, self.projection
+        old, centre = (pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T))
+        degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
+        radii = float(torch.linalg.vector_norm(centre - old)) / describer.radius
+        allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
+        placed = T if self.view is None else torch.linalg.inv(self.view.T_cam_from_world) @ T
+        pose = replace(
+            answer.pose,
+            rotation=placed[:3, :3].clone() if has_translation else allocentric,
+            translation=placed[:3, 3].clone() if has_translation else None,
+            score=float("nan"),
+            evidence={},
+            allocentric_rotation=allocentric,
+            distance=float(torch.linalg.vector_norm(centre)),
+            projection=(T, K),
+            edge_support=None,
+            covariance=None,
+        )
+        edit = f"{edit}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
+        result.answer_before, result.answer = answer, Answer(pose, answer.number, (*answer.edits, edit))
+
+    def fit(self) -> None:
+        """Fit the contours at the answer to the photograph's edges."""
+        registrar, (T, K) = self.require_result()[0].registrar, self.projection
+        assert self.photo is not None
+        contours, margin = registrar.describer.contours, registrar.bank.settings.margin
+        fit = fit_contours(contours, self.photo.image, self.found_box, K, T[None], margin=margin)
+        supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
+        self.place(fit.transform[0], f"contours fitted, edge support {supports}")
+
+    def undo(self) -> None:
+        """Take back the last change by hand; a second call repeats it."""
+        result = self.result
+        if result is not None and result.answer_before is not None:
+            result.answer, result.answer_before = result.answer_before, result.answer
+
+    def glb(self) -> bytes:
+        """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
+        result, answer = self.require_result()
+        assert self.photo is not None
+        if result.photographs:
+            return views_glb(result.registrar, answer.registration(result.registration), result.photographs)
+        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, self.photo.image)
+
+    def overlay(self) -> bytes:
+        """The contours at the answer on the photograph, or on those of the rig, as a PNG file."""
+        result, answer = self.require_result()
+        assert self.photo is not None
+        if result.photographs:
+            return views_picture(result.registrar, answer.registration(result.registration), result.photographs)
+        return png(contour_overlay(result.registrar, answer.pose, self.photo.image, self.found_box))
+
+
+def numbers(box: Sequence[float]) -> Numbers:
+    """A box as four numbers."""
+    x0, y0, x1, y1 = map(float, box)
+    return x0, y0, x1, y1
+
+
+def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
+    """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from inside, or a new one."""
+    (x, y), (u, v) = start, end
+    x0, y0, x1, y1 = box or (math.inf, math.inf, -math.inf, -math.inf)
+    if x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach:
+        left, right = _near_edges(x, x0, x1, reach)
+        top, bottom = _near_edges(y, y0, y1, reach)
+        if not (left or right or top or bottom):
+            x0, y0, x1, y1 = x0 + u - x, y0 + v - y, x1 + u - x, y1 + v - y
+        x0, y0 = u if left else x0, v if top else y0
+        x1, y1 = u if right else x1, v if bottom else y1
+    else:
+        x0, y0, x1, y1 = x, y, u, v
+    if min(abs(x1 - x0), abs(y1 - y0)) < MIN_SIDE:
+        return box
+    return round(min(x0, x1), 1), round(min(y0, y1), 1), round(max(x0, x1), 1), round(max(y0, y1), 1)
+
+
+def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool, bool]:
+    """Whether the low or the high edge is near; inside, at most a third of the box is near to an edge."""
+    inside = min(reach, (high - low) / 3)
+    return at <= low + inside, at > low + inside and at >= high - inside

@@ -1,0 +1,262 @@
+"""A rig file on the page: photographs of one pose. No browser is needed."""
+
+import asyncio
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from curvireg_torch.cli import main
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.evaluation.rigs import BOX, CAMERA, ROTATION, TRANSLATION
+from curvireg_torch.evaluation.store import to_json
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.viewer.workspace import Workspace
+from tests._support.lists import CAMERA as NUMBERS
+from tests._support.scenes import learned_registrar
+from tests.registration.test_several import EASY, WORLD, rig_of
+from tests.viewer.test_workspace import upload
+
+HEADER = ["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION]
+
+
+def write_rig(folder: Path) -> list[list]:
+    """Write 0.png to 2.png, truck.safetensors and rig.csv, without a box of the second; returns its rows."""
+    rows = []
+    for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
+        picture = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
+        cv2.imwrite(str(folder / f"{k}.png"), picture)
+        given = [""] * 4 if k == 1 else box.tolist()
+        rows.append([f"{k}.png", *given, *NUMBERS, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()])
+    write_table(folder / "rig.csv", HEADER, rows)
+    learned_registrar().bank.save(folder / "truck.safetensors")
+    return rows
+
+
+def write_table(path, header, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    return folder, write_rig(folder)
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    (tmp_path / "uploads").mkdir()
+    return Workspace(RegisterOptions(), tmp_path / "uploads")
+
+
+def send(workspace, folder, *names):
+    async def work():
+        for name in names:
+            await upload(workspace, folder / name)
+
+    asyncio.run(work())
+    return workspace.session
+
+
+def search(workspace):
+    async def work():
+        await workspace.start_search()
+
+    asyncio.run(work())
+    assert workspace.messages == {}
+
+
+def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_path):
+    folder, rows = rig
+    session = send(workspace, folder, "0.png", "rig.csv", "2.png", "1.png", "truck.safetensors")
+    assert (workspace.messages, session.rig_gaps()) == ({}, "")
+    first, third, second = session.shots
+    assert (first.box, second.box, third.box) == (tuple(rows[0][1:5]), None, tuple(rows[2][1:5]))
+    assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
+    search(workspace)
+    words = ["register", "--views", str(folder / "rig.csv"), str(folder / "truck.safetensors"), "--quiet"]
+    assert main([*words, "--out", str(tmp_path / "result")]) == 0
+    written = json.loads((tmp_path / "result" / "result.json").read_text())
+    document = json.loads(to_json(session.document()))
+    assert float(rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3])) < 1.5
+    assert [*document] == [*written, "viewer"]
+    for row in written["views"]:
+        row["photo"] = Path(row["photo"]).name
+    for key in document.keys() - {"viewer", "inputs", "mesh", "seconds"}:
+        assert document[key] == written[key], key
+    assert (document["mesh"], document["inputs"]["rig"]) == ("truck.safetensors", "rig.csv")
+    for shot, view in zip((first, second, third), document["views"], strict=True):
+        assert shot.projection[0][:3, :3].tolist() == view["rotation"]
+        assert shot.found_box.tolist() == view["box"]
+        assert shot.answer is first.answer
+    assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
+    assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()
+    names: dict = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        exec(session.python(), names)
+    assert names["pose"]["rotation"] == document["rotation"]
+
+
+@pytest.fixture(scope="module")
+def found(rig, tmp_path_factory):
+    """A workspace with the answer in two photographs of the rig, and a third photograph."""
+    folder, workspace = rig[0], Workspace(RegisterOptions(), tmp_path_factory.mktemp("uploads"))
+    (folder / "other.png").write_bytes((folder / "1.png").read_bytes())
+    session = send(workspace, folder, "rig.csv", "other.png", "0.png", "2.png", "truck.safetensors")
+    search(workspace)
+    return workspace, session
+
+
+def test_photographs_of_no_row_and_rows_without_photograph_are_named(found):
+    _, session = found
+    assert session.rig_gaps() == (
+        "not open: 1.png; drop what is missing here, or go on without; not in the rig: other.png; registered alone"
+    )
+    other, first, last = session.shots
+    assert [shot.result is first.result for shot in (other, first, last)] == [False, True, True]
+    assert len(session.document()["views"]) == 2
+    assert session.command() == "", "the command would miss a photograph"
+
+
+def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
+    _, session = found
+    _, first, last = session.shots
+    session.shot = first
+
+    def check():
+        document = json.loads(to_json(session.document()))
+        world = torch.tensor(document["rotation"]).double()
+        assert document["rotation"] == first.answer.pose.rotation.tolist()
+        for shot, row in zip((first, last), document["views"], strict=True):
+            torch.testing.assert_close(shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world)
+            torch.testing.assert_close(shot.projection[0][:3, :3], torch.tensor(row["rotation"]).double())
+            assert (row["edge_support"], row["name"], row["failure"]) == (None, row["name"], None)
+        assert document["T_cam_from_model"] is None
+        return document
+
+    last.choose(1)
+    assert check()["rotation"] == first.result.document["top"][1]["rotation"]
+    before = first.projection[0]
+    moved = first.result.moved(before, translation=(0.2, 0, 0))
+    first.place(moved)
+    torch.testing.assert_close(first.projection[0], moved)
+    assert check()["viewer"]["by_hand"] == ["moved: rotated 0.0 degrees, shifted 0.20 radii"]
+    assert first.glb()[:4] == b"glTF"
+    last.undo()
+    torch.testing.assert_close(first.projection[0], before)
+    first.choose(0)
+
+
+def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
+    workspace, session = found
+    _, first, last = session.shots
+    before, session.shot = first.box, first
+    first.set_box((10.0, 10.0, 230.0, 170.0))
+    last.set_box(None)
+    assert session.inputs() != first.result.inputs
+    search(workspace)
+    rows = session.document()["views"]
+    assert rows[0]["box"] == [10.0, 10.0, 230.0, 170.0]
+    assert rows[1]["box"] != list(last.box_before)
+    first.set_box(before)
+    session.set_limits(azimuth=(0.0, 90.0))
+    with pytest.raises(InvalidInputError, match="a hint: photographs of a rig take none"):
+        session.register()
+    session.remove_limits()
+
+
+def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
+    session = send(workspace, rig[0], "0.png", "rig.csv", "1.png")
+    assert len(session.together()) == 2
+    asyncio.run(workspace.remove_rig())
+    assert ([shot.view for shot in session.shots], len(session.together())) == ([None, None], 1)
+    assert not list(workspace.folder.rglob("rig.csv"))
+    session.shots[0].set_box((1.0, 2.0, 30.0, 40.0))
+    assert session.request(session.shots[0]).box == (1.0, 2.0, 30.0, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x1": ""}, "rig.csv: row 1: 0.png: x0, y0, x1, y1: expected all or none"),
+        ({"r11": "5"}, "rig.csv: row 1: 0.png: the camera's pose: expected rigid transforms"),
+        ({"photo": "some/1.png"}, "rig.csv: row 1: some/1.png and row 2: 1.png have the same file name"),
+        ({"fx": ""}, "rig.csv: row 1: 0.png: fx, fy, cx, cy: expected all or none"),
+    ],
+)
+def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, changes, message):
+    folder, (first, *rows) = rig
+    write_table(tmp_path / "rig.csv", HEADER, [[changes.get(n, v) for n, v in zip(HEADER, first, strict=True)], *rows])
+    session = send(workspace, folder, "0.png")
+    send(workspace, tmp_path, "rig.csv")
+    assert workspace.messages["rig"].startswith(message)
+    assert (session.rig, session.shot.view) == ((), None)
+    send(workspace, folder, "rig.csv")
+    assert (workspace.messages, session.shot.view is session.rig[0]) == ({}, True)
+
+
+def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photographs(workspace, rig, tmp_path):
+    folder, rows = rig
+    header = ["photo", *BOX, "camera", *ROTATION, *TRANSLATION]
+    write_table(tmp_path / "rig.csv", header, [[*row[:5], "cam.json", *row[9:]] for row in rows])
+    calibration = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1], "dist": [-0.2, 0, 0, 0]}
+    (tmp_path / "cam.json").write_text(json.dumps(calibration))
+    session = send(workspace, folder, "0.png")
+    send(workspace, tmp_path, "rig.csv")
+    assert "cam.json: no such file" in workspace.messages["rig"]
+    assert str(workspace.folder) not in workspace.messages["rig"]
+    send(workspace, tmp_path, "cam.json")
+    assert workspace.messages == {}
+    send(workspace, folder, "1.png", "truck.safetensors")
+    assert [shot.is_undistorted for shot in session.shots] == [True, True]
+    assert session.shots[0].box != tuple(rows[0][1:5])
+    send(workspace, folder, "2.png")
+    assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
+    assert session.options.camera is None
+    search(workspace)
+    assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0]
+    asyncio.run(workspace.remove_rig())
+    assert [shot.is_undistorted for shot in session.shots] == [False, False, False]
+
+
+def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
+    folder, rows = rig
+    T = [torch.tensor(row[9:]).double() for row in rows]
+    lines, scene = [], {}
+    for k, row in enumerate(rows):
+        x, y, z, w = Rotation.from_matrix(T[k][:9].view(3, 3).numpy()).as_quat()
+        lines += [f"{k + 1} {w} {x} {y} {z} {row[18]} {row[19]} {row[20]} 1 {row[0]}", ""]
+        K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+        scene[str(k)] = {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]}
+        shutil.copy(folder / row[0], tmp_path / f"00000{k}.png")
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
+    (tmp_path / "scene_camera.json").write_text(json.dumps(scene))
+    (tmp_path / "scene_gt.json").write_text(json.dumps({str(k): [{"obj_id": 5}] for k in range(3)}))
+    (tmp_path / "scene_gt_info.json").write_text(json.dumps({str(k): [{"bbox_obj": [5, 6, 20, 30]}] for k in range(3)}))
+    session = send(workspace, folder, "0.png", "1.png")
+    send(workspace, tmp_path, "images.txt")
+    assert workspace.messages["rig"].startswith("images.txt: ")
+    send(workspace, tmp_path, "cameras.txt")
+    assert (workspace.messages, len(session.together())) == ({}, 2)
+    assert session.rig_gaps() == "not open: 2.png; drop what is missing here, or go on without"
+    example_mesh().apply_scale(1000.0).export(tmp_path / "obj_000005.ply")
+    send(
+        workspace, tmp_path, "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
+    )
+    assert (workspace.messages, session.options.unit) == ({}, "mm")
+    assert [shot.path.name for shot in session.together()] == ["000000.png"]
+    assert session.shot.box == (5.0, 6.0, 25.0, 36.0)
+    send(workspace, tmp_path, "000001.png", "000002.png")
+    assert session.command() == "curvireg register --views SCENE obj_000005.ply --unit mm --out result"
+    session.shot.set_box((6.0, 6.0, 25.0, 36.0))
+    assert session.command() == ""
