@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 
-RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")
+RENDERER_NAMES = ("auto", "embree", "pyrender")
 """Renderers."""
 
 DEFAULT = "learned"
