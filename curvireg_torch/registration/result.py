@@ -134,7 +134,8 @@ class PhotographPose:
         T_cam_from_model: (4, 4) float64.
         box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it was not read.
         edge_support, similarity: of the pose in this photograph; None where it was not compared.
-        contribution: score by which the photograph prefers the pose to its best rival, 0 if it does not count.
+        contribution: score by which the photograph prefers the pose to its best rival, of 5 points if there
+            is none; 0 if the photograph does not count.
         failure: why the photograph does not count, in words; None if it does.
     """
 

@@ -146,7 +146,7 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
                 odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
         confidence = odds / (1.0 + odds)
         probabilities = hypothesis_probabilities(confidence, total, exact=rig.exact)[:count]
-    margins = weights * (answer.scores[:, 0] - answer.scores[:, min(1, len(total) - 1)])
+    margins = weights * (answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN)
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
     views = []
     for i, camera in enumerate(cameras):
