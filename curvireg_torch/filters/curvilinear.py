@@ -74,8 +74,7 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
     check_option(formula, ("geometric", "paper"), "formula")
 
     def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
@@ -86,20 +85,20 @@ def depth_curvilinear_saliency(
     return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask).to(depth.dtype)
 
 
-def check_depth(depth: Tensor, mask: Tensor | None) -> Tensor | None:
-    """Return the mask expanded to the shape of the depth."""
+def check_depth(
+    depth: Tensor, mask: Tensor | None, depth_scale: float | None, sigma: float | Tensor
+) -> tuple[Tensor | None, float | None, float | Tensor]:
+    """Return the mask expanded to the shape of the depth, and the checked options."""
     check_image(depth, "depth")
+    scale = None if depth_scale is None else check_positive(depth_scale, "depth_scale")
+    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
     if mask is None:
-        return None
+        return None, scale, sigma
     fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
     if not fits or mask.dtype != torch.bool:
         raise InvalidInputError(f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}")
     check_same_device(mask, depth, "mask")
-    return mask.expand(depth.shape)
-
-
-def check_depth_scale(depth_scale: float | None) -> float | None:
-    return None if depth_scale is None else check_positive(depth_scale, "depth_scale")
+    return mask.expand(depth.shape), scale, sigma
 
 
 def _shape_operator(z: Tensor, formula: str) -> ops.Planes:
@@ -107,8 +106,8 @@ def _shape_operator(z: Tensor, formula: str) -> ops.Planes:
     zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
     # M = adj(I_P) H_Z = H_Z + (z_y, -z_x)^T (u, -v).
     u, v = (zy * zxx).addcmul_(zx, zxy, value=-1), (zx * zyy).addcmul_(zy, zxy, value=-1)
-    m11, m12 = ops.clone_if_grad(zxx).addcmul_(zy, u), torch.addcmul(zxy, zy, v, value=-1)
-    m21, m22 = ops.clone_if_grad(zxy).addcmul_(zx, u, value=-1), ops.clone_if_grad(zyy).addcmul_(zx, v)
+    m11, m12 = torch.addcmul(zxx, zy, u), torch.addcmul(zxy, zy, v, value=-1)
+    m21, m22 = torch.addcmul(zxy, zx, u, value=-1), torch.addcmul(zyy, zx, v)
     if formula == "paper":
         return ops.safe_sqrt(ops.squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
     # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)

@@ -86,18 +86,15 @@ def multiscale_focus_curves(
 
     The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i` exceeds
     :math:`e^{-n}` at all n-1 scales and its saliency exceeds 0.1 % of the largest in the image, which rejects noise in
-    flat regions. Its value is :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint). The
-    measured blur of a step edge includes the pre-smoothing ``sigma``, so its value is at most 1/sigma. Noise, thin
-    lines and corners are not step edges; only the derivative kernel limits their value, to 1/0.6 = 1.67 per px at every
-    sigma.
+    flat regions. Its value is :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint): at
+    most 1/sigma at step edges, whose blur includes the pre-smoothing, and 1/0.6 per px elsewhere.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: n >= 2.
         sigma: smoothing in px before all other steps, >= 0.
         mode: of :func:`edge_blur`.
-        saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 0 is the focus alone, 0.5 multiplies by
-            :math:`|\nabla I|`; 1 ranks the views of real photographs best.
+        saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 1 ranks the views of real photographs best.
 
     Returns:
         (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient.

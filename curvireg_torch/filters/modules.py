@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import re
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
@@ -23,26 +22,6 @@ class Positive(nn.Module):
         return value.log()
 
 
-def _options(function: Callable[..., Any]) -> dict[str, Any]:
-    """Keyword-only options and their defaults."""
-    return {n: p.default for n, p in inspect.signature(function).parameters.items() if p.kind == p.KEYWORD_ONLY}
-
-
-def _twin_docstring(summary: str, function: Callable[..., Any], learnable: tuple[str, ...]) -> str:
-    """The docstring of a twin with the options, the input, the output and the example of its function."""
-    sections = re.split(r"^(\w+):\n", inspect.getdoc(function) or "", flags=re.MULTILINE)
-    texts = dict(zip(sections[1::2], sections[2::2], strict=True))
-    options, shape = [], []
-    for names, text in re.findall(r"^    ([\w, ]+): (.*(?:\n {8}.*)*)", texts.get("Args", ""), flags=re.MULTILINE):
-        of_constructor = [name for name in names.split(", ") if name in _options(function)]
-        options += [f"    {', '.join(of_constructor)}: {text}"] if of_constructor else []
-        shape += [] if of_constructor and len(of_constructor) == len(names.split(", ")) else [f"    Input: {text}"]
-    if learnable:
-        options.append(f"    learnable: make {' and '.join(learnable)} trainable; they stay positive.")
-    output = f"    Output: {texts.get('Returns', '').strip()}"
-    return "\n".join([summary, "", "Args:", *options, "", "Shape:", *shape, output, "", "Example:", texts["Example"]])
-
-
 class FunctionModule(nn.Module):
     """Module twin of a function of images, ``class Twin(FunctionModule, function=f, learnable=("sigma",))``. It holds
     the function's options, refuses what the function refuses, and has its documentation. A twin writes its constructor
@@ -56,22 +35,23 @@ class FunctionModule(nn.Module):
             return
         cls._function = staticmethod(function)
         declared = cls.__init__
-        signature = inspect.signature(declared)
-        wanted, stated = _options(function), _options(declared)
-        if wanted != {name: default for name, default in stated.items() if name != "learnable"}:
-            raise TypeError(f"{cls.__name__}: expected the options of its function, {wanted}, got {stated}")
+        defaults = {name: p.default for name, p in inspect.signature(declared).parameters.items() if name != "self"}
 
         @functools.wraps(declared)
-        def construct(self: "FunctionModule", *args: Any, **options: Any) -> None:
-            bound = signature.bind(self, *args, **options)
-            bound.apply_defaults()
-            values = {name: value for name, value in bound.arguments.items() if name not in ("self", "learnable")}
-            FunctionModule.__init__(self, learnable if bound.arguments.get("learnable") else (), **values)
-            self._check(values)
+        def construct(self: "FunctionModule", **options: Any) -> None:
+            declared(self, **options)  # refuses other names
+            values = {**defaults, **options}
+            FunctionModule.__init__(self, learnable if values.pop("learnable", False) else (), **values)
+            # The function refuses wrong options: it is called with no image, or with as many as there are cameras.
+            camera = values.get("camera_matrix")
+            count = len(camera) if isinstance(camera, Tensor) and camera.ndim == 3 else 0
+            function(torch.zeros(count, 1, 1, 1, device=getattr(camera, "device", "cpu")), **values)
 
-        cls.__init__ = construct  # type: ignore[method-assign]
+        cls.__init__ = construct  # type: ignore[method-assign, assignment]
         if cls.__doc__:
-            cls.__doc__ = _twin_docstring(inspect.cleandoc(cls.__doc__), function, learnable)
+            flag = f" ``learnable`` makes {' and '.join(learnable)} positive parameters." if learnable else ""
+            usage = f"The constructor takes the options, a call the images.{flag}"
+            cls.__doc__ = f"{cls.__doc__} {usage}\n\n{inspect.getdoc(function)}"
 
     def __init__(self, learnable: tuple[str, ...] = (), **options: Any) -> None:
         super().__init__()
@@ -84,15 +64,6 @@ class FunctionModule(nn.Module):
                 self.register_buffer(name, value, persistent=False)
             else:
                 setattr(self, name, tuple(value) if isinstance(value, list) else value)
-
-    def _check(self, options: dict[str, Any]) -> None:
-        """Let the function refuse the options: it is called with no image, or with as many as there are cameras."""
-        camera = options.get("camera_matrix")
-        if isinstance(camera, Tensor):
-            images = torch.zeros(len(camera) if camera.ndim == 3 else 0, 1, 1, 1, device=camera.device)
-        else:
-            images = torch.zeros(0, 1, 1, 1, device="cpu")
-        self._function(images, **options)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -112,8 +83,7 @@ class FunctionModule(nn.Module):
         return self
 
     def extra_repr(self) -> str:
-        options = self.options
-        texts = []
+        options, texts = self.options, []
         if "camera_matrix" in options:
             texts.append("orthographic" if options.pop("camera_matrix") is None else "perspective")
         for name, value in options.items():

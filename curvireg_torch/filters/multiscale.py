@@ -11,7 +11,6 @@ from . import operations as ops
 from .curvilinear import scaled_direction
 from .modules import FunctionModule
 
-CONDUCTANCES = ("rational", "exponential")
 DIFFUSION_STEP = 0.2  # of the diffusion under MCS
 
 
@@ -38,7 +37,7 @@ def anisotropic_diffusion(
         torch.Size([1, 3, 16, 16])
     """
     check_tensor(image, "image", (None, None, None, None))
-    check_option(conductance, CONDUCTANCES, "conductance")
+    check_option(conductance, ("rational", "exponential"), "conductance")
     check_integer(iterations, "iterations", least=0)
     kappa, step = ops.check_scalar(kappa, "kappa"), check_positive(step, "step")
     if step > 0.25:

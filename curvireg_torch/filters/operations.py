@@ -28,11 +28,6 @@ def squared_length(x: Tensor, y: Tensor) -> Tensor:
     return (x * x).addcmul_(y, y)
 
 
-def clone_if_grad(x: Tensor) -> Tensor:
-    """A tensor that may be changed in place: x itself, or a clone where autograd still needs its value."""
-    return x.clone() if x.requires_grad else x
-
-
 def full_precision(x: Tensor) -> AbstractContextManager[object]:
     """Disable autocast: a second derivative has no correct digit left in bfloat16."""
     device = x.device.type

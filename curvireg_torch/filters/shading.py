@@ -13,7 +13,6 @@ from . import operations as ops
 from .curvilinear import (
     BACKGROUND_DEPTH,
     check_depth,
-    check_depth_scale,
     default_to_x,
     dominant_eigenvector,
     fill_depth,
@@ -81,8 +80,7 @@ def _field_of_normals(
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
         camera_matrix = camera_matrix.to(ops.at_least_float32(depth).dtype)
-    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
 
     def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> ops.Planes:
         a, b, c = _normal_structure_tensor(depth, mask, camera, sigma, scale)
@@ -154,8 +152,7 @@ def hessian_frobenius_norm(
         >>> hessian_frobenius_norm(bowl, sigma=0.0, depth_scale=1.0)[0, :, 16, 16].tolist()
         [1.0, 0.0]
     """
-    mask, scale = check_depth(depth, mask), check_depth_scale(depth_scale)
-    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
 
     def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
         _, _, zxx, zyy, zxy = ops.central_derivatives(ops.smooth(fill_depth(depth, mask, scale), sigma, linear=True))
@@ -178,10 +175,8 @@ def apparent_ridges(
 
     View-dependent curvature :math:`q_1` is the largest rate of change of the surface normal per step *on the screen*,
     the largest singular value of :math:`[N_x\ N_y]`; :math:`t_1` is the screen direction of that step. Apparent ridges
-    are the maxima of :math:`q_1` along :math:`t_1`.
-
-    Judd et al. follow the zero crossings of :math:`D_{t_1} q_1` over the mesh's faces. Here N comes from the smoothed
-    depth, so :math:`q_1` is finite at an occluding contour; maxima are pixels, along :math:`t_1` rounded to 45 degrees.
+    are the maxima of :math:`q_1` along :math:`t_1`: here pixels, with :math:`t_1` rounded to 45 degrees and N from the
+    smoothed depth, in place of zero crossings over the mesh's faces.
 
     Args:
         depth, mask, camera_matrix, sigma, depth_scale: as in :func:`average_shading_gradient`.

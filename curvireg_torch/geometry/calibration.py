@@ -90,15 +90,9 @@ class Camera:
 
 
 class Undistorted(NamedTuple):
-    """What a camera with the same matrix, but without distortion, shows.
-
-    Attributes:
-        image: (C, H, W); pixels that were not recorded, or whose distortion is unknown, repeat the border of what is
-            known.
-        box: (4,) around the outline of the given box; None without one.
-        mask: (H, W) float32; None without one.
-        missing: (H, W) bool, True where the border is repeated.
-    """
+    """What a camera with the same matrix, but without distortion, shows: ``image`` (C, H, W); ``box`` (4,) around the
+    outline of the given one; ``mask`` (H, W) float32; and ``missing`` (H, W) bool, pixels that were not recorded, or
+    whose distortion is unknown: they repeat the border of what is known."""
 
     image: Tensor
     box: Tensor | None
@@ -107,13 +101,11 @@ class Undistorted(NamedTuple):
 
 
 def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: Tensor | None = None) -> Undistorted:
-    """Remove the distortion of a photograph; box and mask move with it, the camera matrix remains.
-
-    A polynomial describes a lens up to the radius at which it stops growing; what lies beyond is missing.
+    """Remove the distortion of a photograph; box and mask move, the camera matrix remains. A polynomial describes
+    a lens up to the radius at which it stops growing; what lies beyond is missing.
 
     Args:
-        image: (1 or 3, H, W), floating or uint8, of the size of the camera or, if that has the same aspect ratio,
-            another, see :meth:`Camera.at`.
+        image: (1 or 3, H, W), floating or uint8, of the size of the camera or of another, see :meth:`Camera.at`.
         box: (4,) x0, y0, x1, y1 in px of the photograph.
         mask: (H, W) floating.
 

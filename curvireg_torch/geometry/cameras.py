@@ -86,10 +86,9 @@ def rotation_towards(rays: Tensor) -> Tensor:
 
 
 def pose_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Estimate the pose with which the projected points fill a box, with the object in front of the camera.
-
-    Fixed point of two closed-form steps: the sizes of the projected and the given box determine the distance (least
-    squares over width and height), their centres the offset, towards which the rotation turns.
+    """Estimate the pose with which the projected points fill a box, with the object in front of the camera: the fixed
+    point of two closed-form steps. The sizes of the projected and the given box determine the distance (least squares
+    over width and height), their centres the offset, towards which the rotation turns.
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.

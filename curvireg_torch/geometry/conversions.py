@@ -13,20 +13,12 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import (
-    check_fraction,
-    check_last_axes,
-    check_numbers,
-    check_pose,
-    check_rotation,
-)
+from ..utils.checks import check_fraction, check_last_axes, check_numbers, check_pose, check_rotation
 
 
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
-    """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera.
-
-    They are view matrices; the inverse of one is the camera's pose in the model frame, as trimesh and Blender expect
-    it.
+    """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera: view matrices, whose inverse is
+    the camera's pose in the model frame, as trimesh and Blender expect it.
 
     Example:
         >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
@@ -79,12 +71,12 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
     """All symmetries of an object as 4x4 transforms, from its entry in BOP's ``models_info.json``.
 
     Each discrete symmetry is followed by each rotation about each continuous axis, in ``ceil(pi / max_step_fraction)``
-    steps: a vertex is at most half a diameter from an axis. BOP prescribes 0.01 (315 steps).
+    steps: a vertex is at most half a diameter from an axis.
 
     Args:
         info: optional ``symmetries_discrete`` (lists of 16 numbers, row-major 4x4 matrices) and
             ``symmetries_continuous`` (``{"axis": [x, y, z], "offset": [x, y, z]}``, the offset a point of the axis).
-        max_step_fraction: in (0, 1], the largest step of a vertex as a fraction of the object's diameter.
+        max_step_fraction: in (0, 1], the largest step of a vertex as a fraction of the object's diameter, BOP's 0.01.
 
     Returns:
         (S, 4, 4) float64 on the CPU, S >= 1, in the unit of ``info`` (BOP: mm); the identity comes first.

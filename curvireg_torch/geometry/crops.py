@@ -111,9 +111,8 @@ def crop_images(
     """
     if isinstance(images, Tensor):
         check_tensor(images, "images", (None, None, None, None))
-    else:
-        for image in images:
-            check_tensor(image, "images", (None, None, None))
+    for image in images:
+        check_tensor(image, "images", (None, None, None))
     check_integer(size, "size")
     boxes = as_boxes(boxes, len(images))
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])

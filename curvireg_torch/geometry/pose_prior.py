@@ -25,8 +25,7 @@ class PosePrior:
 
     Angles are those of :func:`viewpoint_from_rotation` for an object with z up whose front is at azimuth 0. How far a
     pose misses a limit is measured as a rotation: near the poles, a wrong azimuth hardly counts. Methods take rotations
-    of the mesh file's axes and ``frame``, the rotation of these axes to the object's (:func:`object_frame`); the
-    default frame is the identity.
+    of the mesh file's axes and ``frame``, the rotation of these axes to the object's (:func:`object_frame`).
 
     Attributes:
         azimuth: (low, high) in degrees, counted upwards from low to high: (300, 60) goes through 0.
@@ -190,8 +189,8 @@ def _position(angle: Tensor, limits: tuple[float, ...]) -> tuple[Tensor, float]:
 def _outside(angle: Tensor, limits: tuple[float, ...], elevation: Tensor) -> Tensor:
     r"""Least rotation in degrees that brings an azimuth or theta to the nearer limit, negative within the range. An
     azimuth :math:`\delta` degrees beyond a limit is that of a direction :math:`d` from the limit's meridian,
-    :math:`\sin d = \cos e \sin \delta`; beyond 90 degrees the nearest point is the pole. The same holds for theta and
-    the up axis, which :math:`e` tilts towards the camera."""
+    :math:`\sin d = \cos e \sin \delta`; beyond 90 degrees the nearest point is the pole. So for theta and the up axis,
+    which :math:`e` tilts towards the camera."""
     beyond, width = _position(angle, limits)
     if width == 360.0:
         return torch.full_like(angle, -180.0)

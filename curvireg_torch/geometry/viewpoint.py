@@ -21,14 +21,6 @@ from ..utils.checks import check_integer, check_numbers, check_option, check_pos
 from ..utils.choices import UP_AXES
 
 
-def _as_floating(*values: Tensor | float) -> list[Tensor]:
-    device = next((v.device for v in values if isinstance(v, Tensor)), None)  # of the tensors, for plain numbers
-    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in values]
-    tensors = [t if t.is_floating_point() else t.to(torch.get_default_dtype()) for t in tensors]
-    dtype = reduce(torch.promote_types, (t.dtype for t in tensors))
-    return list(torch.broadcast_tensors(*(t.to(dtype) for t in tensors)))
-
-
 def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0) -> Tensor:
     """(..., 3, 3) rotations model -> OpenCV camera of PASCAL3D+ viewpoints; the module states the equation.
 
@@ -40,7 +32,12 @@ def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, 
         >>> [round(v) for v in (R @ torch.tensor([0.0, 0.0, 1.0])).tolist()]
         [0, -1, 0]
     """
-    a, e, t = (torch.deg2rad(v) for v in _as_floating(azimuth, elevation, theta))
+    angles = azimuth, elevation, theta
+    device = next((v.device for v in angles if isinstance(v, Tensor)), None)  # of the tensors, for plain numbers
+    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in angles]
+    tensors = [v if v.is_floating_point() else v.to(torch.get_default_dtype()) for v in tensors]
+    dtype = reduce(torch.promote_types, (v.dtype for v in tensors))
+    a, e, t = (torch.deg2rad(v) for v in torch.broadcast_tensors(*(v.to(dtype) for v in tensors)))
     ca, sa, ce, se, ct, st = a.cos(), a.sin(), e.cos(), e.sin(), t.cos(), t.sin()
     # Rows of Rz(theta) Rx(e - 90) Rz(-a), rows two and three negated.
     rows = [
@@ -83,14 +80,8 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def up_rotation(up: str) -> Tensor:
-    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does.
-
-    glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
-
-    Example:
-        >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)).tolist()
-        [0.0, 0.0, 1.0]
-    """
+    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does. glTF's
+    front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
 
@@ -188,10 +179,8 @@ def sample_views(
 def uniform_views(
     count: int, *, thetas: Sequence[float] = (0.0,), distances: Sequence[float] = (DEFAULT_DISTANCE,)
 ) -> ViewSphere:
-    """Near-uniform view directions on the sphere, by the Fibonacci spiral.
-
-    No direction is farther than ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000
-    directions). With thetas in steps of ``s`` degrees no rotation is farther than that + ``s / 2``.
+    """Near-uniform view directions on the sphere, by the Fibonacci spiral. No direction is farther than
+    ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000 directions).
 
     Args:
         count: number of view directions; each is combined with every theta and distance.

@@ -23,8 +23,7 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 5
-RERANKING = "reranking."  # Prefix of the names of reranking features among a bank's tensors
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 6
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
@@ -38,8 +37,8 @@ class ViewBank:
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        reranking_features: features of the views by the name of their :class:`RerankingTerm`, (N, D) float16; none in a
-            large bank. Meshes with colours have grey features followed by coloured ones.
+        appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank. Meshes with colours
+            have grey features followed by coloured ones.
     """
 
     def __init__(
@@ -49,8 +48,7 @@ class ViewBank:
         self.descriptors = tensors["descriptors"].float()
         self.boxes = tensors["boxes"]
         self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
-        reranking = (name for name in tensors if name.startswith(RERANKING))
-        self.reranking_features = {name.removeprefix(RERANKING): tensors[name] for name in reranking}
+        self.appearance = tensors.get("appearance")
 
     def __len__(self) -> int:
         return len(self.views)
@@ -86,8 +84,8 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_compatible(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` unless the bank's settings and view policy are those of ``pipeline``. Views that
-        were passed by the caller (``pose="given"``) fit every view policy."""
+        """Raise :class:`BankError` unless settings and view policy are those of ``pipeline``; views that were passed by
+        the caller (``pose="given"``) fit every policy."""
         mine, theirs = asdict(self.settings), asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
             mine |= self.pipeline.views.key_fields()
@@ -113,16 +111,13 @@ class ViewBank:
         """Render, filter and describe every view, in chunks on as many threads as torch may use.
 
         Args:
-            mesh: a mesh or the path of one.
+            mesh: a mesh or the path of one, see :func:`curvireg_torch.load_mesh`.
             views: custom viewpoints; default those of the pipeline.
             image_size, camera: instead of the pipeline's.
-            renderer: "auto", "embree", "pyrender", "torch" or a :class:`DepthRenderer` of this mesh.
+            renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
             pipeline: default ``Pipeline()``.
             progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
             device: where views are filtered and described, and where the bank is stored.
-
-        Raises:
-            MeshError, MissingFileError, InvalidInputError, RenderingError.
 
         Example:
             >>> from curvireg_torch.geometry import sample_views
@@ -142,15 +137,18 @@ class ViewBank:
             pipeline = pipeline.with_pose_prior("given")
         describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
         rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
-        reranking = {t.name: t.build(None).to(device) for t in pipeline.reranking_terms(len(views))}
+        term = pipeline.stored_appearance(len(views))
+        appearance = None if term is None else term.build().to(device)
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
-            described = describe(*chunk)
-            tensors = vars(described) | {n: _pack(getattr(described, n)) for n in ("points", "silhouettes")}
-            return tensors | {
-                RERANKING + n: module.describe(describe.shaded(*chunk)).half() for n, module in reranking.items()
-            }
+            tensors = describe(*chunk)
+            for name in ("points", "silhouettes"):  # (N, S, S) bool to (N, ceil(S * S / 8)) uint8
+                packed = np.packbits(tensors[name].flatten(1).cpu().numpy(), axis=1)
+                tensors[name] = torch.from_numpy(packed).to(device)
+            if appearance is not None:
+                tensors["appearance"] = appearance.describe(describe.shaded(*chunk)).half()
+            return tensors
 
         parts = []
         with (
@@ -177,7 +175,7 @@ class ViewBank:
             "boxes": self.boxes,
             "points": self._points,
             "silhouettes": self._silhouettes,
-            **{RERANKING + name: features for name, features in self.reranking_features.items()},
+            **({} if self.appearance is None else {"appearance": self.appearance}),
         }
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -274,7 +272,8 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
     """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
     N, masks = len(views), -(-(settings.image_size**2) // 8)
     widths = {"descriptors": hog_layer(settings).length, "boxes": 4, "points": masks, "silhouettes": masks}
-    widths |= {name: tensors[name].shape[-1] for name in tensors if name.startswith(RERANKING)}
+    if "appearance" in tensors:
+        widths["appearance"] = tensors["appearance"].shape[-1]
     for name, width in widths.items():
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.
@@ -284,11 +283,6 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
         raise ValueError("viewpoints that are not finite")
     if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():
         raise ValueError("descriptors that are all zero, or empty boxes")
-
-
-def _pack(mask: Tensor) -> Tensor:
-    """(N, S, S) bool to (N, ceil(S * S / 8)) uint8."""
-    return torch.from_numpy(np.packbits(mask.flatten(1).cpu().numpy(), axis=1)).to(mask.device)
 
 
 def _unpack(packed: Tensor, size: int) -> Tensor:

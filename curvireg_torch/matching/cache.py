@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 
-from ..errors import BankError
+from ..errors import BankError, OutputError
 from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
@@ -40,9 +40,8 @@ class CachedBank(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Banks are stored
-    in its folder ``banks`` as ``bank-<32 digits>.safetensors``. Only files in that folder that have such a name are
-    ever listed, overwritten or removed."""
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Only files named
+    ``bank-<32 digits>.safetensors`` in its folder ``banks`` are ever listed, overwritten or removed."""
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):
@@ -76,10 +75,8 @@ def cached_bank(
     device: torch.device | str = "cpu",
     progress: bool | Callable[[str, int, int], object] = True,
 ) -> ViewBank:
-    """The bank from the cache, or a new one that is stored there. Concurrent processes are safe.
-
-    A damaged file is built again. A folder that cannot be written causes a warning. Afterwards the cache is trimmed to
-    its limit.
+    """The bank from the cache, or a new one that is stored there, whereupon the cache is trimmed to its limit.
+    Concurrent processes are safe. A damaged file is built again. A folder that cannot be written causes a warning.
 
     Args:
         mesh, views, pipeline, device, progress: see :meth:`ViewBank.build`.
@@ -118,12 +115,10 @@ def cached_bank(
     bank.descriptors = bank.descriptors.half().float()  # as the file stores them, so that both rank alike
     try:
         bank.save(path)
-    except OSError as error:
+        _trim(folder, keep=path)
+    except OutputError as error:
         warning = f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
         warnings.warn(warning, stacklevel=2)
-        return bank
-    try:
-        _trim(folder, keep=path)
     except OSError as error:  # files may be added to the folder, but not removed
         warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
         warnings.warn(warning, stacklevel=2)

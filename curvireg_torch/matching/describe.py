@@ -1,7 +1,6 @@
 """Views of one mesh: framed as a photograph's crop is, rendered, filtered and described."""
 
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -18,69 +17,29 @@ from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import MeshContours
 
-__all__ = ["DescribedViews", "ViewDescriber", "depth_filter", "hog_layer"]
-
-VIEWS_AT_A_TIME = 64
-"""Views in memory at a time."""
-
+VIEWS_AT_A_TIME = 64  # Views in memory at a time
+# Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel
 VIEW_FACES = 8000
-"""Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel."""
-
-EQUAL_VIEWS = 1e-6
-"""Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view."""
-
+EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
+# Distances to step back so that a perspective view approximates parallel projection to a few per mille
 PARALLEL_DISTANCE = 20.0
-"""Distances to step back so that a perspective view approximates parallel projection to a few per mille."""
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
-    """The filter that turns rendered depth into vector fields.
-
-    Example:
-        >>> type(depth_filter(BankSettings(depth_field="HFN"))).__name__
-        'HessianFrobeniusNorm'
-    """
+    """The filter that turns rendered depth into vector fields."""
     options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
     layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
     return layer
 
 
 def hog_layer(settings: BankSettings) -> HOG:
-    """The descriptor of views and photographs.
-
-    Example:
-        >>> hog_layer(BankSettings()).length
-        1764
-    """
+    """The descriptor of views and photographs."""
     return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
 
 
-@dataclass(frozen=True)
-class DescribedViews:
-    """N described views.
-
-    Attributes:
-        descriptors: (N, D) float32.
-        points, silhouettes: (N, S, S) bool.
-        boxes: (N, 4) float64 boxes of the object in normalised image coordinates (focal length 1), the object's centre
-            on the axis; model units for an orthographic camera.
-    """
-
-    descriptors: Tensor
-    points: Tensor
-    silhouettes: Tensor
-    boxes: Tensor
-
-
 class ViewDescriber:
-    """Renders, filters and describes arbitrary views of one mesh.
-
-    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
-
-    Args:
-        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
-        settings, renderer, device: see :meth:`curvireg_torch.ViewBank.build`.
-    """
+    """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
+    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
@@ -92,13 +51,13 @@ class ViewDescriber:
     ) -> None:
         self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
-        self.renderer = self.view_renderer = make_renderer(mesh, renderer, device=device)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
             self._simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
-            self.view_renderer = make_renderer(self._simple, renderer, device=device)
+            self.view_renderer = make_renderer(self._simple, renderer)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -117,15 +76,9 @@ class ViewDescriber:
         return other
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cameras that look at the object's centre, cropped to its box as a photograph is.
-
-        Args:
-            rotations: (N, 3, 3) model -> camera, as in all methods.
-            distances: (N,) of the object's centre, in model units, as in all methods.
-
-        Returns:
-            T (N, 4, 4), K (N, 3, 3) of the crops, and boxes (N, 4), see :class:`DescribedViews`. All float64.
-        """
+        """Cameras that look at the object's centre, cropped to its box as a photograph is: T (N, 4, 4), K (N, 3, 3) of
+        the crops, and boxes (N, 4), all float64. As in all methods, ``rotations`` (N, 3, 3) are model -> camera,
+        ``distances`` (N,) those of the object's centre in model units."""
         R = rotations.double().cpu()
         t = -(R @ self.centre)
         t[:, 2] += distances.double().cpu()
@@ -134,11 +87,9 @@ class ViewDescriber:
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes.
-
-        They replace unknown cameras of photographs. For orthographic views the camera is far away. Returns
-        T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64.
-        """
+        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes. They
+        replace unknown cameras of photographs. For orthographic views the camera is far away. Returns T_cam_from_model
+        (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64."""
         T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
             z = distances.double().cpu()
@@ -157,10 +108,8 @@ class ViewDescriber:
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`.
-
-        With the mesh's colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`.
-        """
+        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`. With the mesh's
+        colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`."""
         S, projection = self.settings.image_size, {"orthographic": self._orthographic}
         T, K, _ = self.cameras(rotations, distances)
         grey = shade(self.view_renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
@@ -172,27 +121,23 @@ class ViewDescriber:
     @property
     def draws_colours(self) -> bool:
         """Whether the mesh has colours, and :meth:`draw` can show them."""
-        return hasattr(self.renderer, "faces_at") and has_colours(self._mesh)
+        return self._coloured and hasattr(self.renderer, "faces_at")
 
     def draw(self, T: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
         """(N, 3, H, W) of :func:`curvireg_torch.rendering.render_colour`."""
         return render_colour(self._mesh, T, K, size, renderer=self.renderer)
 
     @torch.no_grad()
-    def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 2, S, S) fields of the framed views."""
-        out: Tensor = self._filter(self.depth(rotations, distances)[0])
-        return out
-
-    @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) descriptors of the framed views."""
         chunks = zip(rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True)
-        return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
+        return torch.cat([self.descriptor(self._filter(self.depth(R, z)[0])) for R, z in chunks])
 
     @torch.no_grad()
-    def __call__(self, rotations: Tensor, distances: Tensor) -> DescribedViews:
-        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once."""
+    def __call__(self, rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
+        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once.
+        ``descriptors`` (N, D) float32; ``points`` and ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4) float64 of the
+        object in normalised image coordinates (focal length 1), its centre on the axis; orthographic in model units."""
         source, quarters = quarter_turns(rotations, distances)
         rendered = source == torch.arange(len(source))
         depth, boxes = self.depth(rotations[rendered], distances[rendered])
@@ -209,15 +154,13 @@ class ViewDescriber:
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
             boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
-        return DescribedViews(descriptors, points, silhouettes, boxes)
+        return {"descriptors": descriptors, "points": points, "silhouettes": silhouettes, "boxes": boxes}
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
-
-    Returns, on the CPU, the index (N,) of the first view of each view's group, and the number (N,) of clockwise 90
-    degree rotations, 0 to 3, from that view to this one.
-    """
+    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees. Returns, on the CPU, the
+    index (N,) of the first view of each view's group, and the number (N,) of clockwise 90 degree rotations, 0 to 3,
+    from that view to this one."""
     x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
     apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")

@@ -11,23 +11,16 @@ from torch import Tensor, nn
 from ..features import field_points
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..terms import (
-    QueryFeatures,
-    RerankingModule,
-    RerankingTerm,
-    crop_regions,
-    jittered_boxes,
-    photograph_field,
-    whole_box_shapes,
-)
-from ..utils.checks import as_boxes, check_photograph, check_pixels, check_symmetries
+from ..terms import Appearance, QueryFeatures, crop_regions, jittered_boxes, photograph_field, whole_box_shapes
+from ..terms.terms import AppearanceModule
+from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
-MAX_CACHED_VIEWS = 2048  # Views whose reranking features are cached, 35 kB each at 128 px
+MAX_CACHED_VIEWS = 2048  # Views whose appearance is cached, 35 kB each at 128 px
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
-FEATURES_AT_A_TIME = 16  # Views whose reranking features are computed at a time
+FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
 
 
 @dataclass(frozen=True)
@@ -40,9 +33,8 @@ class Ranking:
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
             [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
             similarity of the boxes' aspect ratios in [0, 1], best view 1.
-        allowed: (B, N) bool, which views a pose prior leaves; None without one.
-        outside: (B,) best of the other views more than 30 degrees from the best view, -1 if there are none; None
-            without a prior.
+        allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,) the best of the others
+            more than 30 degrees from the best view, or -1.
     """
 
     scores: Tensor
@@ -107,20 +99,18 @@ class ViewMatcher(nn.Module):
 
     The box of each photograph is cropped as the views are, filtered and described; each ranking term compares it with
     all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms take the best over a few jittered crops.
-
     The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
     :class:`curvireg_torch.Registrar` prevents that.
 
     Args:
         bank: the views of a mesh.
-        pipeline: field, terms and box jitter; default the bank's. Its bank settings and view policy must be those of
-            the bank, unless the bank's views were passed by the caller.
+        pipeline: field, terms and box jitter; default the bank's.
         field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
             photographs as (B, 3, S, S).
-        renderer: for views that a :class:`RerankingTerm` needs.
+        renderer: for views that :class:`Appearance` needs.
 
     Raises:
-        BankError: the bank was built with other settings or for another pose prior than the pipeline's.
+        BankError: the bank was built with other settings than the pipeline's, or for another view policy.
 
     Example:
         >>> import trimesh
@@ -144,17 +134,12 @@ class ViewMatcher(nn.Module):
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
         self.bank, self._renderer = bank, renderer
-        self._feature_cache: dict[str, dict[int, Tensor]] = {}
+        self._known_appearance: dict[int, Tensor] = {}
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
         self.terms = tuple(term for term in pipeline.terms if term.weight > 0)
         self._terms = nn.ModuleDict({term.name: term.build(bank) for term in self.terms}).to(bank.device)
-
-    @property
-    def device(self) -> torch.device:
-        """The bank's device, where photographs are described and compared."""
-        return self.bank.device
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
@@ -172,10 +157,7 @@ class ViewMatcher(nn.Module):
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
         settings = self.bank.settings
-        boxes = as_boxes(boxes, len(images)).to(self.device, torch.float32)
-        for image in images:
-            check_photograph(image)
-        images = [image.to(self.device) for image in images]
+        boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
         jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
         return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
@@ -201,68 +183,63 @@ class ViewMatcher(nn.Module):
         """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
         views out, whose score is 0."""
         check_pixels(query.crops, "of the box")
-        first = [t for t in self.terms if not isinstance(t, RerankingTerm)]
+        first = [t for t in self.terms if not isinstance(t, Appearance)]
         terms = {t.name: self._terms[t.name](query) for t in first}
         first_log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in first]).sum(dim=0)
-        log, reranked = self._reranked(query, first_log)
+        log, compared = self._with_appearance(query, first_log)
         if allowed is None:
             order = log.argsort(dim=1, descending=True, stable=True)
-            return Ranking(log.exp(), order, {**terms, **reranked})
+            return Ranking(log.exp(), order, {**terms, **compared})
         allowed = allowed.to(log.device)
-        without, (log, reranked) = log, self._reranked(query, first_log.masked_fill(~allowed, -torch.inf))
+        without, (log, compared) = log, self._with_appearance(query, first_log.masked_fill(~allowed, -torch.inf))
         order = log.argsort(dim=1, descending=True, stable=True)
         R = self.bank.rotations
         near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE
         best, outside = without.masked_fill(allowed | near, -torch.inf).max(dim=1)
         outside = outside.masked_fill(best == -torch.inf, -1)
-        return Ranking(log.exp(), order, {**terms, **reranked}, allowed, outside)
+        return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
-    def _reranked(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        raw: dict[str, Tensor] = {}
-        for term in self.terms:
-            if isinstance(term, RerankingTerm):
-                raw[term.name], log_score = self._rerank(term, query, log)
-                log = log + term.weight * log_score
-        return log, raw
+    def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""
+        term = next((t for t in self.terms if isinstance(t, Appearance)), None)
+        if term is None:
+            return log, {}
+        raw, score, compare = torch.full_like(log, torch.nan), torch.zeros_like(log), self._appearance.compare
+        if len(log) and len(self.bank) <= term.exhaustive_limit:
+            raw = compare(query, self._appearance_of(torch.arange(len(self.bank)))).to(log)
+            score = term.log_score(raw)
+        elif len(log):
+            R = self.bank.rotations
+            order = log.argsort(dim=1, descending=True, stable=True)
+            selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
+            selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
+            compared = torch.cat(selected).unique()
+            similarity = compare(query, self._appearance_of(compared)).to(log)
+            for b, index in enumerate(selected):
+                raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
+                traces = R.flatten(1) @ R[index].flatten(1).T  # a relative rotation's trace grows as its angle falls
+                score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
+        return log + term.weight * score, {term.name: raw}
 
-    def _rerank(self, term: RerankingTerm, query: QueryFeatures, log: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, N) raw scores, NaN for views that were not compared, and log scores of all views."""
-        raw, score = torch.full_like(log, torch.nan), torch.zeros_like(log)
-        if len(log) == 0:
-            return raw, score
-        module = cast(RerankingModule, self._terms[term.name])
-        if len(self.bank) <= term.exhaustive_limit:
-            raw = module.compare(query, self._reranking_features(term.name, torch.arange(len(self.bank)))).to(log)
-            return raw, term.log_score(raw)
-        R = self.bank.rotations
-        order = log.argsort(dim=1, descending=True, stable=True)
-        selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
-        selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
-        compared = torch.cat(selected).unique()
-        similarity = module.compare(query, self._reranking_features(term.name, compared)).to(log)
-        for b, index in enumerate(selected):
-            raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
-            traces = R.flatten(1) @ R[index].flatten(1).T  # the trace of the relative rotation grows as its angle falls
-            score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
-        return raw, score
+    @property
+    def _appearance(self) -> AppearanceModule:
+        return cast(AppearanceModule, self._terms[Appearance.name])
 
-    def _reranking_features(self, name: str, views: Tensor) -> Tensor:
+    def _appearance_of(self, views: Tensor) -> Tensor:
         """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
-        if name in self.bank.reranking_features:
-            features = self.bank.reranking_features[name]
-            return features if len(views) == len(features) else features[views.to(self.device)]
-        cache = self._feature_cache.setdefault(name, {})
+        if (features := self.bank.appearance) is not None:
+            return features if len(views) == len(features) else features[views.to(self.bank.device)]
+        cache = self._known_appearance
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
-        module = cast(RerankingModule, self._terms[name])
 
         def describe(chunk: list[int]) -> Tensor:
-            views = torch.tensor(chunk, device=self.device)
-            return module.describe(self.describer.shaded(self.bank.rotations[views], self.bank.distances[views]))
+            R, distances = self.bank.rotations[chunk], self.bank.distances[chunk]
+            return self._appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
         chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
-        parts = map_on_threads(describe, chunks, device=self.device)
+        parts = map_on_threads(describe, chunks, device=self.bank.device)
         new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
         if len(cache) + len(new) > MAX_CACHED_VIEWS:
             cache.clear()
@@ -270,21 +247,19 @@ class ViewMatcher(nn.Module):
         found.update(new)
         return torch.stack([found[view] for view in views.tolist()])
 
-    def reranking_score(
-        self, name: str, query: QueryFeatures, ranking: Ranking, pictures: Tensor, image_index: Tensor
-    ) -> Tensor:
-        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses by the :class:`RerankingTerm` called ``name``,
-        as if they were ranked views; ``image_index`` (H,) is the photograph of ``query`` and ``ranking`` of each."""
-        module, term = cast(RerankingModule, self._terms[name]), next(t for t in self.terms if t.name == name)
-        raw = module.compare(query, module.describe(pictures)).cpu().double()
-        out = torch.zeros(len(pictures), dtype=torch.float64)
-        for h, b in enumerate(image_index.tolist()):
-            views = ranking.terms[name][b].cpu().double()
-            scores = term.log_score(torch.cat([views[views.isfinite()], raw[b, h : h + 1]])[None])[0]
+    def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
+        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
+        that of the most similar view of its ranking."""
+        (term,) = (t for t in self.terms if isinstance(t, Appearance))
+        raw = self._appearance.compare(query, self._appearance.describe(pictures))[0].cpu().double()
+        views = ranking.terms[term.name][0].cpu().double()
+        views, out = views[views.isfinite()], torch.zeros(len(raw), dtype=torch.float64)
+        for h in range(len(raw)):
+            scores = term.log_score(torch.cat([views, raw[h : h + 1]])[None])[0]
             out[h] = scores[-1] - scores[:-1].max()  # positive if the pose is more similar than every view
         return out
 
     @cached_property
     def describer(self) -> ViewDescriber:
         """Render and describe further views as the bank's; built on first use."""
-        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.device)
+        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device)

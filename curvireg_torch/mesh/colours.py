@@ -125,7 +125,12 @@ def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     image = getattr(material, "image", None)  # beside an image, exporters of OBJ write any colour
     image = getattr(material, "baseColorTexture", None) if image is None else image
     factor = getattr(material, "baseColorFactor", None)
-    colour = material.main_color[:3] if factor is None else _encoded(factor[:3])
+    if factor is None:
+        colour = material.main_color[:3]
+    else:  # linear, as factors in glTF are
+        x = np.asarray(factor[:3], np.float64) / 255
+        srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+        colour = np.asarray((255 * srgb).round(), np.uint8)
     texture = None if image is None or visual.uv is None else textures(image)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
@@ -135,16 +140,8 @@ def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     return None if unset else SurfaceColours.plain(len(faces), colour)
 
 
-def _encoded(linear: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """sRGB of a colour whose bytes are linear, as factors in glTF are."""
-    x = np.asarray(linear, np.float64) / 255
-    srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    return np.asarray((255 * srgb).round(), np.uint8)
-
-
 class _Textures:
-    """(h, w, 3) uint8 of PIL images, each decoded once; transparent texels are white. None, with a warning, if one
-    cannot be used."""
+    """(h, w, 3) uint8 of PIL images, each decoded once. None, with a warning, if one cannot be used."""
 
     def __init__(self, *, close: bool = False) -> None:
         self._close, self._known = close, dict[int, tuple[Any, NDArray[np.uint8] | None]]()

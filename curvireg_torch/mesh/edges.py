@@ -6,43 +6,23 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-__all__ = ["MeshEdges", "simplified"]
-
-WELD = 1e-6
-"""Vertices nearer than this fraction of the mesh's longest side are one."""
-
-CREASE_ANGLE = 15.0
-"""Degrees between two faces from which their common edge is a crease."""
-
-SMOOTH_ANGLE = 40.0
-"""Degrees between two faces below which the surface counts as smooth across their edge."""
-
-MAX_EDGE_FACES = 4
-"""Faces of an edge that are looked at; polygon soups have edges with more than two."""
+WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are one
+CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
+SMOOTH_ANGLE = 40.0  # Degrees between two faces below which the surface counts as smooth across their edge
+MAX_EDGE_FACES = 4  # Faces of an edge that are looked at; polygon soups have edges with more than two
 
 
 class MeshEdges:
-    """Unique edges of a simplified mesh, the planes of their faces, and which of them are creases.
-
-    Polygon soups work: vertices are welded, doubled faces count once, and the orientation of faces does not matter.
-
-    Args:
-        mesh: a triangle mesh.
-        centre: (3,), subtracted from its vertices.
-        max_faces: to which larger meshes are simplified.
+    """Unique edges of a mesh that is simplified to ``max_faces``, the planes of their faces, and which of them are
+    creases. Polygon soups work: vertices are welded, doubled faces count once, and the orientation of faces does not
+    matter.
 
     Attributes:
         vertices: (V, 3) float64, relative to ``centre``.
         faces: (F, 3) int.
         edges: (E, 2) vertices of each edge.
         normals: (V, 3) unit vectors, means of the normals of the faces around each vertex.
-        angle: (E,) rad between the two faces of an edge; 0 for a boundary.
-        is_boundary, is_crease, is_smooth: (E,) bool.
-
-    Example:
-        >>> edges = MeshEdges(trimesh.creation.box((1, 2, 3)), np.zeros(3), max_faces=100)
-        >>> int(edges.is_crease.sum()), len(edges.edges)
-        (12, 18)
+        is_crease, is_smooth: (E,) bool.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> None:
@@ -64,35 +44,25 @@ class MeshEdges:
         depth = min(MAX_EDGE_FACES, max(2, int(count.max(initial=1))))  # closed meshes have two faces at every edge
         self._edge_faces, signs = self._edge_faces[:, :depth], signs[:, :depth]
         self._flips = (signs < 0).T
-        self.is_boundary = count == 1
+        boundary, many = count == 1, count > 2
         # Unit vectors within the faces, away from the edge: they do not depend on the orientation of faces.
         along = vertices[self.edges[:, 1]] - vertices[self.edges[:, 0]]
         normal = self._plane / np.maximum(np.linalg.norm(self._plane, axis=1), 1e-300)[:, None]
         inward = np.cross(normal[self._edge_faces] * signs[..., None], along[:, None])
         inward /= np.maximum(np.linalg.norm(inward, axis=2), 1e-300)[..., None]
         cosine = (inward[:, 0] * inward[:, 1]).sum(axis=1)
-        self.angle = np.where(self.is_boundary, 0.0, np.pi - np.arccos(np.clip(cosine, -1.0, 1.0)))
-        many = count > 2
-        self.is_crease = (self.angle > math.radians(CREASE_ANGLE)) | many
-        self.is_smooth = (self.angle < math.radians(SMOOTH_ANGLE)) & ~self.is_boundary & ~many
-        self.normals = self._vertex_normals()
-
-    def _vertex_normals(self) -> np.ndarray:
-        total = np.zeros_like(self.vertices)
+        angle = np.where(boundary, 0.0, np.pi - np.arccos(np.clip(cosine, -1.0, 1.0)))
+        self.is_crease = (angle > math.radians(CREASE_ANGLE)) | many
+        self.is_smooth = (angle < math.radians(SMOOTH_ANGLE)) & ~boundary & ~many
+        total = np.zeros_like(vertices)
         for k in range(3):
-            np.add.at(total, self.faces[:, k], self._plane)
-        length = np.linalg.norm(total, axis=1, keepdims=True)
-        unit: np.ndarray = total / np.maximum(length, 1e-300)
-        return unit
+            np.add.at(total, faces[:, k], self._plane)
+        self.normals: np.ndarray = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
 
     def sides(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which edges are on the occluding contour, seen from camera centres (N, 3) relative to ``centre``.
-
-        An edge is, if the third corners of all of its faces lie on one side of the plane through camera and edge.
-
-        Returns:
-            (N, E) bool, and (N, E) the sign of that side: of ((a - eye) x (b - eye)) . (corner - eye).
-        """
+        """Which edges are on the occluding contour, seen from cameras (N, 3) relative to ``centre``. (N, E) bool:
+        the third corners of all faces lie on one side of the plane through camera and edge. (N, E) the sign of that
+        side, of ((a - eye) x (b - eye)) . (corner - eye)."""
         behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
         first, *others = (behind[:, faces] ^ flip for faces, flip in zip(self._edge_faces.T, self._flips, strict=True))
         all_same = np.ones_like(first)
@@ -102,12 +72,8 @@ class MeshEdges:
 
 
 def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most about ``max_faces``.
-
-    Example:
-        >>> len(simplified(trimesh.creation.icosphere(4), np.zeros(3), 1000)[1])
-        1000
-    """
+    """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most about
+    ``max_faces``."""
     vertices, faces = _welded(np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces))
     if len(faces) <= max_faces:
         return vertices, faces

@@ -86,8 +86,9 @@ def _read(path: Path, folder: "_Folder") -> Any:
         if path.stat().st_size > MAX_MESH_BYTES:
             raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
         data = path.read_bytes()
-        if suffix in (".obj", ".off") or (suffix == ".ply" and b"ascii" in data[:100]):
-            check_lines(data)
+        is_text = suffix in (".obj", ".off") or (suffix == ".ply" and b"ascii" in data[:100])
+        if is_text and max(data.count(b"\n"), data.count(b"\r")) > MAX_MESH_LINES:
+            raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
         if suffix == ".obj":
             data = obj_with_triangles(data)
         elif suffix == ".off":
@@ -210,10 +211,7 @@ def _check_nodes(tree: dict[str, Any]) -> None:
 
 def divide_faces(vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]) -> Triangles:
     """Triangles that cover planar faces: fans of convex ones, others by earcut. Corners on straight edges may drop out.
-
-    Raises:
-        ValueError: a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.errors`.
-    """
+    Raises ValueError where a vertex does not exist, or the faces are beyond :mod:`curvireg_torch.errors`."""
     if sum(max(len(face) - 2, 0) for face in faces) > MAX_MESH_FACES:
         raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
     if any(not 0 <= min(face) <= max(face) < len(vertices) for face in faces if face):
@@ -252,12 +250,6 @@ def _is_concave(flat: NDArray[np.float64]) -> NDArray[np.bool_]:
     size = np.square(np.ptp(flat, axis=1)).sum(axis=1)
     least_turn = (edges[..., 0] * ahead[..., 1] - edges[..., 1] * ahead[..., 0]).min(axis=1)
     return np.asarray(least_turn < -1e-9 * size, dtype=bool)
-
-
-def check_lines(data: bytes) -> None:
-    """Raise ValueError for a text of more lines than a mesh file may have."""
-    if max(data.count(b"\n"), data.count(b"\r")) > MAX_MESH_LINES:
-        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
 
 
 def obj_with_triangles(data: bytes) -> bytes:

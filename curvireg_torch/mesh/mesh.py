@@ -138,8 +138,8 @@ def mesh_up(mesh: trimesh.Trimesh) -> str:
 
 
 def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColours | None]:
-    """One mesh of the meshes of a scene, at their places: ``scene.dump()`` takes time with the cube of a part's depth,
-    and would pack textures into one that cannot repeat."""
+    """One mesh of a scene's parts at their places: ``scene.dump()`` takes time with the cube of a part's depth, and
+    would pack textures into one that cannot repeat."""
     geometry = {name: part for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)}
     colours = dict(zip(geometry, colours_of_parts(geometry.values()), strict=True))
     forest = scene.graph.transforms
@@ -169,8 +169,7 @@ def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColour
 
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than 4096 of them, those
-    that are outermost in one of 2562 directions of the object scaled to equal extents: sides of boxes move by about 0.1
-    % of their length at most."""
+    outermost in 2562 directions of the object scaled to equal extents: sides of boxes move by 0.1 % at most."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.array(mesh.vertices, dtype=np.float64)

@@ -117,8 +117,8 @@ class Proposals:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A box (4,) of a photograph, described and ranked, with the detector's ``response`` and the ``score``, the
-    probability that it shows the object."""
+    """A box (4,) of a photograph, ranked, with the detector's ``response``, and as ``score`` the probability that it
+    shows the object."""
 
     box: Tensor
     response: float
@@ -138,7 +138,6 @@ class Candidate:
         return cls(box, response, query, ranking, detection_probability(response, similarity))
 
     def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
-        """Register the box."""
         result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
         return Found(result, projected_box(registrar.describer, result.projection), self.response, self.score)
 
@@ -199,15 +198,12 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
     results = []
     for one in found:
         probabilities = tuple(p * one.score for p in one.registration.probabilities)
-        uncertain = probabilities and probabilities[0] < FOUND_CONFIDENCE
-        results.append(
-            replace(
-                one.registration,
-                detection=Detection(one.box, one.score, one.response, boxes[kept], responses[kept]),
-                probabilities=probabilities,
-                warnings=one.registration.warnings + ((NOT_FOUND,) if uncertain else ()),
-            )
-        )
+        warnings = one.registration.warnings
+        if probabilities and probabilities[0] < FOUND_CONFIDENCE:
+            warnings += (NOT_FOUND,)
+        detection = Detection(one.box, one.score, one.response, boxes[kept], responses[kept])
+        changes: dict[str, Any] = {"detection": detection, "probabilities": probabilities, "warnings": warnings}
+        results.append(replace(one.registration, **changes))
     return results
 
 
@@ -226,9 +222,9 @@ class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
     A few representative views are compared with every position of the photograph, at sizes in steps of :math:`\sqrt 2`.
-    A view's similarity is the mean cosine of the backbone's features of the view, shaded grey and, where the mesh has
-    colours, in colour, and of the photograph over the cells that the view covers; its response is the similarity in
-    standard deviations above its mean over the photograph. Peaks over position, size and view are boxes.
+    A view's similarity is the mean cosine of the backbone's features of view and photograph, in grey or in colour, over
+    the cells that the view covers; its response is the similarity in standard deviations above its mean over the
+    photograph. Peaks over position, size and view are boxes.
 
     Args:
         matcher: of the bank; ``detection`` of its pipeline holds the settings.
@@ -247,13 +243,15 @@ class Detector(nn.Module):
         super().__init__()
         self.matcher, self.settings = matcher, matcher.pipeline.detection
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))
-        self.backbone = (next(networks, None) or Backbone()).to(matcher.device)
+        self.backbone = (next(networks, None) or Backbone()).to(matcher.bank.device)
         self._templates = _templates(self.backbone, matcher.describer, matcher.bank, self.settings.views)
 
     @cached_property
     def _template_of_view(self) -> Tensor:
-        """(N,) template that stands for each view of the bank."""
-        return _nearest_representatives(self.matcher.bank, self._templates.views)
+        """(N,) template that is most similar to each view of the bank; on the CPU."""
+        bank = self.matcher.bank
+        views, chosen = (_view_features(bank, index) for index in (torch.arange(len(bank)), self._templates.views))
+        return torch.cdist(views, chosen).argmin(dim=1).cpu()
 
     @torch.no_grad()
     def forward(
@@ -284,13 +282,12 @@ class Detector(nn.Module):
         if allowed is not None:
             usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[allowed.cpu()], True)
         side = (templates.boxes[:, 2:] - templates.boxes[:, :2]).amax(dim=1)
-        scales = self._scales(image, focal, distance, float(side.quantile(0.5)))
-        maps, fitting, ratios = [], [], []
-        largest: Tensor | None = None  # comes first; the smaller copies are resized from it
-        for scale in scales:
+        maps: list[Tensor] = []
+        fitting, ratios = [], []
+        for scale in self._scales(image, focal, distance, float(side.quantile(0.5))):
             h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
-            if largest is None:
-                largest = _resized(image, (h, w)).to(self.matcher.device)
+            if not maps:  # the largest copy comes first; the smaller ones are resized from it
+                largest = _resized(image, (h, w)).to(self.matcher.bank.device)
                 check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
             maps.append(self._similarity(_resized(largest, (h, w))[None]))
             ratios.append((w / image.shape[-1], h / image.shape[-2]))
@@ -397,12 +394,6 @@ def representative_views(bank: ViewBank, count: int) -> Tensor:
         views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS
     features = _view_features(bank, views)
     return views[_medoids(torch.cdist(features, features).square(), count).cpu()].sort().values
-
-
-def _nearest_representatives(bank: ViewBank, chosen: Tensor) -> Tensor:
-    """(N,) index into ``chosen`` views of the most similar one of each view; on the CPU."""
-    every = torch.arange(len(bank))
-    return torch.cdist(_view_features(bank, every), _view_features(bank, chosen)).argmin(dim=1).cpu()
 
 
 def _view_features(bank: ViewBank, views: Tensor) -> Tensor:

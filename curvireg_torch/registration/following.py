@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -30,14 +31,14 @@ BELIEVED_CONFIDENCE = 0.5
 class Follower:
     """Registers frames one after the other: each starts from the pose of the frame before.
 
-    The first frame is registered, unless :meth:`start` gives its pose, and so is every further one until a pose is
-    believed. From then on frames are tracked (docs/method.md). Where tracking is not trusted, contours are fitted
-    around its pose and the result is compared with a registration (:func:`refine`); the more certain pose counts.
-    Where neither finds the object, the frame is registered, and that pose is used only if it is reliable.
+    Frames are registered until a pose is believed, and tracked from then on (docs/method.md). Where tracking is not
+    trusted, contours are fitted around its pose and the result is compared with a registration (:func:`refine`); the
+    more certain pose counts. Where neither finds the object, the frame is registered, and that pose is used only if it
+    is reliable.
 
     The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the last pose that a registration confirmed, which it never exceeds.
-    No pose gains confidence from being followed, unless a further registration is reliable.
+    of the truth: the tracker's own, times that of the last pose that a registration confirmed. No pose gains confidence
+    from being followed, unless a further registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -81,7 +82,10 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
-        map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [T])
+        self._start(item, T, confidence)
+
+    def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
+        map_on_threads(partial(self._tracker.start, item.image, _camera(item)), [T])
         self._base = confidence
 
     @torch.no_grad()
@@ -105,7 +109,12 @@ class Follower:
         starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
         refined = map_on_threads(lambda T: self._refined(item, T), [torch.cat(starts)])[0]
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
-            self._go_on(item, refined)
+            with suppress(LostObjectError):  # track on from it, if it lies within the frame
+                measured = map_on_threads(
+                    lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(refined)]
+                )
+                self._tracker.accept(measured[0])
+                self._base = _confidence(refined)
             return refined
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
@@ -119,8 +128,7 @@ class Follower:
         result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
             with suppress(LostObjectError):
-                map_on_threads(lambda T: self._tracker.start(item.image, _camera(item), T), [_pose(result)])
-                self._base = _confidence(result)
+                self._start(item, _pose(result), _confidence(result))
         return result
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
@@ -131,13 +139,6 @@ class Follower:
             return FailedRegistration(error)
         bound = self._base if _confidence(result) < RELIABLE else 1.0
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
-
-    def _go_on(self, item: ImageItem, result: Registration) -> None:
-        """Track on from a refined pose, if it lies within the frame."""
-        with suppress(LostObjectError):
-            measure = self._tracker.measure
-            self._tracker.accept(map_on_threads(lambda T: measure(item.image, _camera(item), T), [_pose(result)])[0])
-            self._base = _confidence(result)
 
     def _track(self, item: ImageItem) -> TrackedPose | None:
         with suppress(LostObjectError):

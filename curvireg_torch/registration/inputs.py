@@ -72,8 +72,13 @@ class ImageItem:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is questionable about box, camera and mask, see ``input_warnings``."""
-        return input_warnings(self.box, self.camera_matrix, self.size) + self.notes
+        """What is questionable about box, camera and mask; each names the likely mistake."""
+        found = [] if self.camera_matrix is None else camera_warnings(self.camera_matrix, self.size)
+        if (side := _visible_side(self.box, self.size)) < SMALL_BOX_SIDE:
+            found.append(
+                f"the box shows {side:.0f} px on its shorter side; use a picture with at least {SMALL_BOX_SIDE}"
+            )
+        return (*found, *self.notes)
 
     def mask_crop(self, size: int, margin: float) -> Tensor | None:
         """(1, 1, size, size) of the mask, as the photograph is cropped to its box."""
@@ -88,23 +93,23 @@ def image_items(
     masks: Any | None = None,
 ) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
-
-    Arguments are those of ``Registrar``; each is read and checked whenever it is asked for, so that many large files
-    need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed. A box of which
-    too little lies inside its photograph is refused, see :func:`check_box_side`.
-
-    Raises:
-        InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without cameras.
-    """
+    Arguments and errors are those of ``Registrar``; each is read and checked whenever it is asked for, so that many
+    large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed. A box
+    of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is refused."""
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
-    n = len(images)
-    boxes = None if boxes is None else _boxes(boxes, n)
+    n, no_box = len(images), boxes is None
+    if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
+        if len(boxes) != n:
+            raise InvalidInputError(f"boxes: expected {n}, one for each image or None, got {len(boxes)}")
+        boxes = [None if is_missing(box) else as_boxes([box], 1)[0] for box in boxes]
+    else:
+        boxes = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
     masks = [None] * n if masks is None else list(masks)
     if len(masks) != n:
         raise InvalidInputError(f"masks: expected {n}, one for each image or None, got {len(masks)}")
-    if boxes is None and any(m is None for m in masks) and any(m is not None for m in masks):
+    if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
         raise InvalidInputError(f"masks: image {masks.index(None)} has neither mask nor box; register it separately")
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
@@ -114,22 +119,17 @@ def image_items(
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
-            item = image_item(images[i], None if boxes is None else boxes[i], cameras[i], priors[i], masks[i])
-            check_box_side(item.box, item.size)
+            item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
+            if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
+                small = min(item.size) < MIN_BOX_SIDE
+                where = "the photograph has" if small else "the part of the photograph in the box has"
+                message = f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"
+                raise InvalidInputError(f"{where} {message}")
             return item
         except CurviregError as error:
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
     return OnDemand(item, n)
-
-
-def _boxes(given: Any, count: int) -> Sequence[Tensor | None]:
-    """A box for each image, None where there is none."""
-    if not (isinstance(given, list | tuple) and any(is_missing(box) for box in given)):
-        return list(as_boxes(given, count))
-    if len(given) != count:
-        raise InvalidInputError(f"boxes: expected {count}, one for each image or None, got {len(given)}")
-    return [None if is_missing(box) else as_boxes([box], 1)[0] for box in given]
 
 
 def is_missing(box: Any) -> bool:
@@ -203,7 +203,13 @@ def image_item(
         pixels, box, mask, missing = undistorted(pixels, camera, box, mask)
         camera = camera.matrix
     if mask is not None:
-        box = _box_of_mask(mask, box)
+        white = mask >= 0.5
+        if not bool((white if box is None else _inside(white, box)).any()):
+            where = "" if box is None else " in the box"
+            raise InvalidInputError(f"mask: no white pixel{where}; expected the object white, all else black")
+        y, x = white.nonzero().unbind(1)
+        around = torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
+        box = around if box is None else box
     box = whole_image_box(pixels).cpu() if box is None else box
     item = ImageItem(pixels, box, camera, prior, mask)
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
@@ -226,18 +232,6 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
     if float(x.min()) < 0 or float(x.max()) > 1:
         raise InvalidInputError("mask: expected values from 0 to 1, the object white; divide by the largest")
     return x
-
-
-def _box_of_mask(mask: Tensor, box: Tensor | None) -> Tensor:
-    """The (4,) box, or that around the white pixels of (H, W); refuses a mask without any, or without any in it."""
-    white = mask >= 0.5
-    if not bool((white if box is None else _inside(white, box)).any()):
-        where = "" if box is None else " in the box"
-        raise InvalidInputError(f"mask: no white pixel{where}; expected the object white, all else black")
-    if box is not None:
-        return box
-    y, x = white.nonzero().unbind(1)
-    return torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
 
 
 def _inside(pixels: Tensor, box: Tensor) -> Tensor:
@@ -280,37 +274,23 @@ def check_crop(crop: Tensor) -> None:
         raise ImageError("the box shows one colour, nothing to register; check image and box")
 
 
-def input_warnings(box: Tensor, camera_matrix: Tensor | None, size: tuple[int, int]) -> tuple[str, ...]:
-    """What is questionable about the (4,) box and the (3, 3) camera of an (H, W) photograph; each names the mistake."""
-    warnings = [] if camera_matrix is None else camera_warnings(camera_matrix, size)
-    if (side := _visible_side(box, size)) < SMALL_BOX_SIDE:
-        warnings.append(
-            f"the box shows {side:.0f} px on its shorter side; use a picture with at least {SMALL_BOX_SIDE}"
-        )
-    return tuple(warnings)
-
-
-def check_box_side(box: Tensor, size: tuple[int, int]) -> None:
-    """Refuse a box of which less than ``MIN_BOX_SIDE`` px lie inside the (H, W) photograph in a direction."""
-    side = _visible_side(box, size)
-    if side < MIN_BOX_SIDE:
-        where = "the photograph has" if min(size) < MIN_BOX_SIDE else "the part of the photograph in the box has"
-        raise InvalidInputError(
-            f"{where} {side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"
-        )
-
-
 def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
-    """What is questionable about a valid (3, 3) camera matrix of an (H, W) photograph; each names the likely
-    mistake."""
+    """What is questionable about a valid (3, 3) camera matrix of an (H, W) photograph."""
     fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     H, W = size
     found = []
-    if not _is_inside(cx, cy, size):
-        found.append(
-            f"the principal point ({cx:g}, {cy:g}) lies outside the photograph of {W} x {H} px; "
-            f"{_likely_mistake(fx, fy, cx, cy, size)}"
-        )
+
+    def is_inside(x: float, y: float) -> bool:  # the corner (0, 0) stands for unknown values
+        return -0.5 < x < W - 0.5 and -0.5 < y < H - 0.5 and (x, y) != (0.0, 0.0)
+
+    if not is_inside(cx, cy):
+        advice = "it is near the centre, unless the picture was cropped"
+        if is_inside(fx, fy) and are_nearly_equal(cx, cy):
+            advice = "FX FY and CX CY seem to be swapped"
+        elif cx >= W - 1 and cy >= H - 1:
+            w, h = 2 * cx + 1, 2 * cy + 1
+            advice = f"this camera seems to belong to a picture of about {w:.0f} x {h:.0f} px; scale it"
+        found.append(f"the principal point ({cx:g}, {cy:g}) lies outside the photograph of {W} x {H} px; {advice}")
     low, high = FOCAL_RANGE
     focal, side = min(fx, fy), max(W, H)
     if not low * side <= focal <= high * side:
@@ -321,22 +301,6 @@ def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
             f"degrees; {advice}"
         )
     return found
-
-
-def _likely_mistake(fx: float, fy: float, cx: float, cy: float, size: tuple[int, int]) -> str:
-    """Of a camera whose principal point lies outside the (H, W) photograph."""
-    H, W = size
-    if _is_inside(fx, fy, size) and are_nearly_equal(cx, cy):
-        return "FX FY and CX CY seem to be swapped"
-    if cx >= W - 1 and cy >= H - 1:
-        return f"this camera seems to belong to a picture of about {2 * cx + 1:.0f} x {2 * cy + 1:.0f} px; scale it"
-    return "it is near the centre, unless the picture was cropped"
-
-
-def _is_inside(x: float, y: float, size: tuple[int, int]) -> bool:
-    """Whether a point lies in an (H, W) picture and not in its corner (0, 0), which stands for unknown values."""
-    H, W = size
-    return -0.5 < x < W - 0.5 and -0.5 < y < H - 0.5 and (x, y) != (0.0, 0.0)
 
 
 def _visible_side(box: Tensor, size: tuple[int, int]) -> float:

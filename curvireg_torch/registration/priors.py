@@ -71,9 +71,8 @@ class Limits:
         return (self._excess(poses) <= FIT_TOLERANCE) & (self._distance_excess(poses) <= DISTANCE_TOLERANCE)
 
     def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
-        """How the best pose contradicts the limits, see :attr:`Registration.prior_contradiction`; ``filling`` is the
-        same at the distance at which the mesh fills the box, ``better_outside`` whether a pose outside has a higher
-        score."""
+        """See :attr:`Registration.prior_contradiction`, of the best pose; ``filling`` is the same at the distance at
+        which the mesh fills the box, ``better_outside`` whether a pose outside has a higher score."""
         if better_outside or bool(self._distance_excess(filling) > BOX_DISTANCE_TOLERANCE):
             return "better outside"
         at_limit = self._excess(best) > -AT_LIMIT_ANGLE, self._distance_excess(best) > -AT_LIMIT_DISTANCE

@@ -28,13 +28,9 @@ from .tracker import OUTSIDE, boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-__all__ = ["LOST_CONFIDENCE", "nearest_view", "refine", "refine_item"]
-
+# Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank
 WIDE_ANGLES = (14.0, 22.0)
-"""Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank."""
-
-LOST_CONFIDENCE = 0.35
-"""Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md."""
+LOST_CONFIDENCE = 0.35  # Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
 
 
 @torch.no_grad()
@@ -68,27 +64,20 @@ def refine(
     """
     if camera_matrices is None:
         raise InvalidInputError("refine: needs the camera matrix of each photograph")
-    items, starts = image_items(images, None, camera_matrices), [_starts(one) for one in poses]
+    items, starts = image_items(images, None, camera_matrices), []
+    for one in poses:
+        T = as_numbers(one, "poses", dtype=torch.float64).cpu()
+        starts.append(T[None] if T.ndim == 2 else T)
+        check_pose(T, "poses")
     limits = [None] * len(items) if start_confidences is None else list(start_confidences)
     if len(starts) != len(items) or len(limits) != len(items):
         raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
-
     return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))
 
 
-def _starts(poses: Any) -> Tensor:
-    T = as_numbers(poses, "poses", dtype=torch.float64).cpu()
-    T = T[None] if T.ndim == 2 else T
-    check_pose(T, "poses")
-    return T
-
-
 def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None) -> Registration:
-    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most ``limit``.
-
-    Raises:
-        LostObjectError: the object is not near any start.
-    """
+    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most ``limit``. Raises
+    :class:`LostObjectError` where the object is not near any start."""
     assert item.camera_matrix is not None
     describer, K = registrar.describer, item.camera_matrix.double()
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
@@ -130,10 +119,8 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
 
 
 def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:
-    """Probability of one pose in a registration of the box that it projects to, which its rotation does not influence.
-
-    It is that of the hypotheses within 30 degrees of the pose.
-    """
+    """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of the box that it
+    projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
     query = registrar.matcher.query([item.image], boxes.float())
     found = registrar.register(replace(item, box=boxes[0].float()), query)

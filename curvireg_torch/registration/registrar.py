@@ -425,8 +425,7 @@ class Registrar:
         appearance = None
         if Appearance.name in work.ranking.terms:
             pictures = self.matcher.describer.shaded(poses.rotation, poses.distance)
-            compared = (work.query, work.ranking, pictures, torch.zeros_like(poses.view))
-            appearance = self.matcher.reranking_score(Appearance.name, *compared)
+            appearance = self.matcher.appearance_score(work.query, work.ranking, pictures)
         return pose_features(self.describer, work.descriptors, poses, appearance)
 
     def _fitted_again(

@@ -33,29 +33,16 @@ HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as
 MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
 STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
 SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
-CONVENTIONS = {
+CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
     "translation": "in the mesh file's unit; null without a camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
-    "score": "normalised correlation of photograph and view, 0 to 1",
-    "confidence": "estimated probability that the rotation is within 30 degrees of the truth, null for pipelines that "
-    "were not calibrated; times the detection's score for an object without a given box; of a pose refined from a "
-    "start: at most that it is within 10 degrees and 10 % of the distance",
-    "probabilities": "of the poses of top, in their order, to be within 30 degrees of the truth; none: of none of them",
-    "ambiguous": "how poses differ that are nearly as probable as the first: half turn, mirror or several; else null",
-    "symmetries": "number of orientations in which the mesh looks the same; poses that differ by them count as one",
-    "detection": "score: estimated probability that the photograph shows the object in that box",
-    "reliable": f"confidence of at least {RELIABLE:g}, no warnings, and no better match outside the prior; false = no "
-    "reliable match, the pose is a guess",
-    "warnings": "what is questionable about the box and the camera",
-    "confidence_features": "features that the confidence is computed from; margin: score of the best pose above that "
-    "of its best rival, null where the bank has no rival view, which bounds the confidence",
-    "edge_support": "how strongly image edges lie under the projected contours, 0 to 1",
+    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
+    "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose is a guess",
     "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
-    "t_true = t + e, if the camera matrix is right: errors of the camera are not in it; null without a camera, with a "
-    "guessed camera, and where not reliable",
+    "t_true = t + e; errors of the camera matrix are not in it",
 }
 
 
@@ -71,13 +58,13 @@ class Hypothesis:
         evidence: the features that the hypotheses are ordered by; of a tracked pose, those of its confidence.
         allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
         distance: of the object's centre in model units.
-        projection: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px, float64, which project the mesh onto
-            the photograph; without a camera matrix, those of a camera that looks straight at the object.
+        projection: (4, 4) and (3, 3) float64 pose and camera matrix in px, which project the mesh onto the photograph;
+            without a camera matrix, those of a camera that looks straight at the object.
         view: index of the bank's view that the hypothesis started from.
         edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
-        covariance: (6, 6) float64 of rotation (rad) about the camera's x, y, z axes and translation (model units) along
-            them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if this is the right pose and camera matrix; None
-            without a camera matrix, without contour fit, and where too few edges were found.
+        covariance: (6, 6) float64 of rotation (rad) about the camera's axes and translation (model units) along them,
+            ``R_true = exp([w]x) R``, ``t_true = t + e``, if pose and camera matrix are right; None without a camera
+            matrix, without contour fit, and where too few edges were found.
     """
 
     rotation: Tensor
@@ -147,7 +134,8 @@ class PhotographPose:
         T_cam_from_model: (4, 4) float64.
         box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it was not read.
         edge_support, similarity: of the pose in this photograph; None where it was not compared.
-        contribution: score by which the photograph prefers the pose to its best rival, 0 if it does not count.
+        contribution: score by which the photograph prefers the pose to its best rival, of 5 points if there
+            is none; 0 if the photograph does not count.
         failure: why the photograph does not count, in words; None if it does.
     """
 
@@ -160,10 +148,9 @@ class PhotographPose:
 
     def to_dict(self) -> dict[str, Any]:
         """All attributes as JSON values, the pose as ``rotation`` and ``translation``."""
-        rest = dict(vars(self))
-        T, box = rest.pop("T_cam_from_model"), rest.pop("box")
-        pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
-        return {**pose, "box": _plain(box), **rest}
+        rest = {**vars(self), "box": _plain(self.box)}
+        T = rest.pop("T_cam_from_model")
+        return {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist(), **rest}
 
 
 class _OfBest(Generic[Value]):
@@ -182,10 +169,8 @@ class _OfBest(Generic[Value]):
 
 @dataclass(frozen=True)
 class Registration:
-    """Poses of one object in one photograph, best first.
-
-    The attributes of the best :class:`Hypothesis` are attributes of the registration too; ``covariance`` and
-    ``standard_deviations`` are None where it is not reliable.
+    """Poses of one object in one photograph. The attributes of the best :class:`Hypothesis` are attributes of the
+    registration too; ``covariance`` and ``standard_deviations`` are None where it is not reliable.
 
     Attributes:
         hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
@@ -248,13 +233,11 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``, without ``warnings``, the photograph does not contradict the
-        prior by a better pose outside, and the contours determine at least one axis of rotation; if False, the pose is
-        a guess."""
+        """Whether the confidence is at least ``RELIABLE``, without ``warnings`` or a better pose outside the prior, and
+        the contours determine at least one axis of rotation; if False, the pose is a guess."""
         best = self.hypotheses[0]
-        if self.confidence is None or self.confidence < RELIABLE or self.warnings:
-            return False
-        if self.prior_contradiction == "better outside":
+        doubtful = self.warnings or self.prior_contradiction == "better outside"
+        if self.confidence is None or self.confidence < RELIABLE or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
@@ -302,8 +285,7 @@ class Registration:
     def to_dict(self) -> dict[str, Any]:
         """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
         deviations = self.standard_deviations
-        prior = None if self.prior is None else {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
-        return {
+        document = {
             **self.hypotheses[0].pose_dict(),
             "quaternion": self.quaternion.tolist(),
             "T_cam_from_model": _plain(self.T_cam_from_model),
@@ -316,25 +298,22 @@ class Registration:
             "ambiguous": self.ambiguous,
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
-            "standard_deviations": None
-            if deviations is None
-            else {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
+            "standard_deviations": deviations
+            and {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
             "covariance": _plain(self.covariance),
             "corrected_box": _plain(self.corrected_box),
-            **({} if prior is None else {"prior": prior}),
-            "top": [self._hypothesis_dict(hypothesis) for hypothesis in self.hypotheses],
-            **({"views": [view.to_dict() for view in self.views]} if self.views else {}),
+            "top": [],
         }
-
-    def _hypothesis_dict(self, hypothesis: Hypothesis) -> dict[str, Any]:
-        terms = {name: float(raw[0, hypothesis.view]) for name, raw in self.ranking.terms.items()}
-        return {
-            **hypothesis.pose_dict(),
-            "score": hypothesis.score,
-            "evidence": dict(hypothesis.evidence),
-            "view": hypothesis.view,
-            "terms": {name: value for name, value in terms.items() if math.isfinite(value)},
-        }
+        for one in self.hypotheses:
+            terms = {name: float(raw[0, one.view]) for name, raw in self.ranking.terms.items()}
+            terms = {name: value for name, value in terms.items() if math.isfinite(value)}
+            more = {"score": one.score, "evidence": dict(one.evidence), "view": one.view, "terms": terms}
+            document["top"].append({**one.pose_dict(), **more})
+        if self.prior is not None:
+            document["prior"] = {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
+        if self.views:
+            document["views"] = [view.to_dict() for view in self.views]
+        return document
 
 
 def _plain(values: Tensor | None) -> list[Any] | None:
@@ -361,15 +340,9 @@ class FailedRegistration:
 
 
 def ambiguity(rotations: Tensor) -> str | None:
-    """How poses (K, 3, 3) differ, in words; None for a single one.
-
-    "half turn": by a rotation of nearly 180 degrees; "mirror": they are seen from directions that are mirror images at
-    a coordinate plane of the mesh; "several": anything else, or more than two.
-
-    Example:
-        >>> ambiguity(torch.stack([torch.eye(3), torch.diag(torch.tensor([-1.0, -1.0, 1.0]))]))
-        'half turn'
-    """
+    """How poses (K, 3, 3) differ, in words; None for a single one. "half turn": by a rotation of nearly 180 degrees;
+    "mirror": they are seen from directions that are mirror images at a coordinate plane of the mesh; "several":
+    anything else, or more than two."""
     if len(rotations) < 2:
         return None
     if len(rotations) > 2:
@@ -420,8 +393,7 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
 
 def used_box(document: Mapping[str, Any]) -> list[float]:
     """The box that a document's pose was computed with: the given one, or the one that replaced it."""
-    box: list[float] = document["corrected_box"] or document["inputs"]["box"]
-    return box
+    return document["corrected_box"] or document["inputs"]["box"]  # type: ignore[no-any-return]
 
 
 def corners(box: Sequence[float]) -> str:
@@ -443,23 +415,15 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
-    """Return "likely" if an answer is reliable, "no match" if "none of them" is more probable than it, else
-    "unsure"."""
+    """Return "likely" for a reliable answer, "no match" if none of them is more probable than it, else "unsure"."""
     if reliable:
         return "likely"
     return "no match" if probability is not None and none is not None and none > probability else "unsure"
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which a (3, 3) rotation shows the object, in degrees that the option ``--azimuth`` takes.
-
-    ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`.
-
-    Example:
-        >>> from curvireg_torch.geometry import rotation_from_viewpoint
-        >>> pose_in_words(rotation_from_viewpoint(310.0, 20.0, 0.0))
-        'seen from the front-left (azimuth 310°), 20° above the horizon'
-    """
+    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left (azimuth 310°), 20°
+    above the horizon"; ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`."""
     R = rotation.detach().cpu().double()
     azimuth, elevation, theta = (round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT))
     side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"

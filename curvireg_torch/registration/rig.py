@@ -60,13 +60,10 @@ ELSEWHERE = "where the other photographs have the object, it lies outside this o
 
 @dataclass(frozen=True, kw_only=True)
 class RigProblem(ContourProblem):
-    """Poses of several photographs that are tied together: those with the same number in ``group`` (N,) are one pose in
-    the world, seen by cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera: with those of the
-    world, the damping and so the result would depend on these.
-
-    Each photograph alone found ``alone`` (N, 4, 4), with a precision whose root is ``root`` (N, 6, 6): it may know more
-    than its contours tell, such as the rotation of a can by its label.
-    """
+    """Poses of several photographs: those with the same number in ``group`` (N,) are one pose in the world, seen by
+    cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera: the result does not depend on those of
+    the world. Each photograph alone found ``alone`` (N, 4, 4), with a precision whose root is ``root`` (N, 6, 6): it
+    may know more than its contours tell, such as the rotation of a can by its label."""
 
     axes: Tensor
     group: Tensor
@@ -74,9 +71,8 @@ class RigProblem(ContourProblem):
     root: Tensor
 
     def __getitem__(self, index: Tensor) -> "RigProblem":
-        K, axes, group, alone, root = (x[index] for x in (self.K, self.axes, self.group, self.alone, self.root))
-        rest = {"axes": axes, "group": group, "alone": alone, "root": root}
-        return replace(self, image_index=self.image_index[index], K=K, **rest)  # type: ignore[arg-type]
+        names = ("image_index", "K", "axes", "group", "alone", "root")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
         scale, distance = self.size / CROP_SIZE, self.gaps(T)
@@ -169,8 +165,8 @@ Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by thei
 
 @dataclass(frozen=True)
 class Answer:
-    """M candidate poses in the world, best first, with ``evidence`` (V, M, 4) and ``scores`` (V, M) in V photographs,
-    and covariances (M, 6, 6), NaN where unfinished."""
+    """M candidate poses in the world, best first, with evidence (V, M, 4) and scores (V, M) in V photographs, and
+    covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
     evidence: Tensor
@@ -194,10 +190,8 @@ class Rig:
         """The photographs that were registered, if there are any, in the unit of the mesh."""
         usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
         if not usable:
-            reasons = "; ".join(
-                f"image {i}: {one.message}" for i, one in found.items() if isinstance(one, CurviregError)
-            )
-            raise InvalidInputError(f"no photograph can be registered: {reasons}")
+            reasons = [f"image {i}: {one.message}" for i, one in found.items() if isinstance(one, CurviregError)]
+            raise InvalidInputError(f"no photograph can be registered: {'; '.join(reasons)}")
         rig = Rig(registrar, usable)
         rig.check_unit()
         return rig
@@ -406,8 +400,8 @@ class Rig:
             similarity = (views @ photograph.descriptor).double().cpu()
             appearance, ranking = torch.zeros_like(similarity), photograph.result.ranking
             if Appearance.name in ranking.terms:
-                pictures, only = matcher.describer.shaded(R, distance), torch.zeros(len(T)).long()
-                appearance = matcher.reranking_score(Appearance.name, photograph.query, ranking, pictures, only)
+                pictures = matcher.describer.shaded(R, distance)
+                appearance = matcher.appearance_score(photograph.query, ranking, pictures)
             parts.append(torch.stack([similarity, appearance]))
         similarity, appearance = torch.stack(parts, dim=1)
         return torch.stack([self.ranks(T), similarity, support, appearance], dim=-1)

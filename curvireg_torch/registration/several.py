@@ -26,14 +26,6 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 
-def _contradicted(confidence: float, others: Sequence[float | None]) -> float:
-    """A confidence after photographs that were left out, in so far as they alone are confident of another pose."""
-    odds = confidence / max(1.0 - confidence, 1e-9)
-    for other in others:
-        odds *= min(1.0, (1.0 - (other or 0.0)) / max(other or 0.0, 1e-9))
-    return odds / (1.0 + odds)
-
-
 @torch.no_grad()
 def register_views(
     registrar: "Registrar", images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
@@ -83,7 +75,12 @@ def register_views(
         found = _registered(registrar, items, cameras, given)
     else:
         for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
-            found[i] = _photograph(registrar, items[i], result, i, cameras[i])
+            item = items[i]
+            if isinstance(result, Registration) and isinstance(item, ImageItem) and result.detection is not None:
+                item = replace(item, box=result.detection.box.float())
+                found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
+            elif isinstance(result, FailedRegistration):
+                found[i] = result.error
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)
@@ -110,27 +107,12 @@ def _registered(
     def register(item: ImageItem, k: int) -> RigPhotograph | CurviregError:
         i = chosen[k]
         try:
-            return _photograph(registrar, item, registrar.register_item(item), i, cameras[i])
+            return RigPhotograph.of(registrar, item, registrar.register_item(item), i, cameras[i])
         except CurviregError as error:
             return error.with_subject(f"image {i}")
 
     found = registrar.map_items(OnDemand(located, len(chosen)), register)
     return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
-
-
-def _photograph(
-    registrar: "Registrar",
-    item: ImageItem | CurviregError,
-    result: Registration | FailedRegistration,
-    index: int,
-    camera: Tensor,
-) -> RigPhotograph | CurviregError:
-    if isinstance(result, FailedRegistration):
-        return result.error
-    assert isinstance(item, ImageItem)
-    if result.detection is not None:
-        item = replace(item, box=result.detection.box.float())
-    return RigPhotograph.of(registrar, item, result, index, camera)
 
 
 def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Registration:
@@ -157,12 +139,14 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
         if len(rig.photographs) > 1:
             scores = [1.0 if p.result.detection is None else p.result.detection.score for p in rig.photographs]
             confidence = max(scores) * registration_confidence(features, exact=rig.exact)
-        against = [
-            p for p in every.photographs if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE
-        ]
-        confidence = _contradicted(confidence, [p.result.confidence for p in against])
+        odds = confidence / max(1.0 - confidence, 1e-9)
+        for p in every.photographs:  # those that were left out, and are confident of another pose
+            if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
+                other = p.result.confidence or 0.0
+                odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
+        confidence = odds / (1.0 + odds)
         probabilities = hypothesis_probabilities(confidence, total, exact=rig.exact)[:count]
-    margins = weights * (answer.scores[:, 0] - answer.scores[:, min(1, len(total) - 1)])
+    margins = weights * (answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN)
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
     views = []
     for i, camera in enumerate(cameras):

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..rendering import DepthRenderer
 from ..rendering.contours import ContourPoints, MeshContours
-from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, ContourState, full_size_problem
+from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, full_size_problem
 from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
 
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
@@ -42,9 +42,9 @@ Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
 def surface_corners(
     grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
 ) -> tuple[np.ndarray, Tensor]:
-    """uv (C, 2) px, whole numbers in float32, of corners of ``grey`` (S, S) uint8, and the points (1, C, 3) of the
-    model there. They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4,
-    4) with camera ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest."""
+    """Corners of ``grey`` (S, S) uint8, (C, 2) whole px in float32, and the points (1, C, 3) of the model there. They
+    lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4, 4) with camera
+    ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest."""
     side = 2 * inside + 1
     mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
     found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, quality, CORNER_SPACING, mask=mask)
@@ -72,13 +72,13 @@ def fit_texture(
     """Fit one pose to the mesh's colours and to contours together.
 
     The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
-    correlation, which the strength of the light does not change. Robust least squares move the pose to where most of
-    them are found, then to the edges as well; a second round searches nearer. The fit counts, and is not None, if in
-    the end more corners are in place than at the start, and enough of them, and the edge support is as before.
+    correlation. Robust least squares move the pose to where most of them are found, then to the edges as well; a second
+    round searches nearer. The fit counts, and is not None, if in the end more corners are in place than at the start,
+    and enough of them, and the edge support is as before.
 
     ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
-    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and others that may be better (:func:`turned`); the
-    other arguments are those of :func:`fit_contours`, for one photograph.
+    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and :func:`turned` ones; the other arguments are those
+    of :func:`fit_contours`, for one photograph.
     """
     crops, _, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
     texture = _TextureRounds(draw, renderer, problem, _as_array(crops[0]))
@@ -95,7 +95,19 @@ def fit_texture(
     after = problem.edge_support(state)
     if bool(after < support - MAX_SUPPORT_LOSS):
         return None
-    covariance, observable = _covariance(problem, state, fine.matches)
+    # Matches count as points with normals along x and y.
+    count = fine.matches.model.shape[1]
+    seen = torch.ones(1, 2 * count, dtype=torch.bool)
+    axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
+    points = ContourPoints(fine.matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
+    joined = ContourPoints(
+        *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
+    )
+    found = fine.matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
+    both = Measurements.cat([problem.measured_edges(state, FULL_SIZE_RADII[-1]), found])
+    covariance, observable = pose_covariance(
+        both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius
+    )
     return ContourFit(fine.T, covariance, edge_support=after, start_support=support, observable=observable)
 
 
@@ -193,18 +205,3 @@ def _vertex(values: np.ndarray, k: int) -> float:
     before, here, behind = values[k - 1 : k + 2].tolist()
     curvature = before - 2.0 * here + behind
     return 0.5 * (before - behind) / curvature if curvature < -1e-9 else 0.0
-
-
-def _covariance(problem: ContourProblem, state: ContourState, matches: PointMatches) -> tuple[Tensor, Tensor]:
-    """:func:`pose_covariance` of edges and of the matches of a texture, as points with normals along x and y."""
-    edges = problem.measured_edges(state, FULL_SIZE_RADII[-1])
-    texture = matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
-    count = matches.model.shape[1]
-    seen = torch.ones(1, 2 * count, dtype=torch.bool)
-    axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
-    points = ContourPoints(matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
-    joined = ContourPoints(
-        *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
-    )
-    both, radius = Measurements.cat([edges, texture]), problem.contours.radius
-    return pose_covariance(both, joined, state.T, problem.K, problem.centre, radius=radius)

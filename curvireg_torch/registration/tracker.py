@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,6 +40,7 @@ LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean o
 MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3  # Added to probabilities, so that a colour never seen is not proof
 MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
 LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
+LEARNING_RATE = 0.2  # Weight of a new frame in the histograms
 HALF_RATE_COUNT = 20.0  # Pixels of a sector with which it learns at half of the rate
 
 
@@ -54,16 +56,8 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
 
     If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
     r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
-    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius.
-
-    Args:
-        log_ratio: (P, L) r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1.
-        radius: in px, at most h.
-
-    Example:
-        >>> ends = torch.tensor([[2.0, 2.0, 2.0, 2.0, 2.0, -2.0, -2.0]])              # after the pixel at offset 1
-        >>> bool(1.4 < line_posterior(ends, 3)[0] < 1.5)
-        True
+    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius px. ``log_ratio`` (P, L) is
+    r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1, h >= ``radius``.
     """
     half = log_ratio.shape[-1] // 2
     log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
@@ -81,12 +75,11 @@ class RegionModel:
         self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
         self._log_ratio = torch.zeros(SECTORS * COLOUR_LEVELS**3)
 
-    def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor, *, rate: float) -> None:
+    def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor) -> None:
         """Move the histograms towards the colours at ``uv`` (M, 2) px of ``bins`` (S, S), in ``directions`` (M,) rad
-        from the object's centre, ``inside`` (M,) bool the object; ``rate`` in [0, 1] is their weight, but empty
-        histograms take all."""
-        index, seen = _indices(bins, uv)
-        colour = bins.view(-1)[index[seen]]
+        from the object's centre, ``inside`` (M,) bool the object; empty histograms take all of them."""
+        colour, seen = _colours_at(bins, uv)
+        colour = colour[seen]
         low, high, fraction = _sectors(directions[seen])
         side = (~inside[seen]).long()
         new = torch.zeros_like(self._histograms)
@@ -94,29 +87,34 @@ class RegionModel:
             new.view(-1).index_add_(0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float())
         count = new.sum(dim=-1, keepdim=True)
         new = new / count.clamp(min=1e-9)
-        step = rate * count / (count + HALF_RATE_COUNT)
+        step = LEARNING_RATE * count / (count + HALF_RATE_COUNT)
         empty = self._histograms.sum(dim=-1, keepdim=True) == 0
         self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
-        p = _smoothed(self._histograms)
+        cube = self._histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
+        for axis in range(3):  # smooth along each colour channel
+            shape, pad = [1, 1, 1], [0] * 6
+            shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
+            kernel = torch.tensor([0.2, 0.6, 0.2]).view(1, 1, *shape)
+            cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel)
+        p = cube.view_as(self._histograms)
         p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
         self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).view(-1)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
         """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of
         lines in ``directions`` (P,); 0 outside the window."""
-        index, seen = _indices(bins, uv)
-        colour = bins.view(-1)[index]
+        colour, seen = _colours_at(bins, uv)
         low, high, fraction = (x[:, None] for x in _sectors(directions))
         of_low, of_high = (self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high))
         return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
 
 
-def _indices(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices (...) of the flattened pixels nearest to ``uv`` (..., 2), and whether they lie in the window."""
+def _colours_at(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Bins (...) of the pixels nearest to ``uv`` (..., 2), and whether they lie in the window."""
     side = bins.shape[-1]
     x, y = uv.round().long().unbind(-1)
     seen = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-    return y.clamp(0, side - 1) * side + x.clamp(0, side - 1), seen
+    return bins[y.clamp(0, side - 1), x.clamp(0, side - 1)], seen
 
 
 def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,17 +122,6 @@ def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     place = (directions / (2.0 * math.pi) % 1.0) * SECTORS
     low = place.floor()
     return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
-
-
-def _smoothed(histograms: Tensor) -> Tensor:
-    """Histograms (2, SECTORS, COLOUR_LEVELS^3) after a binomial-like filter along each colour channel."""
-    kernel = torch.tensor([0.2, 0.6, 0.2])
-    cube = histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
-    for axis in range(3):
-        shape, pad = [1, 1, 1], [0] * 6
-        shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
-        cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel.view(1, 1, *shape))
-    return cube.view_as(histograms)
 
 
 WINDOW_SIZE = 256  # Side in px of the part of a frame around the object, which all measurements share
@@ -147,7 +134,6 @@ STEPS_PER_ROUND = 2  # Least-squares steps per round
 # Weights, relative to edges, of colours and of points from the last frame and from a keyframe
 REGION_WEIGHT, POINT_WEIGHT, KEYFRAME_WEIGHT = 2.0, 0.3, 0.5
 REGION_VARIANCE = 0.5  # Variance in px² added to that of the end of the object's colours
-LEARNING_RATE = 0.2  # Weight of a new frame in the colour histograms
 LEARNED_BAND = (2, 24)  # Nearest and farthest distance in px from the outline at which colours are learned
 REGION_FEATURE_RADIUS = 8  # Radius in px of the posterior from which TrackedPose.features are computed
 # Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another
@@ -177,13 +163,7 @@ class Frame:
     @classmethod
     def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
         """The square around a mesh at ``T`` (1, 4, 4), of an image (1 or 3, H, W) in [0, 1] or uint8 with camera ``K``
-        (3, 3).
-
-        Missing pixels are filled from their neighbours.
-
-        Raises:
-            LostObjectError: the mesh lies behind the camera, or outside the image.
-        """
+        (3, 3). Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
         boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
         if not bool(visible):
             raise LostObjectError(OUTSIDE)
@@ -245,14 +225,9 @@ def _optical_flow(
     before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.ndarray, levels: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where points (P, 2) of one picture are in another, searched at ``guess`` (P, 2); and (P,) whether found."""
+    window, flags = (FLOW_PATCH, FLOW_PATCH), cv2.OPTFLOW_USE_INITIAL_FLOW
     there, found, _ = cv2.calcOpticalFlowPyrLK(
-        before,
-        after,
-        points,
-        guess.copy(),
-        winSize=(FLOW_PATCH, FLOW_PATCH),
-        maxLevel=levels,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        before, after, points, guess.copy(), winSize=window, maxLevel=levels, flags=flags
     )
     return there, found[:, 0] > 0
 
@@ -312,21 +287,20 @@ class Tracker:
         image."""
         found: list[TrackedPose] = []
         for T in self.predictions():
-            try:
+            with suppress(LostObjectError):
                 found.append(self._fit(image, K, T))
-            except LostObjectError:
-                continue
-            if found[-1].confidence >= RELIABLE:
-                break
+                if found[-1].confidence >= RELIABLE:
+                    break
         if not found:
             raise LostObjectError("the object has left the photograph")
         return max(found, key=lambda pose: pose.confidence)
 
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
-        self._poses = [*self._poses[-1:], pose.state.T]
+        self.last_pose = pose.state.T
+        self._poses = [*self._poses[-1:], self.last_pose]
         depth = self.renderer.render(pose.state.T, pose.frame.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
-        self._learn(pose.frame, pose.state, depth, rate=LEARNING_RATE)
+        self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
 
     def covariance(self, pose: TrackedPose) -> Tensor:
@@ -335,19 +309,13 @@ class Tracker:
         measured = problem.measured_edges(pose.state, SEARCH_RADII[-1])
         return pose_covariance(measured, points, pose.state.T, problem.K, self.centre, radius=self.radius)[0][0]
 
-    @property
-    def last_pose(self) -> Tensor:
-        """(1, 4, 4) of the last frame."""
-        return self._poses[-1]
-
     def predictions(self) -> list[Tensor]:
         """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
-        last = self._poses[-1]
         if len(self._poses) < 2:
-            return [last]
+            return [self.last_pose]
         (R0, c0), (R1, c1) = ((T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses)
         R = R1 @ R0.mT @ R1
-        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), last]
+        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), self.last_pose]
 
     def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose around a start (1, 4, 4)."""
@@ -357,7 +325,7 @@ class Tracker:
         T = fit_points(flow, T, first.K, self.centre, FLOW_SCALES)
         frame = self._frame(image, K, T)
         flows = [(POINT_WEIGHT, flow.moved(first.K, frame.K))]
-        keyframe = self._nearest(T)
+        keyframe = self._keyframes[int(self._angles(T).argmin())]
         if keyframe is not self._last:
             flows.append((KEYFRAME_WEIGHT, track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME)))
         state = frame.problem.state(T)
@@ -408,14 +376,14 @@ class Tracker:
         }
         return TrackedPose(features, frame, state)
 
-    def _learn(self, frame: Frame, state: ContourState, depth: Tensor, *, rate: float) -> None:
+    def _learn(self, frame: Frame, state: ContourState, depth: Tensor) -> None:
         """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
         distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
         samples, directions = self._lines(frame, state, torch.cat([-distance, distance]))
         x, y = samples.round().long().clamp(0, WINDOW_SIZE - 1).unbind(-1)
         inside = depth[0, 0, y, x] > 0
         directions = directions[:, None].expand(inside.shape)
-        self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten(), rate=rate)
+        self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten())
 
     def _remember(self, frame: Frame, T: Tensor, depth: Tensor) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
@@ -423,9 +391,6 @@ class Tracker:
         self._last = Keyframe(frame.grey, T, uv, model)
         if not self._keyframes or float(self._angles(T).min()) > KEYFRAME_ANGLE:
             self._keyframes = [*self._keyframes[1 - MAX_KEYFRAMES :], self._last]
-
-    def _nearest(self, T: Tensor) -> Keyframe:
-        return self._keyframes[int(self._angles(T).argmin())]
 
     def _angles(self, T: Tensor) -> Tensor:
         """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""

@@ -12,35 +12,20 @@ from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
 from .embree import RayScene
 
-__all__ = ["ContourPoints", "MeshContours"]
-
-MAX_OCCLUDING, MAX_CREASES = 256, 128
-"""Points per pose on occluding contours and on creases."""
-
-OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256
-"""Places per pose at which visibility is tested; some are hidden."""
-
-ASIDE = 1.0
-"""Distance in px from the contour, on the outer side, at which a ray looks past the object."""
-
+MAX_OCCLUDING, MAX_CREASES = 256, 128  # Points per pose on occluding contours and on creases
+OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256  # Places per pose at which visibility is tested; some are hidden
+ASIDE = 1.0  # Distance in px from the contour, on the outer side, at which a ray looks past the object
+# Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface
 OCCLUSION_JUMP = 0.05
-"""Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface."""
-
-VISIBLE_TOLERANCE = 0.02
-"""Depth, in object radii, by which a crease may lie behind the surface that its ray hits."""
-
+VISIBLE_TOLERANCE = 0.02  # Depth, in object radii, by which a crease may lie behind the surface that its ray hits
+# Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides
 CREASE_SCALE = 1.0 / 64.0
-"""Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides."""
-
+# Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front
 CREASE_BEND = 0.36
-"""Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front."""
-
+# Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at most
+# a fifth of a pixel of that crop
 LEVELS = ((128, 2500), (256, 8000))
-"""Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at
-most a fifth of a pixel of that crop."""
-
-NEAR_PLANE = 1e-3
-"""Depth in object radii below which points are not projected."""
+NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 
 
 @dataclass(frozen=True)
@@ -84,14 +69,6 @@ class _Level:
         length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
         return length
 
-    def smooth_normals(
-        self, index: np.ndarray, fraction: np.ndarray, ends: np.ndarray, R: np.ndarray, K: np.ndarray
-    ) -> np.ndarray:
-        """Normals (N, M, 2) across the contour of a smooth surface, whose vertices' normals are interpolated."""
-        n = self.edges.normals
-        normal = n[ends[..., 0]] + fraction[..., None] * (n[ends[..., 1]] - n[ends[..., 0]])
-        return _across(normal @ R.transpose(0, 2, 1), K)
-
     def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
         xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
@@ -102,15 +79,12 @@ class _Level:
 
 
 class MeshContours:
-    """Occluding contours and creases of a mesh, at any pose.
+    """Occluding contours and creases of a clean mesh (:func:`curvireg_torch.load_mesh`), at any pose.
 
     An edge of the mesh lies on an occluding contour where all of its faces are on one side of it, seen from the camera;
-    creases are edges between faces that meet at an angle (``MeshEdges``). Points are placed along these edges,
-    evenly in the image. A ray one pixel outside an occluding contour tells the outline (nothing hit), an inner
-    occluding contour (hit far behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
-
-    Args:
-        mesh: a clean mesh, from :func:`curvireg_torch.load_mesh`.
+    creases are edges between faces that meet at an angle. Points are placed along these edges, evenly in the image. A
+    ray one pixel outside an occluding contour tells the outline (nothing hit), an inner occluding contour (hit far
+    behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 63.5], [0, 100.0, 63.5], [0, 0, 1]], dtype=torch.float64)
@@ -131,9 +105,7 @@ class MeshContours:
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
     ) -> ContourPoints:
         """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
-
-        ``density`` is a fraction of the usual number of points.
-        """
+        ``density`` is a fraction of the usual number of points."""
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         R = T[:, :3, :3]
         level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
@@ -153,8 +125,9 @@ class MeshContours:
             a, b = (edges.vertices[ends[..., k]] @ R.transpose(0, 2, 1) + position[:, None] for k in (0, 1))
             at = a + fraction[..., None] * (b - a)
             normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
-            if occluding:
-                smooth = level.smooth_normals(index, fraction, ends, R, K)
+            if occluding:  # of a smooth surface, interpolate the vertices' normals
+                n0, n1 = edges.normals[ends[..., 0]], edges.normals[ends[..., 1]]
+                smooth = _across((n0 + fraction[..., None] * (n1 - n0)) @ R.transpose(0, 2, 1), K)
                 smooth *= np.where((smooth * normal).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
                 agree = edges.is_smooth[index] & ((smooth * normal).sum(axis=-1) > 0.5)
                 normal = np.where(agree[..., None], smooth, normal)

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from ..errors import InvalidInputError, MissingDependencyError, RenderingError
+from ..errors import InvalidInputError, RenderingError
 from ..mesh.colours import surface_colours
 from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_image, check_option, check_pose, check_tensor
@@ -26,24 +26,19 @@ class DepthRenderer(Protocol):
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth. The depth is
-        on the renderer's device, which is the CPU except for "torch"."""
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth."""
         ...
 
 
-def make_renderer(
-    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, device: torch.device | str = "cpu"
-) -> DepthRenderer:
+def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") -> DepthRenderer:
     """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be shared by threads:
 
     - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or needed.
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
       its first use cannot use it: start processes by "spawn".
-    - ``"torch"`` runs on ``device``. Forked processes must call ``torch.set_num_threads(1)`` first.
 
-    Raises:
-        RenderingError, MissingDependencyError: the backend does not work here.
+    Raises :class:`RenderingError` where the backend does not work.
     """
     if not isinstance(backend, str):
         return backend
@@ -52,15 +47,8 @@ def make_renderer(
         from .opengl import PyrenderRenderer
 
         return PyrenderRenderer(mesh)
-    if backend == "torch":
-        from .zbuffer import TorchRenderer
+    from .embree import EmbreeRenderer, RasterRenderer
 
-        return TorchRenderer(mesh, device=device)
-    try:
-        from .embree import EmbreeRenderer, RasterRenderer
-    except ImportError as error:
-        message = f"renderer {backend!r} needs the package embreex ({error}): pip install embreex"
-        raise MissingDependencyError(message) from error
     return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh)
 
 
@@ -109,8 +97,7 @@ def render_depth(
 
 def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Rigid poses (N, 4, 4) and cameras (N, 3, 3), checked, as float64 on the CPU."""
-    if T.ndim != 3 or T.shape[1:] != (4, 4):
-        raise InvalidInputError(f"T_cam_from_model: expected shape (N, 4, 4), got {tuple(T.shape)}")
+    check_tensor(T, "T_cam_from_model", (None, 4, 4))
     if len(size) != 2 or min(size) < 1:
         raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
     check_camera_matrix(K)
@@ -135,10 +122,9 @@ def render_colour(
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,
 ) -> Tensor:
-    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel.
-
-    A mesh without colours (:func:`has_colours`) is white. So is every mesh with a renderer that does not report which
-    face a pixel shows; "auto" and "embree" do. Arguments and errors are those of :func:`render_depth`.
+    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel. A mesh
+    without colours is white, and so is every mesh with a renderer that does not report which face a pixel shows; "auto"
+    and "embree" do. Arguments and errors are those of :func:`render_depth`.
 
     Returns:
         (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
@@ -172,10 +158,8 @@ def render_colour(
 
 
 def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1.
-
-    Normals come from neighbouring pixels and are exact for planes. Of the two neighbours along an axis, the one nearer
-    in depth is used, so that creases and contours stay sharp.
+    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1. Normals come from
+    neighbouring pixels, of two along an axis the one nearer in depth, and are exact for planes.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background; the result has its shape and dtype.

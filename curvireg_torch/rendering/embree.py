@@ -51,8 +51,7 @@ def _float32(x: np.ndarray) -> np.ndarray:
 
 class EmbreeRenderer:
     """Casts one ray through each pixel's centre inside the outline of the object's hull, views in parallel on threads.
-    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled: a spawned process builds its
-    own."""
+    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled."""
 
     name = "embree"
 
@@ -82,9 +81,8 @@ class EmbreeRenderer:
     def faces_at(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
-        """The face that each pixel shows, the point on that face, and the depth of :meth:`render`. (N, H, W) int32 face
-        indices, -1 for none; (N, H, W) float32 u and v of the point (1 - u - v) a + u b + v c, with the face's corners
-        a, b, c; (N, 1, H, W) depth."""
+        """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their points (1 - u - v) a
+        + u b + v c, with the face's corners a, b, c; and the depth of :meth:`render`."""
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))

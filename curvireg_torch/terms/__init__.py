@@ -6,8 +6,6 @@ from .terms import BoxShape as BoxShape
 from .terms import Correlation as Correlation
 from .terms import QueryFeatures as QueryFeatures
 from .terms import Repeatability as Repeatability
-from .terms import RerankingModule as RerankingModule
-from .terms import RerankingTerm as RerankingTerm
 from .terms import Term as Term
 from .terms import Views as Views
 from .terms import Whitening as Whitening

@@ -17,7 +17,7 @@ from ..errors import InvalidInputError
 from ..features.backbone import SHA256, Backbone, describe, similarity
 from ..filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
 from ..geometry.crops import check_boxes, crop_squares, square_boxes
-from ..utils.checks import as_numbers, check_integer, check_option, check_photograph, check_positive, check_tensor
+from ..utils.checks import check_integer, check_option, check_photograph, check_positive, check_tensor
 from ..utils.threads import map_on_threads
 
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
@@ -35,7 +35,7 @@ class QueryFeatures:
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
-        reranking_features: features of the crops that reranking terms have computed, by the term's name.
+        computed: features of the crops that terms have computed, by the term's name.
     """
 
     regions: Tensor
@@ -43,7 +43,7 @@ class QueryFeatures:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
-    reranking_features: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
+    computed: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
     @property
     def crops(self) -> Tensor:
@@ -66,8 +66,6 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
     ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
-    boxes = as_numbers(boxes, "boxes")
-    check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
     jitter = torch.tensor(_JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device)
@@ -90,8 +88,6 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     for image in images:
         check_photograph(image)
     sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
-    boxes = as_numbers(boxes, "boxes")
-    check_tensor(boxes, "boxes", (len(sizes), None, 4))
     check_boxes(boxes[:, 0], sizes)
     if not sizes:
         return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
@@ -139,14 +135,9 @@ class Views(Protocol):
 
 @dataclass(frozen=True)
 class Term(ABC):
-    """One factor of the score S = prod S_t^w_t of a view for a photograph.
-
-    A new term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
-    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it.
-
-    Attributes:
-        weight: w >= 0; a term of weight 0 is left out.
-    """
+    """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its ``weight`` w is 0. A new
+    term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
+    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
 
     name: ClassVar[str]
     weight: float = 1.0
@@ -163,46 +154,6 @@ class Term(ABC):
         """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it."""
 
 
-@dataclass(frozen=True)
-class RerankingTerm(Term):
-    """A term that needs a picture of every view that it compares.
-
-    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank the term compares
-    only the best distinct views of the other terms; every other view gets the score of the nearest compared view, and
-    NaN as raw score.
-
-    Attributes:
-        exhaustive_limit: largest number of views that are all compared.
-        top, min_angle: in a larger bank, number of compared views and minimal angle between them in degrees.
-    """
-
-    exhaustive_limit: int = 1000
-    top: int = 64
-    min_angle: float = 20.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_positive(self.min_angle, "min_angle", zero_ok=True)
-        check_integer(self.top, f"{self.name}: top")
-        check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
-
-    @abstractmethod
-    def build(self, views: Views | None) -> "RerankingModule":
-        """The module that describes and compares. It does not depend on the views."""
-
-
-class RerankingModule(nn.Module, ABC):
-    """Describes pictures of views, and compares photographs with them."""
-
-    @abstractmethod
-    def describe(self, pictures: Tensor) -> Tensor:
-        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
-
-    @abstractmethod
-    def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
-        """(B, N) raw scores of B photographs and the (N, D) features of N views."""
-
-
 def log_unit_score(similarity: Tensor) -> Tensor:
     """(B, N) ``(s - max s) / std s`` of similarities per photograph: the log of a softmax of z-scores, best view 0."""
     # Not by std, which warns of empty batches.
@@ -217,8 +168,6 @@ class Whitening(nn.Module):
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
-        check_tensor(mean, "mean", (None,))
-        check_tensor(covariance, "covariance", (len(mean), len(mean)))
         factor, failed = torch.linalg.cholesky_ex(covariance.double())
         if int(failed):
             raise InvalidInputError("covariance: expected a positive definite matrix; shrink it")
@@ -389,17 +338,11 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))`.
-
-    d is the difference of the logs of width / height of the boxes of photograph and view. All views score 1 if the
-    photograph's box reaches its border.
-
-    Attributes:
-        sigma: 0.2 corresponds to a box that is a fifth too wide.
-    """
+    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))` with the difference d of the logs of
+    width / height of the boxes of photograph and view. All views score 1 if the photograph's box reaches its border."""
 
     name: ClassVar[str] = "box"
-    sigma: float = 0.2
+    sigma: float = 0.2  # corresponds to a box that is a fifth too wide
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -427,48 +370,58 @@ class _BoxShapeModule(nn.Module):
 
 
 @dataclass(frozen=True)
-class Appearance(RerankingTerm):
-    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view.
-
-    A mesh with colours is rendered in grey and in its colours, and the better match counts for each view: a print
+class Appearance(Term):
+    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view. A mesh
+    with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
     (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views.
 
-    Attributes:
-        weights: digest of the network's weights.
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank only the best
+    distinct views of the other terms are compared, ``top`` of them, at least ``min_angle`` degrees apart; every other
+    view gets the score of the nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
     """
 
     name: ClassVar[str] = "appearance"
     weight: float = 2.0
+    exhaustive_limit: int = 1000
+    top: int = 64
+    min_angle: float = 20.0
     weights: str = SHA256[:16]
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_positive(self.min_angle, "min_angle", zero_ok=True)
+        check_integer(self.top, f"{self.name}: top")
+        check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
         if self.weights != SHA256[:16]:
             raise InvalidInputError(f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}")
 
-    def build(self, views: Views | None) -> RerankingModule:
-        return _AppearanceModule()
+    def build(self, views: Views | None = None) -> "AppearanceModule":
+        return AppearanceModule()
 
     def log_score(self, raw: Tensor) -> Tensor:
         return log_unit_score(raw)
 
 
-class _AppearanceModule(RerankingModule):
+class AppearanceModule(nn.Module):
+    """Describes pictures of views, and compares photographs with them."""
+
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Backbone()
 
     def describe(self, pictures: Tensor) -> Tensor:
+        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
         grey, colour = pictures[:, :1], pictures[:, 1:]
         features = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
         return torch.cat(features, dim=1)
 
     def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
-        if Appearance.name not in query.reranking_features:  # shared by ranking and rescoring
-            query.reranking_features[Appearance.name] = describe(query.crops, self.backbone)
-        crops = query.reranking_features[Appearance.name]
-        similarities = similarity(crops[:, None], features.reshape(-1, crops.shape[1]))
+        """(B, N) raw scores of B photographs and the (N, D) features of N views."""
+        if Appearance.name not in query.computed:  # shared by ranking and rescoring
+            query.computed[Appearance.name] = describe(query.crops, self.backbone)
+        crops = query.computed[Appearance.name]
+        similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 
-RENDERER_NAMES = ("auto", "embree", "pyrender", "torch")  # renderers
+RENDERER_NAMES = ("auto", "embree", "pyrender")  # renderers
 DEFAULT = "learned"  # the default preset
 PRESET_NAMES = ("learned", "classical", "fast", "paper")  # of :data:`curvireg_torch.pipeline.PRESETS`
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}  # metres per unit

@@ -40,11 +40,11 @@ class Validation:
         for i in tqdm(range(count), desc="validation banks", mininterval=10):
             sample = scenes[i]
             describe = ViewDescriber(scenes.mesh(i), SETTINGS)
-            bank = describe(views.rotations, torch.full((len(views),), 5.0))
+            described = describe(views.rotations, torch.full((len(views),), 5.0))
             self.images.append(sample["image"])
             self.depths.append(sample["depth"])
             self.errors.append(rotation_error(views.rotations.float(), sample["rotation"].expand(len(views), 3, 3)))
-            self.banks.append(bank.descriptors.half())
+            self.banks.append(described["descriptors"].half())
 
     @torch.no_grad()
     def __call__(self, field: torch.nn.Module) -> dict[str, float]:

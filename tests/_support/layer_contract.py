@@ -41,19 +41,8 @@ class LayerCase:
         return self.function(x, **self.options)
 
     def twin(self) -> nn.Module:
-        """The module with the same options; without one, a module that calls the function."""
-        if self.module is not None:
-            return self.module(**self.options)
-        return self.function if isinstance(self.function, nn.Module) else _Wrapper(self)
-
-
-class _Wrapper(nn.Module):
-    def __init__(self, case: LayerCase) -> None:
-        super().__init__()
-        self.case = case
-
-    def forward(self, x: Tensor) -> Any:
-        return self.case(x)
+        """The module with the same options; without one, the function is a module."""
+        return self.function if self.module is None else self.module(**self.options)
 
 
 def tensors(output: Any) -> tuple[Tensor, ...]:
@@ -81,7 +70,6 @@ class LayerContract:
     """Tests that every layer has to pass; see the module for its use."""
 
     cases: ClassVar[Sequence[LayerCase]] = ()
-    differentiable: ClassVar[bool] = True
     batch_tolerance: ClassVar[Mapping[str, float]] = {"rtol": 1e-6, "atol": 1e-9}
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
@@ -143,13 +131,12 @@ class LayerContract:
         x = degenerate_images()[image]
         if min(x.shape[-2:]) < case.min_size:
             return
-        x = x.repeat(1, case.inputs(1, SIZE).shape[1], 1, 1).requires_grad_(self.differentiable)
+        x = x.repeat(1, case.inputs(1, SIZE).shape[1], 1, 1).requires_grad_()
         y = tensors(case(x))
         assert all(torch.isfinite(t).all() for t in y)
-        if self.differentiable:
-            sum(t.square().sum() + t.sum() for t in y).backward()
-            assert x.grad is not None
-            assert torch.isfinite(x.grad).all()
+        sum(t.square().sum() + t.sum() for t in y).backward()
+        assert x.grad is not None
+        assert torch.isfinite(x.grad).all()
         if case.constant_gives_zero and image in ("zeros", "constant") and x.shape[1] == 1:
             assert all(float(t.detach().float().abs().max()) < 1e-6 for t in y)
 

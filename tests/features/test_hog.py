@@ -1,4 +1,4 @@
-"""HOG against scikit-image and against its definition."""
+"""HOG against its definition."""
 
 import math
 
@@ -7,39 +7,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from skimage.feature import hog as skimage_hog
 
-from curvireg_torch import features, filters
+from curvireg_torch import features
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.features import field_points, hog
 from curvireg_torch.filters import image_gradient
 
 from ..filters.layer_cases import photos
-
-
-def _image(seed: int, size: int) -> np.ndarray:
-    x = torch.rand(1, 1, size, size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return filters.gaussian_smooth(x, 1.0)[0, 0].numpy()
-
-
-@pytest.mark.parametrize(
-    ("size", "grid", "bins", "block"), [(64, 8, 9, 2), (48, 4, 6, 2), (96, 16, 9, 3), (32, 8, 9, 1)]
-)
-def test_hog_with_hard_voting_against_scikit_image(size: int, grid: int, bins: int, block: int) -> None:
-    image = _image(size, size)
-    # scikit-image uses x[i + 1] - x[i - 1], and 0 at the border.
-    gradient = np.zeros((2, size, size))
-    gradient[0, :, 1:-1] = image[:, 2:] - image[:, :-2]
-    gradient[1, 1:-1] = image[2:] - image[:-2]
-    want = skimage_hog(
-        image,
-        orientations=bins,
-        pixels_per_cell=(size // grid, size // grid),
-        cells_per_block=(block, block),
-        block_norm="L2-Hys",
-    )
-    got = hog(torch.from_numpy(gradient)[None], grid=grid, bins=bins, block=block, voting="hard")[0]
-    np.testing.assert_allclose(got, want, atol=1e-5)
 
 
 def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) -> np.ndarray:

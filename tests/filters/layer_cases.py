@@ -87,7 +87,6 @@ OPTIONS: dict[str, dict[str, object]] = {
     "blur-saliency": {"mode": "reblur-saliency"},
     "mfc-alone": {"saliency_weight": 0.0},
     "pci": {"sigmas": (1.0, 2.0)},
-    "hog-hard": {"voting": "hard"},
 }
 
 

@@ -5,8 +5,6 @@ from typing import ClassVar
 import pytest
 import torch
 
-from curvireg_torch import filters
-
 from .._support.layer_contract import LayerCase, LayerContract
 from .layer_cases import LAYERS, PAIRS, depths, equal_up_to_sign
 
@@ -17,19 +15,6 @@ class TestLayers(LayerContract):
     def gradcheck_weights(self, case: LayerCase, x: torch.Tensor) -> float | torch.Tensor:
         # At the strongest pixel all levels of MCS are 1, and rounding decides which of them is selected.
         return case(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6 if case.name.startswith("mcs") else 1.0
-
-
-def test_depth_curvilinear_saliency_is_independent_of_block_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    x = depths(5)
-    mask = x > 2.4
-    want = filters.depth_curvilinear_saliency(x, mask)
-    monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", 2 * 24 * 24)
-    torch.testing.assert_close(filters.depth_curvilinear_saliency(x, mask), want)
-    x.requires_grad_()
-    trained = filters.depth_curvilinear_saliency(x, mask)
-    torch.testing.assert_close(trained, want)
-    (gradient,) = torch.autograd.grad(trained.square().sum(), x)
-    assert gradient[1:].abs().amax(dim=(1, 2, 3)).min() > 0  # of every block
 
 
 @pytest.mark.parametrize("layer", [x for x in LAYERS.values() if x.inputs is depths], ids=lambda x: x.name)

@@ -83,15 +83,3 @@ def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value: float) -
     broken[0, 1, 9, 12:15] = value
     torch.testing.assert_close(hog(broken), hog(zero), rtol=0.0, atol=0.0)
     assert torch.equal(field_points(broken), field_points(zero))
-
-
-def test_fill_missing_reaches_holes_of_32_px() -> None:
-    """A hole of 31 px is filled from its surroundings, which are 0; the middle of one of 63 px with the image mean."""
-    for side, expected in ((31, 0.0), (63, None)):
-        image = torch.zeros(1, 1, 256, 256, dtype=torch.float64)
-        image[..., 192:, :] = 1.0
-        holes = torch.zeros_like(image, dtype=torch.bool)
-        holes[..., 64 : 64 + side, 64 : 64 + side] = True
-        mean = float(image[~holes].mean())
-        filled = fill_missing(image.masked_fill(holes, math.nan), holes)
-        assert float(filled[0, 0, 70, 70]) == pytest.approx(mean if expected is None else expected, abs=1e-3)

@@ -24,7 +24,6 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("hog", {"grid": 8.5}, "grid: expected an integer >= 1, got 8.5"),
     ("blur", {"reblur_sigmas": (1.0, 0.0)}, "reblur_sigmas"),
     ("hog", {"clip": 1.5}, "clip"),
-    ("hog", {"voting": "soft"}, "voting"),
     ("hog", {"grid": 2, "block": 3}, "block <= grid"),
 ]
 

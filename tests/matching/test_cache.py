@@ -58,7 +58,7 @@ def test_bank_key_depends_on_everything(monkeypatch):
     meshes = [mesh, millimetres, metres, moved, flipped, painted, standing()]
     meshes += [textured(), textured(uv=1e-4), textured(level=1), textured(side=8), textured(side=2)]
     keys = [key(m) for m in meshes]
-    keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="torch")]
+    keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="embree")]
     keys += [key(mesh, pipeline=Pipeline(bank=replace(PIPELINE.bank, sigma=1.5)))]
     assert key(textured().copy()) in keys
     monkeypatch.setattr(cache, "code_digest", lambda *_: "another version")

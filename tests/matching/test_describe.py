@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber, quarter_turns
+from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.rendering import make_renderer
 
@@ -22,22 +22,10 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     ]  # two directions, 0 and 35
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
-        assert (together.descriptors[i] - alone.descriptors[0]).norm() < 0.02 * alone.descriptors[0].norm()
-        assert (together.points[i] ^ alone.points[0]).float().mean() < 0.01
-        assert (together.silhouettes[i] ^ alone.silhouettes[0]).float().mean() < 0.001
-        torch.testing.assert_close(together.boxes[i], alone.boxes[0], rtol=0, atol=1e-6 * describe.radius)
-
-
-def test_quarter_turns_groups_views_of_equal_direction_and_distance():
-    views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 90, 180, 270, 45])
-    rotations, distances = views.rotations, views.distance.clone()
-    distances[1] *= 1.001
-    first, quarters = quarter_turns(rotations, distances)
-    assert len(set(first.tolist())) == 5  # 0 and 45 degrees of two directions, and the more distant view
-    assert first[1] == 1
-    theta = views.theta.round().long()
-    assert quarters.tolist() == ((theta[first] - theta) // 90 % 4).tolist()
-    assert torch.equal(views.azimuth[first], views.azimuth)
+        assert (together["descriptors"][i] - alone["descriptors"][0]).norm() < 0.02 * alone["descriptors"][0].norm()
+        assert (together["points"][i] ^ alone["points"][0]).float().mean() < 0.01
+        assert (together["silhouettes"][i] ^ alone["silhouettes"][0]).float().mean() < 0.001
+        torch.testing.assert_close(together["boxes"][i], alone["boxes"][0], rtol=0, atol=1e-6 * describe.radius)
 
 
 def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
@@ -47,6 +35,6 @@ def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     quick = ViewDescriber(fine, BankSettings())
     assert len(fine.faces) > 2 * VIEW_FACES
     expected, found = (each(views.rotations, views.distance * exact.radius) for each in (exact, quick))
-    assert float((expected.silhouettes ^ found.silhouettes).float().mean()) < 1e-3
-    assert float(torch.cosine_similarity(expected.descriptors, found.descriptors).min()) > 0.995
-    torch.testing.assert_close(found.boxes, expected.boxes)
+    assert float((expected["silhouettes"] ^ found["silhouettes"]).float().mean()) < 1e-3
+    assert float(torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min()) > 0.995
+    torch.testing.assert_close(found["boxes"], expected["boxes"])

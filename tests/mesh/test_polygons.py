@@ -1,7 +1,6 @@
 """Polygons become triangles; what trimesh reads wrongly is rewritten or refused."""
 
 import struct
-import time
 from pathlib import Path
 
 import numpy as np
@@ -51,18 +50,6 @@ def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
         polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)  # in a tilted plane
         # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that none overlap.
         assert areas(polygon, divide(polygon)).sum() == pytest.approx(true_area(flat) * 1.18**0.5, rel=1e-9)
-
-
-def test_divide_faces_takes_little_time_for_polygons_that_cross_themselves() -> None:
-    rng = np.random.default_rng(0)
-    angle = np.arange(1999) * 2 * np.pi * 998 / 1999
-    crossing = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    start = time.process_time()
-    for flat in (crossing, rng.random((2000, 2)), rng.integers(0, 5, (2000, 2)).astype(float)):
-        triangles = divide(np.insert(flat, 2, 0.0, axis=1))
-        assert 0 < len(triangles) <= len(flat) - 2
-        assert 0 <= triangles.min() <= triangles.max() < len(flat)
-    assert time.process_time() - start < 5
 
 
 def prism() -> tuple[np.ndarray, list[list[int]]]:

@@ -6,12 +6,12 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch import Camera, camera_matrix, project_points, render_depth, rotation_error
+from curvireg_torch import Camera, camera_matrix, render_depth, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
-from curvireg_torch.registration.inputs import image_item, image_items
+from curvireg_torch.registration.inputs import image_item
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
@@ -60,20 +60,6 @@ def test_distorted_photograph_gives_the_pose_of_the_true_camera(camera, seed):
     assert errors(result, T)[0] < angle + 0.3
     assert errors(result, T)[1] < away + 0.005
     assert errors(ignored, T)[1] > 0.02  # so the photograph needs it
-
-
-def test_camera_is_scaled_to_each_photograph():
-    ideal, photo, box, _, _ = distorted(RADIAL, 1)
-    half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
-    items = image_items([photo, half, ideal], [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]], RADIAL)
-    point = torch.tensor([[0.4, 0.2, 1.0]]).double()
-    large, small = (project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1))
-    torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
-    torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
-    (error,) = image_items([photo[:, :90]], None, RADIAL)
-    assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
-    with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):
-        image_items([photo], None, [RADIAL, OFF_CENTRE])
 
 
 def test_detection_refinement_and_following_take_cameras():

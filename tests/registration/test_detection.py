@@ -161,26 +161,6 @@ def test_a_place_that_is_hardly_likely_asks_for_a_box(found, probability, warned
     assert any("give a box" in text for text in result.warnings) == warned
 
 
-@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
-def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
-    one, other = as_found(found[2]), as_found(found[2])
-    again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
-    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
-    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
-    assert best is (one if kept else other)
-
-
-@pytest.mark.parametrize("sure_first", [True, False])
-def test_add_keeps_the_most_certain_of_overlapping_results(found, sure_first):
-    sure = as_found(found[2])
-    beside, less = replace(sure, box=sure.box + 500.0, score=0.1), replace(sure, score=0.5 * sure.score)
-    results = [beside, sure if sure_first else less]
-    detection_module._add(results, less if sure_first else sure)
-    assert len(results) == 2
-    assert results[0] is beside
-    assert results[1] is sure
-
-
 def test_bad_distances_raise(registrar, found):
     for boxes in (None, [[4.0, 4.0, 40.0, 40.0]]):
         with pytest.raises(InvalidInputError, match="distance: needs the camera"):
@@ -242,22 +222,6 @@ def test_detector_finds_the_object(seed, corner, scale):
     assert len(located.boxes) == 20
     assert located.boxes.dtype == torch.float32
     assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
-
-
-def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
-    """Level and spread of a view's similarity do not matter."""
-    generator = torch.Generator().manual_seed(3)
-    K = len(detector()._templates.views)
-    maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
-    fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
-    gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
-    plain = detector()._peaks(maps, fits, ratios)
-    biased = detector()._peaks([gain * m + level for m in maps], fits, ratios)
-    assert torch.equal(biased.views, plain.views)
-    assert torch.allclose(biased.responses, plain.responses, atol=1e-4)
-    every = torch.cat([m.flatten(1) for m in maps], dim=1)
-    z = (every - every.mean(dim=1, keepdim=True)) / every.std(dim=1, keepdim=True)
-    assert float(plain.responses[0]) == pytest.approx(float(z.max()), rel=1e-4)
 
 
 def test_distance_limits_each_box_by_its_view():
@@ -330,3 +294,12 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
     assert [one.score for one in found] == kept
     _add(found, at(40.0, 0.1))  # elsewhere
     assert [one.score for one in found] == [*kept, 0.1]
+
+
+@pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
+def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
+    one, other = as_found(found[2]), as_found(found[2])
+    again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
+    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
+    best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
+    assert best is (one if kept else other)

@@ -92,13 +92,6 @@ def test_confidence_is_a_fraction_of_that_of_the_first_pose(monkeypatch):
     assert found[1].confidence == pytest.approx(0.7 * found[0].confidence, rel=1e-6)
 
 
-def test_the_same_frame_again_and_again_does_not_raise_the_confidence(monkeypatch):
-    (image, box, _), registrar = sequence(1)[0], truck_registrar()
-    answering(monkeypatch, registrar, [0.6])
-    follow = Follower(registrar, CAMERA)
-    assert max(follow(image, box).confidence for _ in range(5)) <= 0.6
-
-
 def test_a_wrong_start_never_becomes_believed():
     """Seen from behind, in frame after frame; a registration of each frame does not confirm it."""
     frames = sequence(3)

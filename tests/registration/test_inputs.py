@@ -9,7 +9,7 @@ import torch
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import inputs
-from curvireg_torch.registration.inputs import camera_warnings, check_box_side, input_warnings
+from curvireg_torch.registration.inputs import ImageItem, camera_warnings, image_items
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
 VGA = (480, 640)
@@ -49,13 +49,11 @@ def test_camera_warnings_name_the_likely_mistake(camera, size, parts):
     ],
 )
 def test_boxes_that_show_few_pixels_are_refused_or_questioned(box, refused, warned):
-    box = torch.tensor(box)
-    assert bool(input_warnings(box, None, VGA)) == warned
-    if refused:
-        with pytest.raises(InvalidInputError, match="at least 12 are needed"):
-            check_box_side(box, VGA)
-    else:
-        check_box_side(box, VGA)
+    picture = torch.rand(1, *VGA)
+    assert bool(ImageItem(picture, torch.tensor(box).float(), None).warnings) == warned
+    item = image_items([picture], [box], None)[0]
+    assert isinstance(item, InvalidInputError) == refused
+    assert not refused or "at least 12 are needed" in str(item)
 
 
 def test_result_with_a_questionable_camera_is_never_reliable(monkeypatch):

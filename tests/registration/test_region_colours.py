@@ -29,7 +29,7 @@ def halves():
 def test_log_ratio_has_the_sign_of_the_learned_colours():
     bins, uv = halves()
     model, zero = RegionModel(), torch.zeros(8)
-    model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten(), rate=0.2)
+    model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten())
     ratio = model.log_ratio(bins, uv, zero)
     assert (ratio[:, :8] > 0.3).all()
     assert (ratio[:, 8:] < -0.3).all()
@@ -44,9 +44,9 @@ def test_histograms_move_by_the_rate_towards_new_colours():
     bins, uv = halves()
     model, directions = RegionModel(), torch.zeros(128)
     red, green = bins[0, 0], bins[0, 15]
-    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten(), rate=0.2)
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten())
     assert float(model._histograms[0, 0, red]) == 1.0
-    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten(), rate=0.2)  # the colours swap
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten())  # the colours swap
     step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)

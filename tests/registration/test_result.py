@@ -1,6 +1,5 @@
 """Made-up registrations: what is reliable, ambiguous, and how results become JSON and plain words."""
 
-import inspect
 import json
 from dataclasses import replace
 from types import SimpleNamespace
@@ -181,8 +180,3 @@ def test_reliable_needs_a_rotation_that_contours_determine():
     variances[0] = 1e-4
     known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)
     assert replace(fitted, hypotheses=known).reliable
-
-
-def test_attributes_of_the_best_hypothesis_exist_on_the_class_too():
-    """``help`` and ``inspect`` look them up there."""
-    assert {"rotation", "translation", "projection"} <= {name for name, _ in inspect.getmembers(Registration)}

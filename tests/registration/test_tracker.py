@@ -183,17 +183,6 @@ def test_covariance_counts_edges_near_the_pose():
     assert bool(beside.isnan().all())
 
 
-def test_frames_from_other_directions_become_keyframes():
-    """The sequence turns by 4 degrees a frame: every second is another keyframe."""
-    frames = sequence(10)
-    follow = make_tracker(example_mesh())
-    follow.start(frames[0][0], CAMERA, frames[0][2])
-    for image, _, T in frames[1:]:
-        follow.accept(follow.measure(image, CAMERA, T))
-    angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
-    assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
-
-
 def test_confidence_falls_where_the_object_is_absent():
     frames = sequence(2)
     follow = make_tracker(example_mesh())
@@ -212,3 +201,14 @@ def test_pose_outside_the_image_is_lost():
     behind[2, 3] = -6.0
     with pytest.raises(LostObjectError):
         follow.start(drawn(START), K, behind)
+
+
+def test_frames_from_other_directions_become_keyframes():
+    """The sequence turns by 4 degrees a frame: every second is another keyframe."""
+    frames = sequence(10)
+    follow = make_tracker(example_mesh())
+    follow.start(frames[0][0], CAMERA, frames[0][2])
+    for image, _, T in frames[1:]:
+        follow.accept(follow.measure(image, CAMERA, T))
+    angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
+    assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)

@@ -12,7 +12,7 @@ from curvireg_torch.errors import RenderingError
 from curvireg_torch.geometry import transform, uniform_views
 from curvireg_torch.rendering import make_renderer
 
-BACKENDS = ("auto", "embree", "pyrender", "torch")
+BACKENDS = ("auto", "embree", "pyrender")
 
 
 @functools.cache

@@ -84,8 +84,7 @@ def test_render_colour_is_grey_without_colours_or_faces() -> None:
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert has_colours(mesh)
     assert not has_colours(bare)
-    grey, other = render_colour(bare, T, K, SIZE), render_colour(mesh, T, K, SIZE, renderer="torch")
-    assert float((grey - other).abs().mean()) < 1e-3
+    grey = render_colour(bare, T, K, SIZE)
     assert bool((grey[:, 0] == grey[:, 1]).all())
     assert float((grey - render_colour(mesh, T, K, SIZE)).abs().mean()) > 0.05
     assert render_colour(mesh, T[:0], K, SIZE).shape == (0, 3, *SIZE)

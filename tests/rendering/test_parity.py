@@ -11,7 +11,6 @@ import trimesh
 from curvireg_torch.geometry import project_points
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.rendering import make_renderer
-from curvireg_torch.rendering.zbuffer import TorchRenderer
 from curvireg_torch.synthetic import example_mesh
 
 from .conftest import BACKENDS, camera, interior, pixel_grid, require, smooth
@@ -94,12 +93,3 @@ def test_silhouette_agrees_with_project_points(backend: str, orthographic: bool)
     assert bool(mask[inside > 0.005].all())
     assert not bool(mask[outside > 0.005].any())
     assert int(mask.sum()) > 1000
-
-
-def test_torch_renderer_does_not_depend_on_chunks(orthographic: bool) -> None:
-    mesh = MESHES["knot"]()
-    T, K, size = camera(3, radius=mesh_radius(mesh), centre=mesh_centre(mesh), orthographic=orthographic)
-    renderer = TorchRenderer(mesh)
-    expected = renderer.render(T, K, size, orthographic=orthographic)
-    renderer._pairs = 4099
-    assert torch.equal(renderer.render(T, K, size, orthographic=orthographic), expected)

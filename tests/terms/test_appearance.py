@@ -42,10 +42,10 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     pictures = matcher.describer.shaded(small_bank.rotations, small_bank.distances)
     assert pictures.shape == (len(small_bank), 1, 64, 64)
     expected = describe(pictures, Backbone())
-    torch.testing.assert_close(small_bank.reranking_features["appearance"], expected, atol=2e-3, rtol=0)
+    torch.testing.assert_close(small_bank.appearance, expected, atol=2e-3, rtol=0)
     query = matcher.query(*photograph(0))
     ranking = matcher.rank(query)
-    raw = similarity(describe(query.crops, Backbone())[:, None], expected)
+    raw = similarity(describe(query.crops, Backbone()), expected)
     torch.testing.assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
     small_bank.save(tmp_path / "bank.safetensors")
     loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(*photograph(0))
@@ -54,7 +54,7 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
 
 def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, matcher):
     before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(*photograph(2))
-    assert large_bank.reranking_features == {}
+    assert large_bank.appearance is None
     reranking = ViewMatcher(large_bank, pipeline=large(top=5, min_angle=40.0))
     ranking = reranking(*photograph(2))
     compared = distinct_views(before.order[0], large_bank.rotations, count=5, angle=40.0)
@@ -94,7 +94,7 @@ def test_colours_distinguish_front_and_back(painted_bank, tmp_path, exhaustive_l
     painted_bank.save(tmp_path / "bank.safetensors")
     bank = ViewBank.load(tmp_path / "bank.safetensors")  # with the mesh's colours
     if exhaustive_limit == 0:
-        bank.reranking_features = {}
+        bank.appearance = None
     views = [v for v in range(len(VIEWS)) if float(VIEWS.elevation[v]) == 30 and float(VIEWS.azimuth[v]) in (0, 180)]
     describer = ViewMatcher(bank, pipeline=pipeline).describer
     pictures = describer.shaded(bank.rotations[views], bank.distances[views])

@@ -17,7 +17,6 @@ from curvireg_torch.terms import (
     BoxShape,
     Correlation,
     Repeatability,
-    Whitening,
     box_shapes,
     ledoit_wolf,
     whole_box_shapes,
@@ -34,12 +33,6 @@ def test_correlation_is_the_cosine_of_the_better_crop():
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
 
 
-def test_correlation_score_is_an_exponential_of_standard_deviations():
-    score = Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
-    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
-    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
-
-
 def sample(count: int, length: int = 12) -> torch.Tensor:
     generator = torch.Generator().manual_seed(count)
     mixing = torch.randn(length, length, generator=generator)
@@ -53,17 +46,6 @@ def test_ledoit_wolf_equals_scikit_learn(count):
     expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
     np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(mean, x.mean(dim=0))
-
-
-def test_whitening_decorrelates():
-    x = sample(4000)
-    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
-    torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
-    torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
-    with pytest.raises(InvalidInputError, match="positive definite"):
-        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
-    with pytest.raises(InvalidInputError, match="covariance"):
-        Whitening(torch.zeros(3), torch.eye(2))
 
 
 def test_matcher_ranks_by_whitened_correlation(bank, photographs):
@@ -97,32 +79,6 @@ def test_repeatability_score_has_the_closed_form():
         torch.testing.assert_close(Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected))
     with pytest.raises(InvalidInputError, match="mode"):
         Repeatability(mode="other")
-
-
-class PointViews:
-    """Views of ``size`` px; view i has feature points at the (row, column) indices ``points[i]``."""
-
-    def __init__(self, size, *points):
-        self.settings = SimpleNamespace(image_size=size)
-        self.points, self.descriptors = torch.zeros(len(points), size, size, dtype=torch.bool), torch.zeros(1)
-        for view, (rows, columns) in zip(self.points, points, strict=True):
-            view[rows, columns] = True
-
-    def __len__(self):
-        return len(self.points)
-
-    def points_at(self, index):
-        return self.points[index]
-
-
-@pytest.mark.parametrize(("size", "cell"), [(129, 2), (194, 3)])
-def test_repeatability_counts_points_in_cut_cells_once(size, cell):
-    """One point in the cut corner, one at a cut side, two in whole cells; the view's points fill the last column."""
-    assert 0 < size % cell < cell
-    term = Repeatability().build(PointViews(size, (slice(None), -1)))
-    assert term.cell == cell
-    query = PointViews(size, ([size - 1, 0, 0, 2 * cell], [size - 1, size - 1, 0, cell])).points[None]
-    assert term(SimpleNamespace(points=query)).item() == 0.5
 
 
 def box_score(shapes, boxes, **options):
