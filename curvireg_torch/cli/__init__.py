@@ -15,7 +15,7 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
-from . import commands, evaluate, follow, register
+from . import commands, follow, register
 from .options import Parser
 
 __all__ = ["build_parser", "main", "parse"]
@@ -63,7 +63,7 @@ def build_parser() -> argparse.ArgumentParser:
     follow.add_follow(subparsers)
     commands.add_bank(subparsers)
     commands.add_cache(subparsers)
-    evaluate.add_evaluate(subparsers)
+    commands.add_evaluate(subparsers)
     commands.add_view(subparsers)
     commands.add_plot(subparsers)
     commands.add_demo(subparsers)

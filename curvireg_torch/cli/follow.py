@@ -162,22 +162,17 @@ def _poses(
 
 def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
-    from ..data import read_photo
+    from ..data import Photo, read_photo
     from ..evaluation.lists import find_photographs
-    from ..geometry import Camera, camera_matrix
-    from ..geometry.cameras import camera_of_view
+    from ..evaluation.runner import camera_of
 
-    source, size, camera = options.photos[0], (image.shape[-2], image.shape[-1]), options.camera
-    if camera is not None:
-        return camera.at(size).matrix if isinstance(camera, Camera) else camera_matrix(*camera)
-    if options.guess != "exif":
-        return camera_of_view(float(options.guess or 0.0), size)
-    first = next(find_photographs(source, 1, source)) if source.is_dir() else None
-    K = None if first is None else read_photo(first).guessed_camera_matrix()
-    if K is None:
-        message = "no focal length in EXIF, which only photographs have; give --camera FX FY CX CY, or --fov DEG"
-        raise InvalidInputError(message, subject=first or source)
-    return K
+    source, photo = options.photos[0], Photo(image, 1, None, ())
+    if source.is_dir():
+        source = next(find_photographs(source, 1, source))
+        photo = read_photo(source) if options.guess == "exif" else photo
+    camera, _ = camera_of(options.entry(source), photo)
+    assert camera is not None  # the command refuses to start without one
+    return camera.at((image.shape[-2], image.shape[-1])).matrix
 
 
 def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:

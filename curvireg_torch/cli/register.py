@@ -188,13 +188,12 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     import torch
 
     from ..data import read_photo
-    from ..evaluation.result_files import write_lost, write_pose_stamped, write_result
+    from ..evaluation.result_files import write_lost, write_result
     from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
-    from ..evaluation.store import to_json
     from ..geometry import Camera
     from ..registration.result import used_box
 
-    out, as_json, path = arguments.out, arguments.json, options.photos[0]
+    out, path = arguments.out, options.photos[0]
     photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
     check_entry(entry, photo)
     if arguments.format and options.camera is options.guess is None:
@@ -210,11 +209,9 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
             if out is not None:
                 write_lost(out, str(error))
             raise
-    notes = sys.stderr if as_json else sys.stdout  # with --json, standard output holds only the result
+    notes = sys.stderr if arguments.json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
         write_result(out, document, registrar, result, seen_image(entry, photo), used_box(document))
-    if arguments.format:
-        write_pose_stamped(out / "pose.yaml", document)
     for warning in document["warnings"]:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     if document["inputs"]["camera_source"] in ("exif", "fov"):
@@ -226,19 +223,14 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
     if remarks:
         print(f"{path}: {'; '.join(remarks)}", file=notes)
-    if as_json:
-        print(to_json(document), end="")
-    else:
-        assert out is not None
-        print_result(document, out)
+    _finish(arguments, document)
     return result.reliable
 
 
 def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
-    from ..evaluation.result_files import write_pose_stamped, write_views
+    from ..evaluation.result_files import write_views
     from ..evaluation.rigs import read_rig, register_rig
-    from ..evaluation.store import to_json
 
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
@@ -248,17 +240,26 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     document["mesh"] = str(options.meshes[result.model])
     if out is not None:
         write_views(out, document, registrar, result, photographs)
-    if arguments.format:
-        write_pose_stamped(out / "pose.yaml", document)
-    if arguments.json:
-        print(to_json(document), end="")
-    else:
+    if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["views"]:
             counts = f"prefers the pose by {view['contribution']:.2f}"
             print(f"{view['name']}: {view['failure'] or counts}")
-        print_result(document, out)
+    _finish(arguments, document)
     return result.reliable
+
+
+def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Print the result, and write it in the format of another tool."""
+    from ..evaluation.result_files import write_pose_stamped
+    from ..evaluation.store import to_json
+
+    if arguments.format:
+        write_pose_stamped(arguments.out / "pose.yaml", document)
+    if arguments.json:
+        print(to_json(document), end="")
+    else:
+        print_result(document, arguments.out)
 
 
 def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> "Counts | None":

@@ -1,6 +1,5 @@
-from .benchmarks import Benchmark, BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark
+from .benchmarks import Benchmark, BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
 from .datasets import evaluate
-from .protocol import Protocol
 from .registry import DATASETS
 
 __all__ = ["DATASETS", "BOPBenchmark", "Benchmark", "Pascal3DBenchmark", "PoseFolderBenchmark", "Protocol", "evaluate"]

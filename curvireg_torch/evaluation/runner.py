@@ -97,7 +97,7 @@ class Entry:
 
 def check_entry(entry: Entry, photo: Photo) -> None:
     """Refuse a box or camera that cannot be used, as :func:`register_entry` does, before meshes are opened."""
-    _item(entry, photo, _camera(entry, photo)[0])
+    _item(entry, photo, camera_of(entry, photo)[0])
 
 
 def seen_image(entry: Entry, photo: Photo) -> Tensor:
@@ -151,7 +151,7 @@ def register_entry(
         CurviregError: it cannot be registered; the message begins with the photograph's name.
     """
     start = time.perf_counter()
-    camera, source = _camera(entry, photo)
+    camera, source = camera_of(entry, photo)
     item = _item(entry, photo, camera)
     results: Sequence[Registration | FailedRegistration]
     if entry.start is not None:
@@ -227,7 +227,7 @@ def projection_of(result: Registration, K: Tensor | None) -> tuple[Tensor, Tenso
     return (result.views[0].T_cam_from_model, K) if result.views and K is not None else result.projection
 
 
-def _camera(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
+def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     """The camera, and its source; that of a calibration has a size or distortion."""
     given = entry.camera
     if isinstance(given, Camera):

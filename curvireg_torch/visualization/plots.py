@@ -1,28 +1,21 @@
 """Figures of registrations, as ``matplotlib.figure.Figure``; :class:`MissingDependencyError` without matplotlib."""
 
-from collections.abc import Sequence
 from typing import Any
 
-from ..errors import InvalidInputError, MissingDependencyError
-from ..matching import Ranking, ViewBank
+from ..errors import MissingDependencyError
+from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration
 from .overlay import side_pictures
 
 __all__ = ["fields", "picture", "viewpoints"]
 
 
-def viewpoints(bank: ViewBank, ranking: Ranking | Registration, *, image_index: int = 0) -> Any:
+def viewpoints(bank: ViewBank, result: Registration) -> Any:
     """Best score of each viewing direction of a bank over azimuth and elevation; several maxima are rival poses.
 
-    Hypotheses of a registration are numbered, best first.
+    The hypotheses are numbered, best first.
     """
-    poses: Sequence[Hypothesis] = ()
-    if isinstance(ranking, Registration):
-        poses, ranking = ranking.hypotheses, ranking.ranking
-    if ranking.scores.shape[1] != len(bank) or not 0 <= image_index < len(ranking):
-        expected = f"{len(bank)} views and image {image_index}"
-        raise InvalidInputError(f"ranking: expected {expected}, got {tuple(ranking.scores.shape)}")
-    scores = ranking.scores[image_index].cpu()
+    scores = result.ranking.scores[0].cpu()
     order = scores.argsort()  # the best one of a direction is drawn last
     figure = _figure(7.0, 3.8)
     axes = figure.subplots()
@@ -31,7 +24,7 @@ def viewpoints(bank: ViewBank, ranking: Ranking | Registration, *, image_index: 
     figure.colorbar(drawn, ax=axes, label="score S")
     axes.set(xlabel="azimuth, degrees", xticks=range(0, 361, 45), xlim=(0, 360))
     axes.set(ylabel="elevation, degrees", yticks=range(-90, 91, 30), ylim=(-90, 90))
-    for number, pose in enumerate(poses, start=1):
+    for number, pose in enumerate(result.hypotheses, start=1):
         azimuth, elevation, _ = pose.viewpoint
         axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11, clip_on=False)
         axes.annotate(str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8)

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from curvireg_torch import Registrar, ViewBank, sample_views
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization.plots import viewpoints
 from tests._support.scenes import CAMERA, scene, unrefined
@@ -23,6 +22,3 @@ def test_viewpoints_draws_the_best_score_of_each_direction_last_and_the_hypothes
     marks = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines]
     np.testing.assert_allclose(marks, [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses])
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]
-    assert not viewpoints(bank, result.ranking).axes[0].lines
-    with pytest.raises(InvalidInputError, match="image 2"):
-        viewpoints(bank, result.ranking, image_index=2)
