@@ -72,11 +72,7 @@ def _argument(how: dict[str, Any]) -> dict[str, Any]:
 def register_options(
     arguments: argparse.Namespace, photos: Sequence[Path] = (), meshes: Sequence[Path] = ()
 ) -> RegisterOptions:
-    """The options of a command; those that it lacks have their defaults.
-
-    Raises:
-        InvalidInputError: limits that contradict each other, an impossible camera, or no such device.
-    """
+    """The options of a command; those that it lacks have their defaults."""
     from ..utils.checks import check_device
 
     given = {name: value for name in DECLARED if (value := getattr(arguments, name, None)) is not None}

@@ -97,11 +97,7 @@ class Protocol:
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
-        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the default of that key.
-
-        Raises:
-            InvalidInputError: an unknown key or value.
-        """
+        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the default of that key."""
         values: dict[str, str | float | int | None] = {"pose": pose}
         named = {"annotated": 0.0, "none": None}
         for word in words:

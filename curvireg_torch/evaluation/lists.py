@@ -98,12 +98,7 @@ def list_photographs(options: RegisterOptions, *, every: int = 1, frames: Path) 
 
 
 def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
-    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frames of a video, or ``path`` itself.
-
-    Raises:
-        MissingFileError: a pattern or folder without photographs.
-        ImageError: a video that cannot be read.
-    """
+    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frames of a video, or ``path`` itself."""
     if path.suffix.lower() in VIDEOS and path.is_file():
         for number, image in Video(path, every=every):
             frame = frames / f"{path.stem}-{number:06d}.png"
@@ -127,10 +122,6 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
     through. Empty cells mean: detect the object, no camera, ``meshes`` (of several the best is found), ``limits`` (on
     the pose, arguments of :class:`PosePrior`). Blank lines, and empty cells beyond the last named column, as
     spreadsheets write them, do not count. The ``error`` of a row that cannot be used is the reason.
-
-    Raises:
-        MissingFileError: no such file.
-        InvalidInputError: another format, a missing, repeated or reserved column, or no rows.
 
     Example:
         >>> import tempfile

@@ -184,9 +184,6 @@ class RegisterOptions:
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given.
 
-    Raises:
-        InvalidInputError: ``side`` beside ``azimuth``, or ``within`` without ``near``.
-
     Example:
         >>> limits_from_options({"side": "front", "near": (10, 20)})
         {'azimuth': (315.0, 45.0), 'viewpoint': (10, 20, 0.0), 'within': 45.0}
@@ -249,9 +246,6 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
 def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
     """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does,
     and its ``confidence``, if the file has one.
-
-    Raises:
-        CurviregError: the file is missing, damaged or does not hold a rigid pose.
     """
     from ..geometry.cameras import transform
     from ..utils.checks import check_numbers, check_pose
@@ -283,9 +277,6 @@ def open_registrar(
         options: its settings; ``photos``, ``meshes`` and what belongs to a photograph are not used.
         meshes, field: the files, and the network from :meth:`RegisterOptions.open_field`.
         progress: called while banks are built, instead of showing a bar.
-
-    Raises:
-        CurviregError: a file is missing or damaged, or a bank was built with other settings.
     """
     from ..registration import Registrar
 

@@ -81,19 +81,11 @@ def _write(
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 
-    def attempt(name_and_draw: tuple[str, Callable[[], bytes | None]]) -> Exception | None:
-        name, draw = name_and_draw
-        try:
-            content = draw()
-            if content is not None:
-                write_file(out / name, content)
-        except Exception as error:  # it must not cost the other file
-            return error
-        return None
+    def draw(file: tuple[str, Callable[[], bytes | None]]) -> None:
+        if (content := file[1]()) is not None:
+            write_file(out / file[0], content)
 
-    for error in map_on_threads(attempt, [("overlay.png", overlay), ("pose.glb", scene)]):
-        if error is not None:
-            raise error
+    map_on_threads(draw, [("overlay.png", overlay), ("pose.glb", scene)])
 
 
 def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:

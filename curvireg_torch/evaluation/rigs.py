@@ -33,9 +33,6 @@ def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
     file), ``r11`` to ``r33`` or ``qw qx qy qz``, and ``tx ty tz``: the camera from the world, in the mesh's unit. Paths
     are relative to the file. Of a BOP scene, boxes are those of the object that the name of ``mesh`` numbers, if each
     photograph shows it once at most.
-
-    Raises:
-        CurviregError: a missing or damaged file; the message names the row.
     """
     if path.is_dir():
         for name, read in (("images.txt", _colmap), ("scene_camera.json", lambda folder: _bop(folder, mesh))):

@@ -146,9 +146,6 @@ def register_entry(
 
     Returns:
         The registration, and its document: the content of ``result.json``, and of a line of ``results.jsonl``.
-
-    Raises:
-        CurviregError: it cannot be registered; the message begins with the photograph's name.
     """
     start = time.perf_counter()
     camera, source = camera_of(entry, photo)
@@ -195,9 +192,6 @@ def register_views(
     Returns:
         The registration; and the photographs without distortion, None for one that could not be read, and their
         cameras.
-
-    Raises:
-        CurviregError: no pose; the message names the photograph.
     """
     seen, cameras = [], []
     for view in views:
@@ -264,9 +258,6 @@ def run_entries(
 
     Returns:
         The store, which holds all entries; None in processes that leave the report to the first one.
-
-    Raises:
-        CurviregError: ``open_registrar`` refuses its options, or ``out`` cannot be written to.
     """
     common = json.dumps([dict(settings), code_digest(*POSE_SOURCES)], sort_keys=True)
     photo_digest, digest_of_mesh = cache(file_digest), cache(mesh_digest)
@@ -278,7 +269,7 @@ def run_entries(
         return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
 
     with workers() as group:
-        if group.leads:
+        if group.rank == 0:
             for name in REPORTS:
                 (out / name).unlink(missing_ok=True)
         group.wait()
@@ -291,7 +282,7 @@ def run_entries(
             for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
                 _register_some(list(same), meshes, store, open_registrar, bar)
         group.wait()
-        if not group.leads:
+        if group.rank:
             return None
         if not store.is_complete({entry.key: digests(entry) for entry in entries}):
             raise InvalidInputError(f"{out}: a photograph or mesh changed meanwhile; run the same command again")

@@ -23,15 +23,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Workers:
-    """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list."""
+    """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list; 0 writes the tables."""
 
     rank: int = 0
     size: int = 1
-
-    @property
-    def leads(self) -> bool:
-        """Whether this process merges the store and writes the tables when all are done."""
-        return self.rank == 0
 
     def wait(self) -> None:
         """Wait for all processes."""
@@ -65,11 +60,7 @@ def workers() -> Iterator[Workers]:
 
 
 def run_processes(count: int, words: Sequence[str]) -> bool:
-    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes.
-
-    Raises:
-        InvalidInputError: a process failed.
-    """
+    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes."""
     if count <= 1 or "TORCHELASTIC_RUN_ID" in os.environ:
         return False
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
@@ -104,9 +95,6 @@ class ResultStore:
     Args:
         folder: created with the first row.
         workers: the processes that share the store.
-
-    Raises:
-        InvalidInputError: ``results.jsonl`` holds something else.
 
     Example:
         >>> import tempfile

@@ -13,10 +13,8 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import torch
 import trimesh
 
-from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation.result_files import write_pose_stamped
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
@@ -63,22 +61,6 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     (tmp_path / "out" / "pose.yaml").write_text("of an older result")
     assert register(*words) == 0
     assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
-def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, draws, file, threads):
-    def fail(*_, **__):
-        raise InvalidInputError("it cannot be drawn")
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
-    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
-    status = register(*words)
-    torch.set_num_threads(before)
-    assert status == 2
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
 
 
 def test_pose_for_ros_is_in_metres(tmp_path):
