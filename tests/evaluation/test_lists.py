@@ -20,7 +20,6 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
-LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
