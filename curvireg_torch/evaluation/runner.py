@@ -348,7 +348,6 @@ def thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
     return out / "thumbnails" / f"{digests['request']}.jpg"
 
 
-def thumbnail_of(out: Path, row: Row) -> Callable[[], bytes | None]:
-    """Return a function that reads the picture of a row; its result is None if there is none."""
-    path = thumbnail_path(out, row["digests"])
-    return lambda: path.read_bytes() if row["status"] == "ok" and path.is_file() else None
+def thumbnail_of(out: Path, row: Row) -> Path | None:
+    """The picture of a row; None if it has no pose."""
+    return thumbnail_path(out, row["digests"]) if row["status"] == "ok" else None

@@ -2,7 +2,7 @@
 
 import base64
 import html
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,15 +38,15 @@ figcaption {{ overflow-wrap: anywhere }}
 class SheetEntry:
     """A photograph on the page: the number of its row, from 1, its name, and the outcome in words.
 
-    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red); ``picture`` returns its
-    thumbnail or None and is called only for entries that are written.
+    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red); ``picture`` is the file
+    of its thumbnail.
     """
 
     number: int
     name: str
     caption: str
     kind: str
-    picture: Callable[[], bytes | None]
+    picture: Path | None
 
 
 def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
@@ -75,9 +75,9 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
 
 
 def _figure(entry: SheetEntry) -> str:
-    name, content, picture = html.escape(entry.name), entry.picture(), ""
-    if content is not None:
-        data = base64.b64encode(content).decode()
+    name, picture = html.escape(entry.name), ""
+    if entry.picture is not None and entry.picture.is_file():
+        data = base64.b64encode(entry.picture.read_bytes()).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
     caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
     return f'<figure class="{entry.kind}">{picture}<figcaption>{caption}</figcaption></figure>'
