@@ -50,14 +50,6 @@ def check(document):
     assert float((t - WORLD[:3, 3]).norm()) < 0.1
 
 
-def test_views_take_no_limits_on_the_pose(rig, folder, tmp_path, capsys):
-    place, rows = rig
-    path = write(place / "limits.csv", [*COLUMNS, *POSE], rows)
-    assert register(folder, path, tmp_path, "--azimuth", "20", "45") == 2
-    assert "a rig takes no limits on the pose" in capsys.readouterr().err
-    assert not (tmp_path / "result.json").exists()
-
-
 def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     place, rows = rig
     path = write(place / "rig.csv", [*COLUMNS, *POSE], [*rows, ["none.png", *rows[0][1:]]])
