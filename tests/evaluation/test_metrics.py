@@ -100,23 +100,6 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
 
 
-def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scores of cans with 315 symmetries took minutes."""
-    angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
-    symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
-    symmetries[:, :2, :2] = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1).view(-1, 2, 2)
-    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    moved, transform = [], metrics._transform
-    counted = lambda T, points: moved.append(len(T) * len(points)) or transform(T, points)  # noqa: E731
-    monkeypatch.setattr(metrics, "_transform", counted)
-    found = [metrics.mssd_error(EST, GT, points, symmetries=symmetries)]
-    found.append(metrics.mspd_error(EST, GT, points, K, symmetries=symmetries))
-    assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
-    monkeypatch.setattr(metrics, "BOUNDING_POINTS", len(points))
-    torch.testing.assert_close(found[0], metrics.mssd_error(EST, GT, points, symmetries=symmetries), rtol=0, atol=0)
-    torch.testing.assert_close(found[1], metrics.mspd_error(EST, GT, points, K, symmetries=symmetries), rtol=0, atol=0)
-
-
 def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
     behind = EST.clone()
     behind[2, 2, 3] = 0.1
