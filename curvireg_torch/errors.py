@@ -99,7 +99,7 @@ MAX_POLYGON_WORK = 20_000_000
 #: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25
 MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
-MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file
+MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
 #: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice
 MAX_VIEWER_FACES = 300_000
 MAX_VIEWER_PHOTOGRAPHS = 20  #: Photographs that the viewer holds in memory

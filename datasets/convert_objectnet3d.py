@@ -19,7 +19,7 @@ from collections import Counter
 from pathlib import Path
 
 from curvireg_torch.data._base import is_plain_name
-from curvireg_torch.data.pascal3d import read_objects
+from curvireg_torch.data.mat_files import read_mat
 from curvireg_torch.errors import InvalidInputError
 
 
@@ -34,7 +34,9 @@ def place(source: Path, target: Path) -> None:
 
 
 def classes_of(annotation: Path) -> set[str]:
-    names = {entry.get("class") for entry in read_objects(annotation)}
+    record = read_mat(annotation, "record")
+    objects = record[0].get("objects") if isinstance(record, list) and record else None
+    names = {entry.get("class") for entry in objects} if isinstance(objects, list) else set()
     return {name for name in names if isinstance(name, str) and is_plain_name(name)}
 
 

@@ -4,13 +4,13 @@ import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ..errors import MAX_MAT_BYTES, InvalidInputError, MissingFileError
+from ..errors import InvalidInputError, MissingFileError
 from ..utils.checks import check_option
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
+from .mat_files import MatStruct, MatValue, read_mat
 
 _README = "datasets/pascal3d/README.md"
 _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
@@ -118,7 +118,7 @@ class Pascal3DPlus(ObjectDataset):
                 self._skip("missing_image", item)
                 continue
             try:
-                objects = read_objects(annotation)
+                objects = _objects(read_mat(annotation, "record"))
             except InvalidInputError:
                 self._skip("corrupt_annotation", item)
                 continue
@@ -130,7 +130,7 @@ class Pascal3DPlus(ObjectDataset):
                     ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
                     self._items.append({**ids, **parsed})
 
-    def _parse(self, entry: Sample, category: str) -> Sample | str:
+    def _parse(self, entry: MatStruct, category: str) -> Sample | str:
         """The sample of one object, or the reason to skip it."""
         if entry.get("class") != category:
             return "other_class"
@@ -141,10 +141,10 @@ class Pascal3DPlus(ObjectDataset):
         box = _box(entry.get("bbox"), self.pixel_origin)
         if box is None:
             return "bad_box"
-        view = next(iter(_structs(entry.get("viewpoint"))), None)
-        if view is None:
+        views = entry.get("viewpoint")
+        if not isinstance(views, list) or not views:
             return "no_viewpoint"
-        azimuth, elevation, distance = (_number(view.get(key)) for key in ("azimuth", "elevation", "distance"))
+        azimuth, elevation, distance = (_number(views[0].get(key)) for key in ("azimuth", "elevation", "distance"))
         if azimuth is None or elevation is None or not distance:
             return "coarse_viewpoint"
         cad_index = _number(entry.get("cad_index")) or 0.0
@@ -153,10 +153,10 @@ class Pascal3DPlus(ObjectDataset):
             return "missing_mesh"
         return {
             "box": box,
-            **pose_fields(azimuth, elevation, _number(view.get("theta")) or 0.0),
+            **pose_fields(azimuth, elevation, _number(views[0].get("theta")) or 0.0),
             "distance": distance,
             "translation": (0.0, 0.0, distance),
-            "camera_matrix": _camera(view, box, self.pixel_origin),
+            "camera_matrix": _camera(views[0], box, self.pixel_origin),
             "category": category,
             "cad_index": int(cad_index),
             "cad_path": str(cad),
@@ -164,47 +164,30 @@ class Pascal3DPlus(ObjectDataset):
         }
 
 
-def read_objects(path: Path) -> list[Sample]:
-    """The structs ``record.objects`` of an annotation file; :class:`InvalidInputError` if it holds none."""
-    from scipy.io import loadmat
-
-    try:
-        if path.stat().st_size > MAX_MAT_BYTES:
-            raise ValueError(f"larger than {MAX_MAT_BYTES:,} bytes, no annotation")
-        objects = loadmat(path, variable_names=["record"], simplify_cells=True)["record"]["objects"]
-        found = _structs(objects)
-        if not found and np.size(objects):
-            raise ValueError("objects that are no structs")
-        return found
-    except Exception as error:  # SciPy raises errors of any kind for damaged files
-        raise InvalidInputError(
-            f"not a MATLAB 5 file with record.objects, or damaged: {error}", subject=path
-        ) from error
+def _objects(record: MatValue) -> list[MatStruct]:
+    objects = record[0].get("objects") if isinstance(record, list) and record else None
+    if isinstance(objects, np.ndarray) and objects.size == 0:
+        return []
+    if not isinstance(objects, list):
+        raise InvalidInputError("record: holds no struct array 'objects'")
+    return objects
 
 
-def _structs(value: Any) -> list[Sample]:
-    """The structs of an array; SciPy reduces an array of one to its content."""
-    values = value if isinstance(value, list | np.ndarray) else [value]
-    return [one for one in values if isinstance(one, dict)]
-
-
-def _number(value: Any) -> float | None:
+def _number(value: MatValue) -> float | None:
     """The first number of ``value`` if it is finite, else None."""
-    numbers = np.ravel(value)
-    if numbers.dtype.kind not in "biuf" or numbers.size == 0 or not math.isfinite(numbers[0]):
+    if not isinstance(value, np.ndarray) or value.size == 0 or not math.isfinite(value[0]):
         return None
-    return float(numbers[0])
+    return float(value[0])
 
 
-def _box(value: Any, origin: int) -> tuple[float, float, float, float] | None:
-    numbers = np.ravel(value)
-    if numbers.dtype.kind not in "biuf" or numbers.size != 4 or not np.isfinite(numbers).all():
+def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | None:
+    if not isinstance(value, np.ndarray) or value.size != 4 or not np.isfinite(value).all():
         return None
-    x0, y0, x1, y1 = (float(v) - origin for v in numbers)
+    x0, y0, x1, y1 = (float(v) - origin for v in value)
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
 
-def _camera(view: Sample, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
+def _camera(view: MatStruct, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
     """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the box."""
     focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)
     px, py = _number(view.get("px")), _number(view.get("py"))

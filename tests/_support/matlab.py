@@ -1,0 +1,13 @@
+"""Parts of MATLAB 5 files."""
+
+import struct
+
+__all__ = ["element", "file"]
+
+
+def element(kind: int, content: bytes) -> bytes:
+    return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)
+
+
+def file(content: bytes) -> bytes:
+    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + content
