@@ -344,8 +344,9 @@ class Rig:
         if len(self.photographs) == 1:
             return self.hypotheses_of_one()
         full, half, quarter = self.problems
-        T, _, _ = self.fitted(quarter, self.candidates(), QUARTER_SIZE_RADII)
-        T, support, _ = self.fitted(half, T, FIRST_RADII)
+        T = self.candidates()
+        moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)  # for those that are far off; the others lose by it
+        T, support, _ = self.fitted(half, torch.cat([T, moved]), FIRST_RADII)
         promising = (SCORE_WEIGHTS[2] * support + _bounded(self.ranks(T))).sum(dim=0)
         chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
         T, support = T[chosen], support[:, chosen]
