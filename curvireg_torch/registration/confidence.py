@@ -193,7 +193,7 @@ def hypothesis_probabilities(confidence: float, scores: Tensor, *, exact: bool) 
 
     Example:
         >>> [round(p, 2) for p in hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 1.0]), exact=True)]
-        [0.6, 0.08, 0.08]
+        [0.6, 0.09, 0.09]
     """
     constants = CALIBRATION[model_name(exact=exact)]
     rivals = scores[1:].double()
