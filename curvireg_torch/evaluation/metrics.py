@@ -17,7 +17,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from ..errors import InvalidInputError
 from ..geometry import rotation_error
+from ..utils.checks import check_camera_matrix, check_finite, check_pose, check_rotation, check_symmetries, check_tensor
 
 __all__ = [
     "ADD_THRESHOLDS",
@@ -57,7 +59,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         >>> add_error(moved, T, torch.rand(10, 3)).tolist()
         [0.5]
     """
-    T_est, T_gt, points, valid = _without_missing(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     means = [_transform(d, points).norm(dim=1).mean(1) for d in _chunks(T_est - T_gt, points)]
     return _inf_unless(valid, torch.cat(means))
 
@@ -74,7 +76,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
         >>> adds_error(half_turn, T, torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).tolist()
         [0.0]
     """
-    T_est, T_gt, points, valid = _without_missing(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
     model = points.detach().cpu().double()
     tree = cKDTree(model.numpy())
     back = torch.linalg.solve(T_est.detach().cpu().double(), T_gt.detach().cpu().double())
@@ -97,8 +99,8 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
         >>> mssd_error(half_turn, T, points, symmetries=torch.cat([T, half_turn])).tolist()
         [0.0]
     """
-    T_est, T_gt, points, valid = _without_missing(T_est, T_gt, points)
-    difference = T_est.unsqueeze(1) - _equivalent(T_gt, symmetries)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
+    difference = T_est.unsqueeze(1) - T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt)
 
     def largest(which: Tensor, points: Tensor) -> Tensor:
         moved = difference.flatten(0, 1)[which]
@@ -126,9 +128,12 @@ def mspd_error(
         >>> round(float(mspd_error(moved, T, torch.zeros(1, 3), K)), 3)       # 100 px * 0.1 / 2
         5.0
     """
-    T_est, T_gt, points, valid = _without_missing(T_est, T_gt, points)
+    T_est, T_gt, points, valid = _checked(T_est, T_gt, points)
+    batch = () if getattr(camera_matrix, "ndim", 0) == 2 else (len(T_est),)
+    check_tensor(camera_matrix, "camera_matrix", (*batch, 3, 3))
+    check_camera_matrix(camera_matrix)
     K = camera_matrix.to(T_est.dtype).unsqueeze(-3)
-    true = K @ _equivalent(T_gt, symmetries)[:, :, :3]
+    true = K @ (T_gt.unsqueeze(1) @ _checked_symmetries(symmetries, T_gt))[:, :, :3]
     estimated = (K @ T_est.unsqueeze(1)[:, :, :3]).expand_as(true)
 
     def largest(which: Tensor, points: Tensor) -> Tensor:
@@ -170,19 +175,31 @@ def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
         >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
         0.5
     """
+    _check_errors(errors)
     return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(thresholds)
 
 
-def _without_missing(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """In the dtype of ``T_est``, missing estimates replaced by the truth; and a mask of valid estimates."""
+    check_tensor(T_est, "T_est", (None, 4, 4))
+    check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
+    check_tensor(points, "points", (None, 3))
+    if len(points) == 0:
+        raise InvalidInputError("points: expected at least one point, got none")
+    check_finite(points, "points")
+    check_pose(T_gt, "T_gt")
     T_gt = T_gt.to(T_est.dtype)
     valid = T_est.isfinite().flatten(1).all(1)
-    return torch.where(valid.view(-1, 1, 1), T_est, T_gt), T_gt, points.to(T_est.dtype), valid
+    T_est = torch.where(valid.view(-1, 1, 1), T_est, T_gt)
+    check_pose(T_est, "T_est")
+    return T_est, T_gt, points.to(T_est.dtype), valid
 
 
-def _equivalent(T_gt: Tensor, symmetries: Tensor | None) -> Tensor:
-    """(B, S, 4, 4) true poses of which each is right."""
-    return T_gt.unsqueeze(1) if symmetries is None else T_gt.unsqueeze(1) @ symmetries.to(T_gt)
+def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
+    if symmetries is None:
+        return torch.eye(4, dtype=like.dtype, device=like.device)[None]
+    check_symmetries(symmetries)
+    return symmetries.to(like)
 
 
 def _chunks(transforms: Tensor, points: Tensor) -> list[Tensor]:
@@ -210,6 +227,7 @@ def median_error(errors: Tensor) -> float:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
         26.0
     """
+    _check_errors(errors)
     if not len(errors):
         return math.nan
     ordered = errors.double().sort().values
@@ -232,10 +250,22 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
         >>> float(symmetric_rotation_error(half_turn, torch.eye(3), half_turn[None]))
         0.0
     """
+    for name, R in (("R_est", R_est), ("R_gt", R_gt), ("symmetries", symmetries)):
+        check_rotation(R, name)
+    check_finite(R_gt, "R_gt")
+    check_finite(symmetries, "symmetries")
     valid = R_est.isfinite().flatten(-2).all(-1)
     plain = rotation_error(R_est, R_gt)
     symmetric = rotation_error(R_est.unsqueeze(-3), R_gt.unsqueeze(-3) @ symmetries.to(R_gt.dtype))
     return _inf_unless(valid, torch.cat([plain.unsqueeze(-1), symmetric], -1).amin(-1))
+
+
+def _check_errors(errors: Tensor) -> None:
+    check_tensor(errors, "errors", (None,))
+    if bad := int((~(errors >= 0)).sum()):
+        raise InvalidInputError(
+            f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
+        )
 
 
 def _inf_unless(valid: Tensor, errors: Tensor) -> Tensor:

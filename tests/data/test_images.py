@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image, TiffImagePlugin
+from PIL import Image
 
 from curvireg_torch.data import images, read_image, read_photo
 from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
@@ -65,15 +65,6 @@ def test_read_photo_inverts_tiff_in_which_white_is_zero(tmp_path, dtype):
     assert read_photo(tmp_path / "white.tif").image[0].tolist() == [[255, 204, 0]]
 
 
-def test_read_photo_takes_the_full_image_of_a_tiff(tmp_path):
-    small, full = Image.new("RGB", (8, 6), "red"), Image.new("RGB", (80, 60), "blue")
-    with TiffImagePlugin.AppendingTiffWriter(str(tmp_path / "a.tif"), True) as file:
-        for image, tags in ((small, {254: 1}), (full, {})):
-            image.save(file, format="TIFF", tiffinfo=tags)
-            file.newFrame()
-    assert read_photo(tmp_path / "a.tif").image.shape == (3, 60, 80)
-
-
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_read_photo_applies_the_exif_orientation(tmp_path, suffix, orientation):
@@ -129,6 +120,9 @@ def test_read_photo_notes_changes_of_channels(tmp_path):
         for count in channels:
             assert cv2.imwrite(str(tmp_path / f"a.{name}"), np.full((4, 4, count), 9, np.uint8))
             assert read_photo(tmp_path / f"a.{name}").notes == notes[count], name
+    colour = Image.new("RGB", (8, 8))  # phones add previews to photographs
+    colour.save(tmp_path / "phone.jpg", format="MPO", save_all=True, append_images=[colour])
+    assert read_photo(tmp_path / "phone.jpg").notes == ()
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.tif"])

@@ -1,4 +1,4 @@
-"""Errors and recalls against scipy, numpy and loops; missing estimates (NaN, inf) are misses."""
+"""Errors and recalls against scipy, numpy and loops; missing estimates (NaN, inf) are misses; bad input is refused."""
 
 import math
 from collections.abc import Callable
@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import metrics
 from curvireg_torch.geometry import rotation_error
 from tests._support.poses import poses, rotations
@@ -45,6 +46,13 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
     for n in (1, 6, 7):
         values = 180.0 * torch.rand(n, generator=torch.Generator().manual_seed(n))
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
+
+
+@pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
+def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
+    for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
+        with pytest.raises(InvalidInputError, match="errors: expected"):
+            average(bad)
 
 
 def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
@@ -127,3 +135,32 @@ def test_pose_errors_contract(error: PoseError) -> None:
     single = error(EST.float(), GT, POINTS)
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
+    zero = torch.zeros_like(EST)  # would map every point to the origin, which may be close to the surface
+    for est, gt, points, message in (
+        (EST, GT, POINTS[:0], "points: expected at least one"),
+        (EST, GT, POINTS * math.nan, "points: expected finite"),
+        (EST, GT[:2], POINTS, "T_gt: expected shape"),
+        (EST, GT * math.nan, POINTS, "T_gt: expected finite"),
+        *((bad, GT, POINTS, "T_est: expected rigid") for bad in (zero, EST * 1.05, EST.mT, -EST)),
+        (EST, GT * 1.05, POINTS, "T_gt: expected rigid"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            error(est, gt, points)
+
+
+WRONG: dict[str, Callable[[], object]] = {
+    "R_est: expected": lambda: metrics.symmetric_rotation_error(R[0, 0], R, SYMMETRIES),
+    "R_gt: expected": lambda: metrics.symmetric_rotation_error(R, R.tolist(), SYMMETRIES),  # type: ignore[arg-type]
+    "R_gt: expected finite": lambda: metrics.symmetric_rotation_error(R, R * math.nan, SYMMETRIES),
+    "symmetries: expected finite": lambda: metrics.symmetric_rotation_error(R, R, SYMMETRIES * math.nan),
+    "symmetries: expected shape .* with S >= 1": lambda: metrics.mssd_error(EST, GT, POINTS, symmetries=GT[:0]),
+    "symmetries: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K, symmetries=GT * math.inf),
+    "camera_matrix: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K[None].repeat(2, 1, 1)),
+    "camera matrix: expected finite": lambda: metrics.mspd_error(EST, GT, POINTS, K * math.nan),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_metrics_refuse_wrong_input(message: str) -> None:
+    with pytest.raises(InvalidInputError, match=f"^{message}"):
+        WRONG[message]()
