@@ -81,11 +81,17 @@ def _write(
     _remove(out)
     write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
 
-    def draw(file: tuple[str, Callable[[], bytes | None]]) -> None:
-        if (content := file[1]()) is not None:
-            write_file(out / file[0], content)
+    def attempt(file: tuple[str, Callable[[], bytes | None]]) -> Exception | None:
+        try:
+            if (content := file[1]()) is not None:
+                write_file(out / file[0], content)
+        except Exception as error:  # it must not cost the other file
+            return error
+        return None
 
-    map_on_threads(draw, [("overlay.png", overlay), ("pose.glb", scene)])
+    for error in map_on_threads(attempt, [("overlay.png", overlay), ("pose.glb", scene)]):
+        if error is not None:
+            raise error
 
 
 def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:

@@ -17,7 +17,7 @@ from ..errors import InvalidInputError
 from ..features.backbone import SHA256, Backbone, describe, similarity
 from ..filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
 from ..geometry.crops import check_boxes, crop_squares, square_boxes
-from ..utils.checks import check_integer, check_option, check_photograph, check_positive, check_tensor
+from ..utils.checks import as_numbers, check_integer, check_option, check_photograph, check_positive, check_tensor
 from ..utils.threads import map_on_threads
 
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
@@ -66,6 +66,8 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
     ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
+    boxes = as_numbers(boxes, "boxes")
+    check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
     jitter = torch.tensor(_JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device)
@@ -88,6 +90,8 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     for image in images:
         check_photograph(image)
     sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+    boxes = as_numbers(boxes, "boxes")
+    check_tensor(boxes, "boxes", (len(sizes), None, 4))
     check_boxes(boxes[:, 0], sizes)
     if not sizes:
         return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
@@ -168,6 +172,8 @@ class Whitening(nn.Module):
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
+        check_tensor(mean, "mean", (None,))
+        check_tensor(covariance, "covariance", (len(mean), len(mean)))
         factor, failed = torch.linalg.cholesky_ex(covariance.double())
         if int(failed):
             raise InvalidInputError("covariance: expected a positive definite matrix; shrink it")

@@ -6,11 +6,19 @@ import sys
 import warnings
 from dataclasses import replace
 
+import cv2
+import pytest
+import torch
+import trimesh
+
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning
+from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.geometry import rotation_error
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
+from tests._support.scenes import truck_bank
 
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
@@ -52,3 +60,28 @@ def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
     monkeypatch.setattr("curvireg_torch.cli.commands.show_cache", warn)
     assert main(["cache"]) == 0
     assert capsys.readouterr().err == "curvireg: warning: of ours\n"
+
+
+def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
+    """The true pose projects the mesh into the box, and the errors are those of the result."""
+    options = {}
+    monkeypatch.setattr("curvireg_torch.matching.cached_bank", lambda _, **given: options.update(given) or truck_bank())
+    monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
+    assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
+    assert options["progress"] is False
+    result = json.loads((tmp_path / "result.json").read_text())
+    R, t = (torch.tensor(result["truth"][name], dtype=torch.float64) for name in ("rotation", "translation"))
+    estimate = torch.tensor(result["rotation"], dtype=torch.float64)
+    assert result["rotation_error_deg"] == pytest.approx(float(rotation_error(estimate, R)))
+    error = (torch.tensor(result["translation"], dtype=torch.float64) - t).norm() / t.norm()
+    assert result["translation_error"] == pytest.approx(float(error))
+    points = torch.tensor(trimesh.load(tmp_path / "mesh.ply").vertices.copy()) @ R.T + t
+    pixels = 1040.0 * points[:, :2] / points[:, 2:] + torch.tensor([479.5, 359.5])
+    box = torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
+    assert (torch.tensor(result["inputs"]["box"]) - box).abs().max() < 1.5
+    photo = cv2.imread(str(tmp_path / "photo.png"))
+    assert (photo.shape, result["inputs"]["seed"]) == ((720, 960, 3), 2)
+    assert photo.max() > 150
+    printed = capsys.readouterr().out
+    assert f"rotation {result['rotation_error_deg']:.1f} degrees" in printed
+    assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in printed

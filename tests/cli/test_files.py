@@ -13,8 +13,10 @@ import sys
 import cv2
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation.result_files import write_pose_stamped
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.visualization import sheet
@@ -82,3 +84,19 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment, check=False, timeout=120)
     os.close(writer)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
+def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, draws, file, threads):
+    def fail(*_, **__):
+        raise InvalidInputError("it cannot be drawn")
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
+    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
+    status = register(*words)
+    torch.set_num_threads(before)
+    assert status == 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}

@@ -142,3 +142,15 @@ def test_bop_dataset_skips_invalid_cameras(tree, place, value):
     lost = len(before) - len(after)
     assert lost > 0
     assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
+
+
+def test_bop_dataset_prefers_colour_to_grey(tree):
+    scene = tree[0] / "test" / "000001"
+    (scene / "gray").mkdir()
+    (scene / "gray" / "000000.tif").write_bytes(b"")
+    assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
+
+
+def test_targets_take_instances_of_unknown_visibility_last(tree):
+    edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
+    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible

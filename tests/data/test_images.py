@@ -197,3 +197,19 @@ def test_read_image_reports_missing_files(tmp_path):
     for path in (tmp_path / "nothing.jpg", tmp_path):
         with pytest.raises(MissingFileError, match="no such file; check the path of the photograph"):
             read_image(path)
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF")
+def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_path):
+    path = tmp_path / "a.jpg"
+    write_image(path)
+    plain, whole = path.read_bytes(), exif(6, focal=27)
+    for block in (whole[:38], whole[:41], whole[:30] + b"\xff" * 4 + whole[34:], whole[:38] + b"\xff" * 18):
+        path.write_bytes(plain)
+        with_exif(path, block)
+        photo = read_photo(path)
+        assert (photo.orientation, photo.focal_35mm) == (6, None)
+    for block in (exif(0), exif(9), b"XX" + whole[2:], whole[:20], b""):
+        path.write_bytes(plain)
+        with_exif(path, block)
+        assert read_photo(path).orientation == 1

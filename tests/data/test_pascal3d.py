@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from curvireg_torch.data import Pascal3DPlus
-from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from tests._support.miniature import HALF, pascal_object, write_pascal3d, write_record
 
@@ -124,3 +124,17 @@ def test_pascal3d_reports_missing_files_with_advice(tree, tmp_path):
 def test_pascal3d_refuses_invalid_options(tree, options, message):
     with pytest.raises(InvalidInputError, match=message):
         Pascal3DPlus(tree[0], **options)
+
+
+def test_annotation_has_no_image(tree):
+    dataset = Pascal3DPlus(tree[0])
+    assert set(dataset[0]) - set(dataset.annotation(0)) == {"image"}
+    dataset.annotation(0)["box"].zero_()
+    assert dataset.annotation(0)["box"].sum() > 0, "a sample is a copy"
+    with pytest.raises(IndexError):
+        dataset[len(dataset)]
+
+
+def test_pascal3d_reports_damaged_photographs_on_access(pascal):
+    with pytest.raises(ImageError, match="2008_000003"):
+        [pascal[i] for i in range(len(pascal))]

@@ -150,3 +150,9 @@ def test_every_dataset_opens_and_names_its_groups(kind, tmp_path):
     benchmark = row.scored(dataset, Protocol(pose=row.pose))
     assert benchmark.name == kind
     assert [str(path) for path in benchmark.entries[0].meshes] == [str(sample[benchmark.mesh])]
+
+
+def test_selection_is_spread(pascal):
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    assert benchmark.selection(2) == [0, 2]
+    assert benchmark.selection(9) == [0, 1, 2, 3, 4]

@@ -8,18 +8,23 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
+from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, runner
 from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.runner import Entry
+from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import scene, unrefined
+from tests._support.scenes import SIZE, scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
+LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +109,40 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
     assert read_list(path, [tmp_path / "part.stl"])[0].box == (1.0, 2.0, 30.0, 40.0)
+
+
+@pytest.mark.parametrize(
+    ("camera", "source"),
+    [
+        (CAMERA, "given"),
+        (replace(CAMERA, size=SIZE), "file"),
+        (LENS, "file"),
+        (50.0, "fov"),
+        ("exif", "exif"),
+        (None, None),
+    ],
+)
+def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
+    def with_covariance(image, box, K, **_):
+        (result,) = registrar(image, box, K)
+        assert isinstance(result, Registration)
+        best, *others = result.hypotheses
+        best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
+        return [replace(result, probabilities=(1.0,), hypotheses=(best, *others))]
+
+    class Certain:
+        bank, pipeline = registrar.bank, registrar.pipeline
+        is_exact, symmetries_of = registrar.is_exact, registrar.symmetries_of
+        of_model = registrar.of_model
+        __call__ = staticmethod(with_covariance)
+
+    photo = read_photo(entry.photo)
+    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
+    one = replace(entry, camera=camera)
+    result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
+    assert document["inputs"]["camera_source"] == source
+    known = source in ("given", "file")
+    assert document["covariance"] == (torch.eye(6).tolist() if known else None)
+    assert (document["standard_deviations"] is not None) == known
+    assert (result.translation is not None) == (source is not None)
+    json.dumps(document, allow_nan=False)

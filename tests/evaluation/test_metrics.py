@@ -48,6 +48,16 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
 
 
+def test_average_recall_worked_example() -> None:
+    errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
+    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of the ten.
+    assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
+    assert metrics.average_recall(errors, metrics.ADD_THRESHOLDS) == pytest.approx(2 / 5)
+    pixels = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf], dtype=torch.float64)
+    assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
+    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
+
+
 @pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
 def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
     for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
@@ -108,6 +118,23 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
 
 
+def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of cans with 315 symmetries took minutes."""
+    angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
+    symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
+    symmetries[:, :2, :2] = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1).view(-1, 2, 2)
+    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    moved, transform = [], metrics._transform
+    counted = lambda T, points: moved.append(len(T) * len(points)) or transform(T, points)  # noqa: E731
+    monkeypatch.setattr(metrics, "_transform", counted)
+    found = [metrics.mssd_error(EST, GT, points, symmetries=symmetries)]
+    found.append(metrics.mspd_error(EST, GT, points, K, symmetries=symmetries))
+    assert sum(moved) < 0.25 * 3 * len(EST) * 315 * len(points)
+    monkeypatch.setattr(metrics, "BOUNDING_POINTS", len(points))
+    torch.testing.assert_close(found[0], metrics.mssd_error(EST, GT, points, symmetries=symmetries), rtol=0, atol=0)
+    torch.testing.assert_close(found[1], metrics.mspd_error(EST, GT, points, K, symmetries=symmetries), rtol=0, atol=0)
+
+
 def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
     behind = EST.clone()
     behind[2, 2, 3] = 0.1
@@ -164,3 +191,10 @@ WRONG: dict[str, Callable[[], object]] = {
 def test_metrics_refuse_wrong_input(message: str) -> None:
     with pytest.raises(InvalidInputError, match=f"^{message}"):
         WRONG[message]()
+
+
+def test_metrics_of_empty_sets() -> None:
+    empty = torch.empty(0, dtype=torch.float64)
+    assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)
+    assert math.isnan(metrics.median_error(empty))
+    assert math.isnan(metrics.average_recall(empty, metrics.MSSD_THRESHOLDS))

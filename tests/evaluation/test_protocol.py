@@ -53,3 +53,11 @@ def test_hint_of_truth_is_none_without_truth_or_hint():
     eye = torch.eye(3, dtype=torch.float64)
     assert hint_of_truth(eye, eye, Protocol(), "a") is None
     assert hint_of_truth(torch.nan * eye, eye, Protocol(hint="pose:5"), "a") is None
+
+
+def test_perturbed_box_fills_the_range():
+    offsets = torch.stack([perturbed_box(BOX, Protocol(box=0.1), str(i)) - BOX for i in range(400)])
+    fraction = offsets / torch.tensor([100.0, 50.0, 100.0, 50.0])
+    assert fraction.abs().max() <= 0.1
+    assert fraction.abs().amax(0).min() > 0.095
+    assert fraction.mean(0).abs().max() < 0.01

@@ -1,5 +1,6 @@
 """The loop over entries, with a function in place of the registration."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -8,9 +9,10 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
-from curvireg_torch.errors import MeshError
+from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.runner import Entry, View, run_entries
+from curvireg_torch.evaluation.store import Workers, run_processes
 
 
 @pytest.fixture
@@ -26,11 +28,13 @@ def entries(tmp_path):
     return [Entry(photo=tmp_path / p, meshes=(tmp_path / m,), label=f"{p[0]}{m[0]}") for p, m in pairs]
 
 
-def registered(entries, folder, *, settings=None):
-    """The labels of the entries that a run registers, in their order."""
+def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
+    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after`` of them."""
     labels = []
 
     def register(entry, registrar, _, *, bank_seconds):
+        if len(labels) == stop_after:
+            raise KeyboardInterrupt
         labels.append(entry.label)
         assert str(registrar) == entry.meshes[0].name
         first = sum(label[1] == entry.label[1] for label in labels) == 1
@@ -44,11 +48,26 @@ def registered(entries, folder, *, settings=None):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        with patch.object(runner, "_row", register):
+        with (
+            patch.object(runner, "workers", lambda: nullcontext(workers or Workers())),
+            patch.object(runner, "_row", register),
+        ):
             registered.store = run_entries(entries, folder, open_registrar, **options)
+    except KeyboardInterrupt:
+        assert stop_after is not None
     finally:
         torch.set_num_threads(threads)
     return labels
+
+
+def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
+    assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
+    assert registered(entries, tmp_path / "out") == []
+    assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
+    for size in (2, 8):
+        parts = [Workers(rank, size).part(["0a", "1a", "0b", "1b"]) for rank in range(size)]
+        assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
+        assert size == 8 or len(parts[0]) == 2
 
 
 @pytest.mark.parametrize(
@@ -83,6 +102,14 @@ def test_missing_photographs_are_tried_again(entries, tmp_path):
     assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
     assert registered(entries, tmp_path / "out") == ["0a", "0b"]
     assert registered.store.read("0a")["digests"]["photo"] == ""
+
+
+def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "summary.json").write_text("of other results")
+    assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
+    assert not (tmp_path / "out" / "summary.json").exists()
+    assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
 
 ENTRY = Entry(
@@ -122,3 +149,13 @@ def test_request_covers_other_views(name):
     values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
     other = replace(VIEWS[0], **{name: values.get(name, 2.0 * torch.eye(4))})
     assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request()
+
+
+def test_run_processes(monkeypatch, capfd):
+    assert not run_processes(1, ["evaluate"])
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
+    assert not run_processes(2, ["evaluate"])
+    monkeypatch.delenv("TORCHELASTIC_RUN_ID")
+    with pytest.raises(InvalidInputError, match="a process ended with 1"):
+        run_processes(2, ["nonsense"])
+    assert "nonsense" in capfd.readouterr().err

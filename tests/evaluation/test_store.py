@@ -1,7 +1,9 @@
+import json
+
 import pytest
 
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation.store import ResultStore, Workers
+from curvireg_torch.errors import InvalidInputError, OutputError
+from curvireg_torch.evaluation.store import ResultStore, Workers, to_json
 
 DIGESTS = {"request": "a", "photo": "b"}
 
@@ -70,3 +72,17 @@ def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "results.jsonl").write_text(content)
     with pytest.raises(InvalidInputError, match=r"results\.jsonl: not results"):
         ResultStore(tmp_path)
+
+
+def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    def full_disk(*_):
+        raise OSError(28, "No space left on device")
+
+    store = ResultStore(tmp_path)
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        store.append(row("x"))
+
+
+def test_to_json_writes_null_for_nan():
+    assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}

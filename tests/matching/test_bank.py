@@ -3,6 +3,7 @@
 import os
 import stat
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.matching import bank as bank_module
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
+from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_digest
 
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
@@ -148,3 +150,14 @@ def test_load_refuses_truncated_and_missing_files(saved):
         ViewBank.load(saved)
     with pytest.raises(MissingFileError, match="no such bank"):
         ViewBank.load(saved.with_name("none"))
+
+
+def test_float16_storage_changes_no_ranking(small_bank, saved):
+    # Queries differ from views as photographs do: noise of half the descriptors' length.
+    noise = torch.rand(200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    noise *= 0.5 * small_bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
+    queries = small_bank.descriptors[torch.arange(200) % len(small_bank)] + noise
+    query = SimpleNamespace(descriptors=queries[:, None])
+    exact, stored = (Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved)))
+    assert float((exact - stored).abs().max()) < 1e-4
+    assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))

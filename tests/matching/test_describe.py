@@ -5,7 +5,7 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import sample_views
-from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber
+from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber, quarter_turns
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.rendering import make_renderer
 
@@ -38,3 +38,15 @@ def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     assert float((expected["silhouettes"] ^ found["silhouettes"]).float().mean()) < 1e-3
     assert float(torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min()) > 0.995
     torch.testing.assert_close(found["boxes"], expected["boxes"])
+
+
+def test_quarter_turns_groups_views_of_equal_direction_and_distance():
+    views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 90, 180, 270, 45])
+    rotations, distances = views.rotations, views.distance.clone()
+    distances[1] *= 1.001
+    first, quarters = quarter_turns(rotations, distances)
+    assert len(set(first.tolist())) == 5  # 0 and 45 degrees of two directions, and the more distant view
+    assert first[1] == 1
+    theta = views.theta.round().long()
+    assert quarters.tolist() == ((theta[first] - theta) // 90 % 4).tolist()
+    assert torch.equal(views.azimuth[first], views.azimuth)

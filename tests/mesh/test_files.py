@@ -6,6 +6,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from curvireg_torch.errors import MeshError
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.mesh.files import mesh_digest, mesh_files
 from tests.mesh.test_hostile_meshes import tree
@@ -85,3 +86,19 @@ def test_mesh_digest_changes_when_a_missing_file_appears(tmp_path: Path, suffix:
     assert mesh_digest(path) != whole
     (tmp_path / name).write_bytes(content)
     assert mesh_digest(path) == whole
+
+
+def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path: Path) -> None:
+    path = write(tmp_path / "inside", "gltf")
+    path.write_text("{")
+    with pytest.raises(MeshError):
+        load_mesh(path)
+    assert mesh_files(path) == [path]
+    assert mesh_digest(path) != mesh_digest(tmp_path / "inside" / "missing.gltf")
+    (tmp_path / "secret.mtl").write_text("newmtl skin\n")
+    path = tmp_path / "inside" / "part.obj"
+    path.write_text("mtllib ../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl skin\nf 1 2 3\n")
+    assert mesh_files(path) == [path]
+    bank = tmp_path / "part.safetensors"  # a list may name banks in place of meshes
+    bank.write_bytes(b"a bank")
+    assert mesh_files(bank) == [bank]

@@ -6,12 +6,12 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch import Camera, camera_matrix, render_depth, rotation_error
+from curvireg_torch import Camera, camera_matrix, project_points, render_depth, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
-from curvireg_torch.registration.inputs import image_item
+from curvireg_torch.registration.inputs import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
 
@@ -146,3 +146,17 @@ def test_inverted_mask_is_warned_of():
     mask[5:35, 20:50] = 0.0
     assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
     assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
+
+
+def test_camera_is_scaled_to_each_photograph():
+    ideal, photo, box, _, _ = distorted(RADIAL, 1)
+    half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
+    items = image_items([photo, half, ideal], [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]], RADIAL)
+    point = torch.tensor([[0.4, 0.2, 1.0]]).double()
+    large, small = (project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1))
+    torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
+    torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
+    (error,) = image_items([photo[:, :90]], None, RADIAL)
+    assert "calibrated for 240 x 180 px, but the photograph has 240 x 90 px" in str(error)
+    with pytest.raises(InvalidInputError, match="expected 1, one for each image, got 2"):
+        image_items([photo], None, [RADIAL, OFF_CENTRE])

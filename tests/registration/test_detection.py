@@ -303,3 +303,19 @@ def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, f
     monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
     best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
     assert best is (one if kept else other)
+
+
+def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
+    """Level and spread of a view's similarity do not matter."""
+    generator = torch.Generator().manual_seed(3)
+    K = len(detector()._templates.views)
+    maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
+    fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
+    gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
+    plain = detector()._peaks(maps, fits, ratios)
+    biased = detector()._peaks([gain * m + level for m in maps], fits, ratios)
+    assert torch.equal(biased.views, plain.views)
+    assert torch.allclose(biased.responses, plain.responses, atol=1e-4)
+    every = torch.cat([m.flatten(1) for m in maps], dim=1)
+    z = (every - every.mean(dim=1, keepdim=True)) / every.std(dim=1, keepdim=True)
+    assert float(plain.responses[0]) == pytest.approx(float(z.max()), rel=1e-4)

@@ -191,3 +191,10 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
     assert not lost.ok or lost.confidence < BELIEVED_CONFIDENCE
     result = follow(frames[1][0])
     assert errors(result, frames[1][2])[0] < 4.0
+
+
+def test_the_same_frame_again_and_again_does_not_raise_the_confidence(monkeypatch):
+    (image, box, _), registrar = sequence(1)[0], truck_registrar()
+    answering(monkeypatch, registrar, [0.6])
+    follow = Follower(registrar, CAMERA)
+    assert max(follow(image, box).confidence for _ in range(5)) <= 0.6

@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from dataclasses import replace
 
 import cv2
@@ -6,7 +7,7 @@ import torch
 import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
-from curvireg_torch.errors import CurviregError, InvalidInputError
+from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -15,7 +16,7 @@ from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
-from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.inputs import ImageItem, check_crop
 from curvireg_torch.registration.result import result_document, used_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
@@ -296,3 +297,34 @@ def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
         assert all(h.covariance is None for h, moved in zip(result.hypotheses, is_moved, strict=True) if not moved)
         restored += is_moved.count(False)
     assert restored > 0
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "message"),
+    [
+        (0.4, 0.4 + 0.9 / 255.0, "one colour"),
+        (0.2, 1.01, r"outside \[0, 1\]"),
+        (-0.01, 0.8, r"outside \[0, 1\]"),
+        (0.4, 0.4 + 2.0 / 255.0, None),
+        (-0.0005, 1.0005, None),
+    ],
+)
+def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, high, message):
+    crop = torch.full((3, 8, 8), low)
+    crop[:, 2:5, 3] = high
+    with pytest.raises(ImageError, match=message) if message else nullcontext():
+        check_crop(crop)
+
+
+@pytest.mark.parametrize(
+    ("size", "given", "box", "expected"),
+    [
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
+        ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
+    ],
+)
+def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
+    item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+    assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected

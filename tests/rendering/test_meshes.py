@@ -1,6 +1,7 @@
 """Unusual meshes and cameras: inside out, doubled, degenerate, in parts, tiny, huge, behind the camera."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError, RenderingError
+from curvireg_torch.rendering import contours as contours_module
 from curvireg_torch.rendering import make_renderer
 
 from .conftest import camera
@@ -106,3 +108,22 @@ def test_a_renderer_that_fails_is_not_replaced() -> None:
 
     with pytest.raises(RenderingError, match="out of memory"):
         cr.render_depth(trimesh.creation.box(), *camera(2), renderer=SimpleNamespace(name="mine", render=fail))
+
+
+def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[int] = []
+    lengths = contours_module._Level.lengths
+
+    def watched(level: Any, *arguments: Any) -> Any:
+        used.append(len(level.edges.faces))
+        return lengths(level, *arguments)
+
+    monkeypatch.setattr(contours_module._Level, "lengths", watched)
+    contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))  # 20 480 faces
+    T = torch.eye(4, dtype=torch.float64)[None]
+    T[0, 2, 3] = 4.0
+    for size in (100, 128, 129, 256, 400):
+        K = torch.tensor([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]], dtype=torch.float64)
+        points = contours.points(T, K, size)
+        assert (points.model.norm(dim=-1)[points.valid] - 1.0).abs().max() < 0.005
+    assert used == [2500, 2500, 8000, 8000, 8000]

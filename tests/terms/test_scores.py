@@ -17,6 +17,7 @@ from curvireg_torch.terms import (
     BoxShape,
     Correlation,
     Repeatability,
+    Whitening,
     box_shapes,
     ledoit_wolf,
     whole_box_shapes,
@@ -110,3 +111,20 @@ def test_whole_box_shapes_are_nan_at_the_border(box, whole):
     shape = whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
     assert bool(shape.isfinite()) == whole
     assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
+
+
+def test_correlation_score_is_an_exponential_of_standard_deviations():
+    score = Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
+    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
+    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
+
+
+def test_whitening_decorrelates():
+    x = sample(4000)
+    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
+    torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
+    torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
+    with pytest.raises(InvalidInputError, match="positive definite"):
+        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
+    with pytest.raises(InvalidInputError, match="covariance"):
+        Whitening(torch.zeros(3), torch.eye(2))

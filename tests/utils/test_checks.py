@@ -21,6 +21,7 @@ from curvireg_torch.utils.checks import (
     check_pose,
     check_positive,
     check_rotation,
+    check_square_pixels,
 )
 
 CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -149,3 +150,11 @@ def test_errors_keep_message_and_subject(name: str) -> None:
         assert (copy.message, copy.subject) == ("unusable; use another", "a.png")
     assert str(error.with_subject("image 3")) == "image 3: unusable; use another"
     assert str(type(error)("unusable")) == "unusable"
+
+
+def test_check_square_pixels_accepts_ten_per_cent() -> None:
+    for ratio in (1.0 / 1.099, 1.0, 1.099):
+        check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
+    for ratio in (1.0 / 1.101, 1.101):
+        with pytest.raises(InvalidInputError, match="square"):
+            check_square_pixels(torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))]))

@@ -10,6 +10,8 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
+from curvireg_torch.evaluation.runner import POSE_SOURCES
+from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
 from curvireg_torch.utils.files import (
     check_writable,
@@ -152,3 +154,11 @@ def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(FileNotFoundError):
         code_digest("no_such_room")
     code_digest.cache_clear()
+
+
+@pytest.mark.parametrize("sources", [cache._SOURCES, POSE_SOURCES])
+def test_code_digests_of_banks_and_results_cover_all_that_decides_them(sources: tuple[str, ...]) -> None:
+    assert {"errors.py", "features", "filters", "geometry", "mesh", "rendering", "terms"} - {"errors.py"} <= set(
+        sources
+    )
+    assert len(code_digest(*sources)) == 16

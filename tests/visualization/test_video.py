@@ -1,13 +1,16 @@
 """The overlay video: contours at the pose, captions, and what is written where OpenCV cannot encode."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from curvireg_torch.data import Video
-from curvireg_torch.errors import LostObjectError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.visualization import OverlayVideo
-from curvireg_torch.visualization.video import annotated_frame
+from curvireg_torch.visualization.video import annotated_frame, caption
 from tests._support.scenes import CAMERA, scene, truck_registrar
 
 LOST = FailedRegistration(LostObjectError("not near the start"))
@@ -36,3 +39,21 @@ def test_overlay_video_has_every_frame(registered, tmp_path):
     assert np.abs(frames[0] - frames[1])[body].max() > 60  # contours, and none
     assert frames[2][body].max() < 30
     assert np.abs(frames[3] - frames[0]).mean() < 12
+
+
+def test_caption_says_how_sure_the_pose_is(registered):
+    for confidence, expected in ((0.95, "likely"), (0.6, "unsure"), (0.4, "no match")):
+        result = replace(registered[1], probabilities=(confidence,))
+        assert caption(result)[0] == f"{expected}, confidence {confidence:.2f}"
+    assert caption(LOST)[0] == "lost"
+    assert caption(FailedRegistration(InvalidInputError("no")))[0] == "failed"
+
+
+def test_overlay_video_warns_without_an_encoder(registered, tmp_path, monkeypatch):
+    image, result = registered
+    monkeypatch.setattr(cv2.VideoWriter, "fourcc", lambda *_: 0x20202020)
+    with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0) as video:
+        with pytest.warns(UserWarning, match="no MPEG-4 encoder"):
+            video.add(image, result)
+        video.add(image, LOST)
+    assert list(tmp_path.iterdir()) == []
