@@ -209,8 +209,9 @@ def add_view(commands: Any) -> None:
 def view(arguments: argparse.Namespace) -> None:
     """Serve the page until Ctrl-C."""
     photos, meshes = ([path] if path else [] for path in (arguments.photo, arguments.mesh))
-    for path in (path for path in photos if path.suffix.lower() == ".csv"):
-        raise InvalidInputError("a table where a photograph is expected; drop a rig file on the page", subject=path)
+    if photos and photos[0].suffix.lower() == ".csv":
+        message = "a table where a photograph is expected; drop a rig file on the page"
+        raise InvalidInputError(message, subject=photos[0])
     check_given(photos, meshes)
     check_viewer("view")
     from ..utils.threads import one_torch_thread

@@ -231,6 +231,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
     from ..evaluation.result_files import write_views
     from ..evaluation.rigs import read_rig, register_rig
+    from ..registration.result import view_in_words
 
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
@@ -243,8 +244,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["views"]:
-            counts = f"prefers the pose by {view['contribution']:.2f}"
-            print(f"{view['name']}: {view['failure'] or counts}")
+            print(f"{view['name']}: {view_in_words(view)}")
     _finish(arguments, document)
     return result.reliable
 

@@ -15,11 +15,10 @@ from ..mesh.edges import simplified
 from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
-from ..rendering.contours import MeshContours
+from ..rendering.contours import LEVELS, MeshContours
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
-# Faces to which larger meshes are simplified for views: at 256 px their surface moves by a small part of a pixel
-VIEW_FACES = 8000
+VIEW_FACES = LEVELS[-1][1]  # to which larger meshes are simplified for views: their contours are those of full size
 EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
 # Distances to step back so that a perspective view approximates parallel projection to a few per mille
 PARALLEL_DISTANCE = 20.0

@@ -62,8 +62,8 @@ MIN_REFINED = 3
 photographs of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
 
 SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
-"""Best distinct views of an exact mesh to which contours are fitted for a moment, and weight of their edge support, for
-which the most promising ones become hypotheses."""
+"""Number of the best distinct views of an exact mesh that get a short contour fit, and weight of the edge support that
+they reach, beside log S, in the choice of those that become hypotheses."""
 
 SAME_BOX_OVERLAP = 0.85
 """Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
@@ -394,13 +394,13 @@ class Registrar:
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True)
 
     def _screened(self, work: _Work, poses: Poses, mask: Tensor | None, count: int) -> Poses:
-        """The ``count`` poses whose rank and edge support after a short fit promise most."""
+        """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
         if len(poses) <= count:
             return poses
         given = (self.describer.contours, work.item.image, work.item.box, poses.cameras, poses.T)
         support = quick_support(*given, margin=self.bank.settings.margin, mask=mask)
-        promise = poses.rank + SCREENING_WEIGHT * support
-        return poses[promise.argsort(descending=True, stable=True)[:count]]
+        score = poses.rank + SCREENING_WEIGHT * support
+        return poses[score.argsort(descending=True, stable=True)[:count]]
 
     def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
         return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)

@@ -393,7 +393,8 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
 
 def used_box(document: Mapping[str, Any]) -> list[float]:
     """The box that a document's pose was computed with: the given one, or the one that replaced it."""
-    return document["corrected_box"] or document["inputs"]["box"]  # type: ignore[no-any-return]
+    box: list[float] = document["corrected_box"] or document["inputs"]["box"]
+    return box
 
 
 def corners(box: Sequence[float]) -> str:
@@ -412,6 +413,13 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
     if (count := document.get("symmetries", 1)) > 1:
         lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
     return lines
+
+
+def view_in_words(view: Mapping[str, Any]) -> str:
+    """Why a photograph of several, one of a document's ``views``, does not count, or how much it does; empty if its
+    pose was set by hand, so that nobody has compared it."""
+    counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"
+    return view["failure"] or counts
 
 
 def verdict(probability: float | None, none: float | None, reliable: bool) -> str:

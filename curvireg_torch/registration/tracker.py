@@ -297,8 +297,7 @@ class Tracker:
 
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
-        self.last_pose = pose.state.T
-        self._poses = [*self._poses[-1:], self.last_pose]
+        self._poses = [*self._poses[-1:], pose.state.T]
         depth = self.renderer.render(pose.state.T, pose.frame.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
         self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
@@ -308,6 +307,11 @@ class Tracker:
         problem, points = pose.frame.problem, pose.state.points
         measured = problem.measured_edges(pose.state, SEARCH_RADII[-1])
         return pose_covariance(measured, points, pose.state.T, problem.K, self.centre, radius=self.radius)[0][0]
+
+    @property
+    def last_pose(self) -> Tensor:
+        """(1, 4, 4) of the last frame."""
+        return self._poses[-1]
 
     def predictions(self) -> list[Tensor]:
         """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-__all__ = ["BOX", "CREDIT", "PHOTO", "VIEW", "cup"]
+__all__ = ["BOX", "CREDIT", "FIELD_OF_VIEW", "PHOTO", "cup"]
 
 PHOTO = Path(__file__).parent / "static" / "coffee.jpg"
 CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
 BOX = (172.0, 18.0, 409.0, 308.0)
 """Of the cup, in px."""
-VIEW = 30.0
-"""Horizontal field of view in degrees, as the ellipses in the photograph tell it; nobody has measured it."""
+FIELD_OF_VIEW = 30.0
+"""Horizontal, in degrees: an estimate from the ellipses in the photograph."""
 
 # Radius and height in mm from the middle of the foot to the rim, and from the rim to the middle of the coffee
 OUTSIDE = [(0.0, 0.0), (16.4, 0.0), (18.6, 4.3), (20.3, 14.2), (23.6, 28.5), (30.8, 46.3), (31.5, 64.1), (31.0, 71.2)]

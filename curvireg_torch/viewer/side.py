@@ -10,7 +10,7 @@ from ..errors import MAX_VIEWER_FACES
 from ..evaluation.store import to_json
 from ..geometry import Camera, rotation_error
 from ..mesh import mesh_unit, mesh_up
-from ..registration.result import pose_in_words, remarks, verdict
+from ..registration.result import pose_in_words, remarks, verdict, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot
@@ -107,9 +107,8 @@ class Answers:
         numbers = {"score": document["score"], "edge support": document["edge_support"]}
         lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
         if shot.view is not None:
-            for row in document["views"]:
-                counts = "" if row["similarity"] is None else f"prefers the pose by {row['contribution']:.2f}"
-                lines += [f"{self.session.name(row['photo'])}: {said}" for said in [row["failure"] or counts] if said]
+            told = [(self.session.name(view["photo"]), view_in_words(view)) for view in document["views"]]
+            lines += [f"{name}: {words}" for name, words in told if words]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
         self.repairs.clear()

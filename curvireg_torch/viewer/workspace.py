@@ -229,7 +229,7 @@ class Workspace:
         options: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
         self._before_sample = self._before_sample or session.options
         session.close()
-        session.options = replace(session.options, **options, camera=None, guess=sample.VIEW)
+        session.options = replace(session.options, **options, camera=None, guess=sample.FIELD_OF_VIEW)
         shot = session.open_photo(photo, sample.BOX)
         assert shot.photo is not None
         shot.photo = replace(shot.photo, notes=(sample.CREDIT,))

@@ -119,7 +119,8 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         index, zero = np.arange(len(faces), dtype=np.int32), np.zeros(len(faces), np.float32)
         corners = [colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))]
         rgb = np.stack(corners, axis=1)
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)  # glTF's vertex colours; sRGB before
+    # From sRGB: the vertex colours of glTF are linear.
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     vertex_colors = (linear.reshape(-1, 3) * 255).round().astype(np.uint8)
     plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=vertex_colors)
     return plain
