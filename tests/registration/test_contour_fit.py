@@ -20,11 +20,14 @@ from curvireg_torch.registration.contour_fit import (
     EdgeField,
     ObjectMask,
     contour_support,
+    full_size_problem,
     inside_photographs,
+    quick_support,
 )
 from curvireg_torch.registration.least_squares import apply_twist, project
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
+from curvireg_torch.terms import crop_regions
 from tests.registration.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
@@ -324,3 +327,21 @@ def test_trustworthy_depends_on_support_or_gain():
 def test_fit_rejects_bad_input(start, options, message):
     with pytest.raises(InvalidInputError, match=message):
         fitted(noise(), start, **options)
+
+
+def test_quick_support_reaches_far_and_counts_the_mask():
+    """At a quarter of the size, edges are found from 16 px beside them, which a fit at full size does not reach."""
+    image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
+    crop = full_size_problem(contours, [image], BOX[None], K[None], FIRST, 0.1)[2]
+    focal, depth = float(crop.K[0, 0, 0]), float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
+    beside = CUBE_POSE.clone()
+    beside[0, 3] += 16.0 / focal * depth
+    poses, same = torch.stack([CUBE_POSE, beside]), {"margin": 0.1}
+    right, far = quick_support(contours, image, BOX, K.expand(2, 3, 3), poses, mask=None, **same).tolist()
+    assert far > 0.95 * right
+    inside = crop_regions([image], BOX[None, None], size=64, margin=0.1)[0, :, :1].clamp(0, 1)
+    with_mask, against = (
+        float(quick_support(contours, image, BOX, K[None], CUBE_POSE[None], mask=mask, **same))
+        for mask in (inside, 1.0 - inside)
+    )
+    assert with_mask > 1.5 * against
