@@ -330,12 +330,12 @@ def test_fit_rejects_bad_input(start, options, message):
 
 
 def test_quick_support_reaches_far_and_counts_the_mask():
-    """At a quarter of the size, edges are found from 16 px beside them, which a fit at full size does not reach."""
+    """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size does not reach."""
     image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
     crop = full_size_problem(contours, [image], BOX[None], K[None], FIRST, 0.1)[2]
     focal, depth = float(crop.K[0, 0, 0]), float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
     beside = CUBE_POSE.clone()
-    beside[0, 3] += 16.0 / focal * depth
+    beside[0, 3] += 28.0 / focal * depth
     poses, same = torch.stack([CUBE_POSE, beside]), {"margin": 0.1}
     right, far = quick_support(contours, image, BOX, K.expand(2, 3, 3), poses, mask=None, **same).tolist()
     assert far > 0.95 * right

@@ -10,6 +10,7 @@ from curvireg_torch import Registration, rotation_error, rotation_from_viewpoint
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
+from curvireg_torch.registration import rig as rig_module
 from curvireg_torch.registration.rig import Rig
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
@@ -68,7 +69,14 @@ def test_pose_in_the_world_and_in_each_photograph(easy):
         assert view.similarity > 0.6
     torch.testing.assert_close(easy.projection[0], easy.views[0].T_cam_from_model)
     assert easy.confidence > 0.9
-    assert len(easy.probabilities) == len(easy.hypotheses)
+    assert len(easy.probabilities) == len(easy.hypotheses) > 1
+
+
+def test_photographs_prefer_a_pose_without_rivals_by_all_points(monkeypatch):
+    monkeypatch.setattr(rig_module, "JUDGED_CANDIDATES", 1)
+    alone = registered(*rig_of(EASY))
+    assert len(alone.hypotheses) == 1
+    assert [view.contribution for view in alone.views] == pytest.approx([5.0] * 3)
 
 
 def test_half_turns_in_doubt_are_decided_together():
