@@ -24,7 +24,7 @@ BOP = (
     "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | Acc 30° | s/object",
     "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean distance of model "
     "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; unoccluded: at least 95 % "
-    "visible. Box and camera matrix are given.",
+    "visible. Box and camera matrix are given. s/object as above.",
 )
 
 
