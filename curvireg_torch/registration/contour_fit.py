@@ -2,26 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..filters.operations import central_gradient, fill_missing, smooth
-from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..rendering.contours import ContourPoints, MeshContours
-from ..terms import crop_regions
 from ..utils.checks import (
     as_boxes,
     as_numbers,
     check_camera_matrix,
     check_photograph,
-    check_pixels,
     check_pose,
     check_tensor,
 )
+from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
     Measurements,
     apply_twist,
@@ -32,15 +28,12 @@ from .least_squares import (
     step_fraction,
 )
 
-CROP_SIZE = 256
-"""Side of the crop in px; the first rounds use half of it."""
-
 QUARTER_SIZE_RADII = (6.0, 4.0)
 FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
 """Search radius for edges in px, one a round: from all starts and then from the best at half size, and at full size."""
 
-HALF_SIZE_DENSITY = 0.5
-"""Contour points at half size, as a fraction of those at full size."""
+SMALL_CROP_DENSITY = 0.5
+"""Contour points in smaller crops, as a fraction of those at full size."""
 
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
@@ -60,123 +53,6 @@ STALE_SHIFT = 0.3
 
 EDGE_DAMPING = 1e-2
 """Levenberg-Marquardt: fraction of the diagonal of J^T W J that is added to it."""
-
-MASK_DISTANCE = 6.0 / 256.0
-"""Distance from an edge at which the mask is read on both sides, as a fraction of the crop's side: about 1.5 px of the
-learned mask."""
-
-MASK_TRUST = 0.7
-"""Weight that an edge loses where the mask contradicts it."""
-
-OUTLINE_WEIGHT = 2.0
-"""Weight of the outline relative to creases and inner contours, which prints and reflections imitate."""
-
-
-class EdgeField:
-    """Edges of image crops (B, C, S, S) in [0, 1]; the strongest of several channels counts.
-
-    ``inside`` (B, 1, S, S), if given, is 0 outside the photograph: there are no edges, though crops repeat its border.
-    """
-
-    def __init__(self, crops: Tensor, inside: Tensor | None = None) -> None:
-        gx, gy = central_gradient(smooth(crops, 1.0))
-        self._inside = torch.ones_like(crops[:, :1]) if inside is None else inside.to(crops)
-        self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2) * self._inside
-        energy, area = self._gradient.square().sum(dim=(1, 2, 3)), self._inside.sum(dim=(1, 2, 3))
-        self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
-
-    def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
-        """Strength of the image gradient across a contour, at offsets along its normals.
-
-        With g the gradient, m the crop's root mean square gradient and c = ``|n . g| / |g|``, r = ``|n . g| c^4`` gives
-        the strength r / (r + m). It is 0 outside the crop; c^4 is one half where n and g differ by 33 degrees.
-
-        Args:
-            uv, normals: (N, P, 2) pixels of the crops and unit vectors.
-            offsets: (L,) px along the normals.
-            image_index: (N,) the crop of each pose.
-
-        Returns:
-            (N, P, L) float64 in [0, 1).
-        """
-        gradient = _sampled_lines(self._gradient, uv, normals, offsets, image_index)
-        gx, gy = gradient[:, 0::2], gradient[:, 1::2]
-        nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
-        across = (gx * nx + gy * ny).abs()
-        cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
-        r = (across * cosine.square().square()).amax(dim=1)
-        return (r / (r + self._level[image_index, None, None])).double()
-
-    def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
-        """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but those outside the
-        photograph; but then half of the points at least."""
-        S = self._inside.shape[-1]
-        x, y = uv.round().long().clamp(0, S - 1).unbind(-1)
-        here = valid & (self._inside[image_index[:, None], 0, y, x] > 0)
-        enough = 2 * here.sum(dim=1, keepdim=True) >= valid.sum(dim=1, keepdim=True)
-        return torch.where(enough, here, valid)
-
-
-class ObjectMask:
-    """Probabilities (B, 1, s, s) that pixels of image crops belong to the object."""
-
-    def __init__(self, probability: Tensor) -> None:
-        self._probability = probability.detach().cpu().float()
-
-    def weights(self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int) -> Tensor:
-        """How well edges at offsets along the normals of contour points agree with the mask.
-
-        With p and q the probabilities 6/256 of the crop's side inward and outward of an edge, an edge of the outline
-        has weight 2 (0.3 + 0.7 max(p - q, 0)), one within the object 0.3 + 0.7 min(p, q).
-
-        Args:
-            uv: (N, P, 2) px of the points in crops of ``size`` px.
-            offsets: (L,) px along the normals.
-            image_index: (N,) the crop of each pose.
-
-        Returns:
-            (N, P, L) float64, at most 2.
-        """
-        aside = MASK_DISTANCE * size
-        at = torch.cat([offsets - aside, offsets + aside])
-        probability = _sampled_lines(
-            self._probability, uv, points.normals, at, image_index, size=size, padding="border"
-        )
-        inside, outside = probability[:, 0].chunk(2, dim=-1)
-        outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
-        is_outline = points.outline[..., None]
-        agreement = 1.0 - MASK_TRUST + MASK_TRUST * torch.where(is_outline, outline, within)
-        return agreement.double() * self.largest_weights(points)[..., None]
-
-    @staticmethod
-    def largest_weights(points: ContourPoints) -> Tensor:
-        """(N, P) float64 weights of edges that agree with the mask: 2 for the outline, else 1."""
-        return torch.where(points.outline, OUTLINE_WEIGHT, 1.0).double()
-
-
-def _sampled_lines(
-    pictures: Tensor,
-    uv: Tensor,
-    normals: Tensor,
-    offsets: Tensor,
-    image_index: Tensor,
-    *,
-    size: int | None = None,
-    padding: str = "zeros",
-) -> Tensor:
-    """(N, C, P, L) float32 values of pictures (B, C, S, S) at offsets (L,) px from points (N, P, 2) along normals.
-
-    ``size`` is the side of the crop in px, to which points and offsets refer, if it is not S.
-    """
-    scale = 2.0 / (size or pictures.shape[-1])
-    start, along = (scale * uv + (0.5 * scale - 1.0)).float(), (scale * normals).float()
-    grid = torch.addcmul(start[:, :, None], offsets.float()[:, None], along[:, :, None])
-    out = grid.new_empty(len(uv), pictures.shape[1], *grid.shape[1:3])
-    for b in image_index.unique().tolist():  # an expanded picture is not copied for every pose
-        mine = (image_index == b).nonzero()[:, 0]
-        picture = pictures[b].expand(len(mine), -1, -1, -1)
-        out[mine] = F.grid_sample(picture, grid[mine], padding_mode=padding, align_corners=False)
-    return out
 
 
 @dataclass(frozen=True)
@@ -208,6 +84,19 @@ class ContourProblem:
     size: int
     mask: ObjectMask | None = None
     density: float = 1.0
+
+    @classmethod
+    def of(
+        cls, contours: MeshContours, crops: EdgeCrops, K: Tensor, image_index: Tensor | None = None, *, factor: int = 1
+    ) -> "ContourProblem":
+        """The problem in ``crops`` whose sides are smaller by a ``factor``, with cameras ``K`` (N, 3, 3) of the whole
+        photographs ``image_index`` (N,), by default the first."""
+        index = torch.zeros(len(K), dtype=torch.long) if image_index is None else image_index
+        shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
+        shrink[:2, 2] = 0.5 / factor - 0.5
+        K = shrink @ crops.transforms[index] @ K
+        density = 1.0 if factor == 1 else SMALL_CROP_DENSITY
+        return cls(contours, crops.edges(factor), index, K, CROP_SIZE // factor, crops.mask, density)
 
     @property
     def centre(self) -> Tensor:
@@ -310,9 +199,6 @@ class ContourProblem:
         d = distance.gather(-1, index)
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
         return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
-
-
-Problem = TypeVar("Problem", bound=ContourProblem)
 
 
 def _offsets(radius: float) -> Tensor:
@@ -423,14 +309,28 @@ def fit_contours(
     if finish is not None and not finish >= 1:
         raise InvalidInputError(f"finish: expected a whole number >= 1 or None, got {finish}")
     T0 = starts.detach().cpu().double()
-    if (N := len(T0)) == 0:
+    if len(T0) == 0:
         none = T0.new_zeros(0)
         return ContourFit(T0, T0.new_zeros(0, 6, 6), none, none, none.long())
-    crops, inside, full = full_size_problem(contours, images, boxes, K, image_index, margin)
     if object_mask is not None:
         check_tensor(object_mask, "object_mask", (len(images), 1, None, None))
-        full = replace(full, mask=ObjectMask(object_mask))
-    half, quarter = (smaller_problem(full, crops, inside, factor) for factor in (2, 4))
+    crops = EdgeCrops.cut(images, boxes, margin, object_mask)
+    return fit_to_edges(contours, crops, K, T0, image_index, finish=finish, wide_angles=wide_angles)
+
+
+def fit_to_edges(
+    contours: MeshContours,
+    crops: EdgeCrops,
+    K: Tensor,
+    T0: Tensor,
+    image_index: Tensor,
+    *,
+    finish: int | None = None,
+    wide_angles: Sequence[float] = (),
+) -> ContourFit:
+    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras ``K`` (N, 3, 3)."""
+    N = len(T0)
+    full, half, quarter = (ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2, 4))
     before, weighted_before = half.supports(half.state(T0))
     wide = _turned(T0, half.centre, wide_angles)
     every = torch.arange(N).repeat_interleave(wide.shape[1])
@@ -463,73 +363,18 @@ def fit_contours(
 
 
 @torch.no_grad()
-def quick_support(
-    contours: MeshContours, image: Tensor, box: Tensor, K: Tensor, T: Tensor, *, margin: float, mask: Tensor | None
-) -> Tensor:
-    """(N,) edge support, with the weights of the ``mask``, that poses ``T`` (N, 4, 4) with cameras ``K`` (N, 3, 3)
-    reach by a short fit at a quarter of the size; it tells in a tenth of the time which of them are worth a fit."""
-    crops, inside, full = full_size_problem(
-        contours, [image], box[None], K, torch.zeros(len(T), dtype=torch.long), margin
-    )
-    quarter = smaller_problem(replace(full, mask=None if mask is None else ObjectMask(mask)), crops, inside, 4)
+def quick_support(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor) -> Tensor:
+    """(N,) edge support, with the weights of the mask, that poses ``T`` (N, 4, 4) with cameras ``K`` (N, 3, 3) reach by
+    a short fit at a quarter of the size; it tells in a tenth of the time which of them are worth a fit."""
+    quarter = ContourProblem.of(contours, crops, K, factor=4)
     return quarter.supports(quarter.descend(quarter.state(T), QUARTER_SIZE_RADII))[1]
 
 
 @torch.no_grad()
-def contour_support(
-    contours: MeshContours,
-    images: Tensor | Sequence[Tensor],
-    boxes: Tensor,
-    camera_matrices: Tensor,
-    poses: Tensor,
-    *,
-    image_index: Tensor | None = None,
-    margin: float = 0.1,
-) -> Tensor:
-    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of fitted ones.
-
-    Arguments and errors are those of :func:`fit_contours`, with ``poses`` in place of ``starts``.
-    """
-    images, boxes, K, image_index = _checked(images, boxes, camera_matrices, poses, image_index)
-    if len(poses) == 0:
-        return torch.zeros(0, dtype=torch.float64)
-    _, _, problem = full_size_problem(contours, images, boxes, K, image_index, margin)
-    return problem.edge_support(problem.state(poses.detach().cpu().double()))
-
-
-def full_size_problem(
-    contours: MeshContours,
-    images: Sequence[Tensor],
-    boxes: Tensor,
-    K: Tensor,
-    image_index: Tensor,
-    margin: float,
-) -> tuple[Tensor, Tensor, ContourProblem]:
-    """(B, C, S, S) crops without missing pixels, (B, 1, S, S) 1 where they show the photograph, and the problem."""
-    crops = fill_missing(crop_regions(images, boxes[:, None], size=CROP_SIZE, margin=margin)[:, 0].float())
-    K = crop_transforms(square_boxes(boxes, margin), CROP_SIZE).double()[image_index] @ K
-    check_pixels(crops, "of the box")
-    inside = inside_photographs(images, boxes, CROP_SIZE, margin)
-    return crops, inside, ContourProblem(contours, EdgeField(crops, inside), image_index, K, CROP_SIZE)
-
-
-def smaller_problem(full: Problem, crops: Tensor, inside: Tensor, factor: int) -> Problem:
-    """The problem in crops whose sides are smaller by a factor."""
-    shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
-    shrink[:2, 2] = 0.5 / factor - 0.5
-    edges = EdgeField(F.avg_pool2d(crops, factor), F.avg_pool2d(inside, factor).floor())
-    return replace(full, edges=edges, K=shrink @ full.K, size=full.size // factor, density=HALF_SIZE_DENSITY)
-
-
-def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margin: float) -> Tensor:
-    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes show their photograph, 0 where they repeat its
-    border."""
-    A = image_transforms(square_boxes(boxes, margin), size)
-    at = torch.arange(size, dtype=A.dtype)
-    x, y = (A[:, k, k, None] * at + A[:, k, 2, None] for k in (0, 1))
-    ends = torch.tensor([[image.shape[-1], image.shape[-2]] for image in images], dtype=A.dtype) - 0.5
-    across, down = ((p >= -0.5) & (p <= end[:, None]) for p, end in zip((x, y), ends.unbind(-1), strict=True))
-    return (down[:, None, :, None] & across[:, None, None, :]).float()
+def contour_support(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor) -> Tensor:
+    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of fitted ones."""
+    problem = ContourProblem.of(contours, crops, K, image_index)
+    return problem.edge_support(problem.state(T))
 
 
 def _turned(T: Tensor, centre: Tensor, angles: Sequence[float], *, roll: float | None = None) -> Tensor:

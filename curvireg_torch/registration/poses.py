@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
-from .contour_fit import ContourFit, contour_support, fit_contours
+from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges
+from .edges import EdgeCrops
 from .result import Hypothesis
 from .texture_fit import fit_texture, turned
 
@@ -153,55 +154,27 @@ def best_views(
     return view, log[view] - log.max()
 
 
-def fit_poses(
-    describer: ViewDescriber,
-    images: Sequence[Tensor],
-    poses: Poses,
-    boxes: Tensor,
-    object_mask: Tensor | None = None,
-    **options: Any,
-) -> Poses:
-    """Fit the contours of poses in images with ``boxes`` (B, 4), see :func:`fit_contours` and its ``options``."""
-    fit = fit_contours(
-        describer.contours,
-        images,
-        boxes,
-        poses.cameras,
-        poses.T,
-        image_index=poses.crop_index,
-        margin=describer.settings.margin,
-        object_mask=object_mask,
-        **{"finish": FINISHED_FITS, **options},
-    )
-    return poses.with_fit(fit, describer.centre)
+def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
+    """Fit the contours of poses to crops, see :func:`fit_contours` and its ``options``."""
+    given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+    return poses.with_fit(fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre)
 
 
-def fit_texture_of(
-    describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor, h: int
-) -> Poses | None:
+def fit_texture_of(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, h: int) -> Poses | None:
     """Pose ``h``, fitted to the colours of its mesh too, see :func:`fit_texture`; None without colours or fit."""
     if not describer.draws_colours:
         return None
     one = poses[torch.tensor([h])]
-    b = int(one.crop_index)
-    fit = fit_texture(
-        describer.draw,
-        describer.renderer,
-        describer.contours,
-        [images[b]],
-        boxes[b : b + 1],
-        one.cameras,
-        turned(one.fit, describer.centre),
-        image_index=torch.zeros(1, dtype=torch.long),
-        margin=describer.settings.margin,
-    )
+    problem = ContourProblem.of(describer.contours, crops, one.cameras, one.crop_index)
+    photograph = crops.crops[int(one.crop_index)]
+    starts = turned(one.fit, describer.centre)
+    fit = fit_texture(describer.draw, describer.renderer, replace(problem, mask=None), photograph, starts)
     return None if fit is None else one.with_fit(fit, describer.centre)
 
 
-def with_edge_support(describer: ViewDescriber, images: Sequence[Tensor], poses: Poses, boxes: Tensor) -> Poses:
+def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Poses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    given = (describer.contours, images, boxes, poses.cameras, poses.T)
-    support = contour_support(*given, image_index=poses.crop_index, margin=describer.settings.margin)
+    support = contour_support(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
     return replace(poses, edge_support=support)
 
 

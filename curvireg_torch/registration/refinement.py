@@ -11,6 +11,7 @@ from ..errors import InvalidInputError, LostObjectError
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .confidence import are_near, is_calibrated, refinement_confidence
+from .edges import EdgeCrops
 from .inputs import MIN_BOX_SIDE, ImageItem, check_crop, image_items
 from .poses import (
     Poses,
@@ -94,9 +95,10 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     views = torch.tensor([nearest_view(registrar, R) for R in poses.rotation])
     poses = replace(poses, crop_index=each, view=views)
     mask = registrar.object_mask(query, [item] * len(T))
-    poses = fit_poses(describer, images, poses, boxes, mask, wide_angles=WIDE_ANGLES)
+    crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
+    poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
     best = pose_scores(pose_features(describer, descriptors, poses), exact=True).argmax()[None]
-    if (fitted := fit_texture_of(describer, images, poses, boxes, int(best))) is not None:
+    if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
         poses = poses.replaced(best, fitted)
     evidence = pose_features(describer, descriptors, poses)
     scores = pose_scores(evidence, exact=True)

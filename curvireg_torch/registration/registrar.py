@@ -34,6 +34,7 @@ from .confidence import (
 )
 from .contour_fit import quick_support
 from .detection import Detector, detect
+from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
 from .poses import (
     SCORE_WEIGHTS,
@@ -82,7 +83,8 @@ _SHAPE_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class _Work:
-    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's."""
+    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's, and ``crops`` for
+    contour fits, if there are any."""
 
     item: ImageItem
     query: QueryFeatures
@@ -91,6 +93,7 @@ class _Work:
     limits: Limits | None
     exact: bool
     symmetries: Tensor | None
+    crops: EdgeCrops | None
 
 
 class Registrar:
@@ -332,8 +335,7 @@ class Registrar:
             ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
         work = self._rank(item, query, ranking)
-        mask = self.object_mask(query, [item]) if self.pipeline.contours else None
-        starts, outside = self._starts(work, mask)
+        starts, outside = self._starts(work)
         poses = starts
         if self.pipeline.search:
             self.report_progress("search")
@@ -341,13 +343,13 @@ class Registrar:
             poses = self._in_box(work, rotation, poses.distance, poses.view, poses.rank)
             if work.limits is not None:
                 poses = work.limits.moved_inside(poses)
-        if self.pipeline.contours:
+        if work.crops is not None:
             self.report_progress("contours")
-            poses = fit_poses(self.describer, [item.image], poses, item.box[None], mask)
+            poses = fit_poses(self.describer, work.crops, poses)
         features = self._features(work, poses)
-        if self.pipeline.contours and work.exact:
-            poses, features = self._fitted_again(work, poses, features, outside, mask)
-            poses, features = self._with_texture(work, poses, features, outside)
+        if work.crops is not None and work.exact:
+            poses, features = self._fitted_again(work, work.crops, poses, features, outside)
+            poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
@@ -356,8 +358,8 @@ class Registrar:
             # Poses that merged, or whose fit is not trusted, go back to the views that they started from.
             back = (~keep).nonzero()[:, 0]
             restored = starts[back]
-            if self.pipeline.contours:
-                restored = with_edge_support(self.describer, [item.image], restored, item.box[None])
+            if work.crops is not None:
+                restored = with_edge_support(self.describer, work.crops, restored)
             poses = poses.replaced(back, restored)
             features = features.index_copy(0, back, self._features(work, restored))
         return self._result(work, poses, features, distinct, outside)
@@ -369,20 +371,25 @@ class Registrar:
             ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
         exact = self.is_exact(with_camera=item.camera_matrix is not None)
         symmetries = self.symmetries_of(exact=exact)
-        return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries)
+        crops = None
+        if self.pipeline.contours:
+            mask = self.object_mask(query, [item])
+            crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
+        return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries, crops)
 
-    def _starts(self, work: _Work, mask: Tensor | None) -> tuple[Poses, Tensor]:
+    def _starts(self, work: _Work) -> tuple[Poses, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: the last one may lie outside the limits.
 
         That is the best view outside; it is never reported, and tells whether the limits are wrong.
         """
         count = max(MIN_REFINED, self.pipeline.hypotheses)
-        screened = max(SCREENED_VIEWS, count) if self.pipeline.contours and work.exact else count
+        screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
         view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
         poses = self._of_views(work, view, rank)
         if work.limits is not None:
             poses = work.limits.moved_inside(poses)
-        poses = self._screened(work, poses, mask, count)
+        if work.crops is not None and len(poses) > count:
+            poses = self._screened(work.crops, poses, count)
         outside = torch.zeros(len(poses), dtype=torch.bool)
         if work.limits is None:
             return poses, outside
@@ -393,13 +400,9 @@ class Registrar:
         other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True)
 
-    def _screened(self, work: _Work, poses: Poses, mask: Tensor | None, count: int) -> Poses:
+    def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
-        if len(poses) <= count:
-            return poses
-        given = (self.describer.contours, work.item.image, work.item.box, poses.cameras, poses.T)
-        support = quick_support(*given, margin=self.bank.settings.margin, mask=mask)
-        score = poses.rank + SCREENING_WEIGHT * support
+        score = poses.rank + SCREENING_WEIGHT * quick_support(self.describer.contours, crops, poses.cameras, poses.T)
         return poses[score.argsort(descending=True, stable=True)[:count]]
 
     def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
@@ -429,20 +432,22 @@ class Registrar:
         return pose_features(self.describer, work.descriptors, poses, appearance)
 
     def _fitted_again(
-        self, work: _Work, poses: Poses, features: Tensor, outside: Tensor, mask: Tensor | None
+        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose again from where it is, and keep the result if it has a higher score."""
         best = _best_inside(features, outside)
-        fitted = fit_poses(self.describer, [work.item.image], poses[best], work.item.box[None], mask)
+        fitted = fit_poses(self.describer, crops, poses[best])
         new = self._features(work, fitted)
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features
         return self._replaced(work, poses, features, best, fitted, new)
 
-    def _with_texture(self, work: _Work, poses: Poses, features: Tensor, outside: Tensor) -> tuple[Poses, Tensor]:
+    def _with_texture(
+        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    ) -> tuple[Poses, Tensor]:
         """Fit the best pose to the mesh's colours as well."""
         best = _best_inside(features, outside)
-        fitted = fit_texture_of(self.describer, [work.item.image], poses, work.item.box[None], int(best))
+        fitted = fit_texture_of(self.describer, crops, poses, int(best))
         if fitted is None:
             return poses, features
         return self._replaced(work, poses, features, best, fitted, self._features(work, fitted))

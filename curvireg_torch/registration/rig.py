@@ -10,26 +10,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
-from ..filters.operations import fill_missing
 from ..geometry import rotation_error
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
-from ..geometry.crops import box_iou, crop_transforms, square_boxes
+from ..geometry.crops import box_iou
 from ..rendering.contours import ContourPoints
 from ..terms import Appearance, QueryFeatures, crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
-from .contour_fit import (
-    CROP_SIZE,
-    FIRST_RADII,
-    FULL_SIZE_RADII,
-    QUARTER_SIZE_RADII,
-    ContourProblem,
-    ContourState,
-    EdgeField,
-    ObjectMask,
-    inside_photographs,
-    smaller_problem,
-)
+from .contour_fit import FIRST_RADII, FULL_SIZE_RADII, QUARTER_SIZE_RADII, ContourProblem, ContourState
+from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
 from .least_squares import Measurements, pose_covariance
 from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
@@ -115,11 +104,9 @@ class RigPhotograph:
     K: Tensor
     size: tuple[int, int]
     box: Tensor
-    crop: Tensor
-    inside: Tensor
+    crops: EdgeCrops
     query: QueryFeatures
     descriptor: Tensor
-    mask: Tensor | None
     result: Registration
 
     @staticmethod
@@ -129,22 +116,18 @@ class RigPhotograph:
         box = item.box.double() if result.corrected_box is None else result.corrected_box
         settings, boxes, image = registrar.bank.settings, box.float()[None], item.image.expand(3, -1, -1)
         assert item.camera_matrix is not None
-
-        def crop(size: int) -> Tensor:
-            return crop_regions([image], boxes[:, None], size=size, margin=settings.margin)[:, 0].float()
-
-        query = registrar.matcher.features(crop(settings.image_size).to(registrar.bank.device))
+        crop = crop_regions([image], boxes[:, None], size=settings.image_size, margin=settings.margin)[:, 0].float()
+        query = registrar.matcher.features(crop.to(registrar.bank.device))
+        mask = registrar.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
             camera=camera,
             K=item.camera_matrix.double(),
             size=item.size,
             box=box,
-            crop=fill_missing(crop(CROP_SIZE)),
-            inside=inside_photographs([image], boxes, CROP_SIZE, settings.margin),
+            crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
             descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1)[0],
-            mask=registrar.object_mask(query, [replace(item, box=boxes[0])]),
             result=result,
         )
 
@@ -287,21 +270,19 @@ class Rig:
     @cached_property
     def problems(self) -> list[RigProblem]:
         """One pose in all photographs: at full size, half of it, and a quarter."""
-        photographs, settings = self.photographs, self.registrar.bank.settings
-        crops, inside = (torch.cat([getattr(p, name) for p in photographs]) for name in ("crop", "inside"))
-        squares = square_boxes(torch.stack([p.box for p in photographs]).float(), settings.margin)
-        K = crop_transforms(squares, CROP_SIZE).double() @ torch.stack([p.K for p in photographs])
-        masks = [p.mask for p in photographs if p.mask is not None]
-        mask = ObjectMask(torch.cat(masks)) if masks else None
-        index = torch.arange(len(photographs))
-        full = RigProblem(
-            *(self.describer.contours, EdgeField(crops, inside), index, K, CROP_SIZE, mask),
-            axes=self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT,
-            group=torch.zeros_like(index),
-            alone=self.cameras,
-            root=torch.zeros(len(index), 6, 6, dtype=torch.float64),
-        )
-        return [full, *(smaller_problem(full, crops, inside, factor) for factor in (2, 4))]
+        crops = EdgeCrops.cat([p.crops for p in self.photographs])
+        K, index = torch.stack([p.K for p in self.photographs]), torch.arange(len(self.photographs))
+        each = (ContourProblem.of(self.describer.contours, crops, K, index, factor=factor) for factor in (1, 2, 4))
+        return [
+            RigProblem(
+                **vars(problem),
+                axes=self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT,
+                group=torch.zeros_like(index),
+                alone=self.cameras,
+                root=torch.zeros(len(index), 6, 6, dtype=torch.float64),
+            )
+            for problem in each
+        ]
 
     def tied(self, problem: RigProblem, T: Tensor) -> tuple[RigProblem, Tensor]:
         """The problem of M world poses, and their poses (M V, 4, 4) in the cameras."""

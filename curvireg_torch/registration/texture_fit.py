@@ -4,7 +4,7 @@ The contours of a can do not determine its rotation about the axis; its label do
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import cv2
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..rendering import DepthRenderer
-from ..rendering.contours import ContourPoints, MeshContours
-from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem, full_size_problem
+from ..rendering.contours import ContourPoints
+from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem
 from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
 
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
@@ -60,14 +60,9 @@ def surface_corners(
 def fit_texture(
     draw: Draw,
     renderer: DepthRenderer,
-    contours: MeshContours,
-    images: Sequence[Tensor],
-    boxes: Tensor,
-    camera_matrices: Tensor,
+    problem: ContourProblem,
+    photograph: Tensor,
     starts: Tensor,
-    *,
-    image_index: Tensor,
-    margin: float,
 ) -> ContourFit | None:
     """Fit one pose to the mesh's colours and to contours together.
 
@@ -77,11 +72,10 @@ def fit_texture(
     and enough of them, and the edge support is as before.
 
     ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
-    ``starts`` (N, 4, 4) are the pose whose contours are fitted, and :func:`turned` ones; the other arguments are those
-    of :func:`fit_contours`, for one photograph.
+    ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S, S) its crop; ``starts``
+    (N, 4, 4) are the pose whose contours are fitted, and :func:`turned` ones.
     """
-    crops, _, problem = full_size_problem(contours, images, boxes, camera_matrices, image_index, margin)
-    texture = _TextureRounds(draw, renderer, problem, _as_array(crops[0]))
+    texture = _TextureRounds(draw, renderer, problem, _as_array(photograph))
     support = problem.edge_support(problem.state(starts[:1]))
     rounds = [texture.round(start, *FAR_ROUND) for start in starts.split(1)]
     coarse = max((one for one in rounds if one is not None), key=lambda one: one.after, default=None)

@@ -21,7 +21,8 @@ from ..rendering import DepthRenderer
 from ..rendering.contours import MeshContours
 from ..terms import crop_regions
 from .confidence import RELIABLE, tracking_confidence
-from .contour_fit import ContourProblem, ContourState, EdgeField, inside_photographs
+from .contour_fit import ContourProblem, ContourState
+from .edges import EdgeField, inside_photographs
 from .least_squares import (
     INLIER_SCALE,
     Measurements,

@@ -26,6 +26,7 @@ from curvireg_torch.registration.confidence import (
     registration_confidence,
 )
 from curvireg_torch.registration.contour_fit import contour_support
+from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar
 
@@ -174,8 +175,8 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
         assert h.score == pytest.approx(float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5)
         T, K = h.projection
         assert h.distance == pytest.approx(float((T[:3, :3] @ describer.centre + T[:3, 3]).norm()))
-        margin = describer.settings.margin
-        support = contour_support(describer.contours, image[None], box[None], K[None], T[None], margin=margin)
+        crops = EdgeCrops.cut([image], box[None], describer.settings.margin)
+        support = contour_support(describer.contours, crops, K[None], T[None], torch.tensor([0]))
         assert h.edge_support == pytest.approx(float(support), abs=0.03)
         assert h.evidence["edge_support"] == h.edge_support
 

@@ -14,16 +14,8 @@ from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
-from curvireg_torch.registration.contour_fit import (
-    ContourProblem,
-    ContourState,
-    EdgeField,
-    ObjectMask,
-    contour_support,
-    full_size_problem,
-    inside_photographs,
-    quick_support,
-)
+from curvireg_torch.registration.contour_fit import ContourProblem, ContourState, contour_support, quick_support
+from curvireg_torch.registration.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
 from curvireg_torch.registration.least_squares import apply_twist, project
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
@@ -227,7 +219,8 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     both = fit_contours(contours, image, box, camera, torch.cat([start, truth[None]]))
     torch.testing.assert_close(both.transform[:1], fit.transform)
     torch.testing.assert_close(both.edge_support[:1], fit.edge_support)
-    support = contour_support(contours, image[None], box[None], camera, fit.transform)
+    crops = EdgeCrops.cut([image], box[None], 0.1)
+    support = contour_support(contours, crops, camera[None], fit.transform, FIRST)
     assert float(support) == pytest.approx(float(fit.edge_support), abs=0.03)
 
 
@@ -300,7 +293,7 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
 def test_start_support_is_that_of_the_start_at_full_size():
     off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
     start, image = apply_twist(CUBE_POSE[None], off, mesh_centre(cube())), silhouette(cube(), CUBE_POSE)
-    expected = contour_support(MeshContours(cube()), [image], BOX[None], K, start)
+    expected = contour_support(MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST)
     torch.testing.assert_close(fitted(image, start).start_support, expected)
 
 
@@ -332,16 +325,16 @@ def test_fit_rejects_bad_input(start, options, message):
 def test_quick_support_reaches_far_and_counts_the_mask():
     """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size does not reach."""
     image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
-    crop = full_size_problem(contours, [image], BOX[None], K[None], FIRST, 0.1)[2]
+    crops = EdgeCrops.cut([image], BOX[None], 0.1)
+    crop = ContourProblem.of(contours, crops, K[None])
     focal, depth = float(crop.K[0, 0, 0]), float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
     beside = CUBE_POSE.clone()
     beside[0, 3] += 28.0 / focal * depth
-    poses, same = torch.stack([CUBE_POSE, beside]), {"margin": 0.1}
-    right, far = quick_support(contours, image, BOX, K.expand(2, 3, 3), poses, mask=None, **same).tolist()
+    right, far = quick_support(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside])).tolist()
     assert far > 0.95 * right
     inside = crop_regions([image], BOX[None, None], size=64, margin=0.1)[0, :, :1].clamp(0, 1)
     with_mask, against = (
-        float(quick_support(contours, image, BOX, K[None], CUBE_POSE[None], mask=mask, **same))
+        float(quick_support(contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None]))
         for mask in (inside, 1.0 - inside)
     )
     assert with_mask > 1.5 * against

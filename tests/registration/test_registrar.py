@@ -123,8 +123,8 @@ def test_the_best_pose_is_not_one_outside_the_limits():
 def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
     fit_poses = registrar_module.fit_poses
 
-    def pretended(describer, images, poses, *rest):
-        fitted = fit_poses(describer, images, poses, *rest)
+    def pretended(describer, crops, poses):
+        fitted = fit_poses(describer, crops, poses)
         return replace(fitted, edge_support=torch.full_like(fitted.rank, support)) if len(poses) == 1 else fitted
 
     monkeypatch.setattr(registrar_module, "fit_poses", pretended)
@@ -135,13 +135,13 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = registrar_module.fit_poses
 
-    def fail(describer, images, *fit):
-        if images[0].shape[-1] < 240:
+    def fail(describer, crops, poses):
+        if float(crops.crops.amax()) <= 0.25:
             raise CurviregError("no fit")
-        return fit_poses(describer, images, *fit)
+        return fit_poses(describer, crops, poses)
 
     monkeypatch.setattr(registrar_module, "fit_poses", fail)
-    results = truck_registrar()([IMAGE, IMAGE[..., :230], IMAGE], BOX.repeat(3, 1), CAMERA)
+    results = truck_registrar()([IMAGE, 0.25 * IMAGE, IMAGE], BOX.repeat(3, 1), CAMERA)
     assert [result.ok for result in results] == [True, False, True]
     assert str(results[1].error) == "image 1: no fit"
 

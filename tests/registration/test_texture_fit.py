@@ -15,6 +15,7 @@ from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint, up_rotati
 from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.registration.contour_fit import ContourProblem
+from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.registration.least_squares import apply_twist
 from curvireg_torch.registration.texture_fit import _TextureRounds, fit_texture, match_patches, turned
 from curvireg_torch.rendering import make_renderer, render_colour
@@ -26,7 +27,6 @@ MESH = can()
 R = rotation_from_viewpoint(*torch.tensor((17.0, 22.0, 0.0), dtype=torch.float64)) @ up_rotation("y")
 TRUTH = transform(R[None], torch.tensor([[0.1, -0.05, 7.0]], dtype=torch.float64))
 CENTRE, CONTOURS = mesh_centre(MESH), MeshContours(MESH)
-OPTIONS = {"image_index": torch.zeros(1, dtype=torch.long), "margin": 0.1}
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,8 @@ def fit(renderer, image, starts, mesh=MESH) -> ContourFit | None:
         return render_colour(mesh, T, K, size, renderer=renderer)
 
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
-    return fit_texture(draw, renderer, CONTOURS, [image], box, CAMERA[None], starts, **OPTIONS)
+    crops = EdgeCrops.cut([image], box.float(), 0.1)
+    return fit_texture(draw, renderer, ContourProblem.of(CONTOURS, crops, CAMERA[None]), crops.crops[0], starts)
 
 
 def error(found: ContourFit) -> float:
@@ -69,7 +70,7 @@ def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
     alone = fit(renderer, image, start)
     assert alone is None or error(alone) > 5.0
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
-    contours = fit_contours(CONTOURS, image, box[0], CAMERA, start, **OPTIONS)
+    contours = fit_contours(CONTOURS, image, box[0], CAMERA, start)
     assert int(contours.observable) == 5
     starts = turned(contours, CENTRE)
     assert len(starts) == 3
