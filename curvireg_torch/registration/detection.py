@@ -25,6 +25,7 @@ from .inputs import ImageItem, check_crop, image_items
 from .poses import projected_box
 from .priors import Limits
 from .result import Detection, FailedRegistration, Registration
+from .tracker import boxes_at
 
 if TYPE_CHECKING:
     from .registrar import Registrar
@@ -81,6 +82,7 @@ def detect(
             limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
         focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
         proposals = detector(item.image, focal=focal, **limits)
+        proposals = _with_landmarks(proposals, registrar, item)
         if not len(proposals.boxes):
             raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
         return _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
@@ -113,6 +115,18 @@ class Proposals:
     boxes: Tensor
     responses: Tensor
     views: Tensor
+
+
+def _with_landmarks(proposals: Proposals, registrar: "Registrar", item: ImageItem) -> Proposals:
+    """Proposals after the boxes around poses on which landmarks agree; their number is the response."""
+    poses, count = registrar.landmark_poses(item)
+    boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
+    first = boxes[visible].to(proposals.boxes), count[visible], poses.view[visible]
+    return Proposals(
+        torch.cat([first[0], proposals.boxes]),
+        torch.cat([first[1], proposals.responses]),
+        torch.cat([first[2], proposals.views]),
+    )
 
 
 @dataclass(frozen=True)

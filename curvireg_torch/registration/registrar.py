@@ -36,6 +36,7 @@ from .contour_fit import quick_support
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
+from .landmarks import LandmarkPose, Landmarks
 from .poses import (
     SCORE_WEIGHTS,
     Poses,
@@ -51,7 +52,7 @@ from .poses import (
     with_edge_support,
 )
 from .priors import Limits
-from .refinement import refine
+from .refinement import nearest_view, refine
 from .result import FailedRegistration, Registration
 from .search import search
 from .several import register_views
@@ -262,6 +263,25 @@ class Registrar:
     def _shape_symmetries(self) -> Tensor | None:
         return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
+    def landmark_poses(self, item: ImageItem, box: Tensor | None = None) -> tuple[Poses, Tensor]:
+        """Poses on which landmarks of the mesh's print agree, as promising as the best view, and how many, the largest
+        number first, see :class:`.Landmarks`; none without colours or a camera matrix. ``box`` (4,) is where
+        they are looked for."""
+        found: list[LandmarkPose] = []
+        if self.describer.draws_colours and item.camera_matrix is not None:
+            with _SHAPE_LOCK:  # photographs share them
+                landmarks = self._landmarks
+            found = landmarks.poses(item.image, item.camera_matrix, box)
+        T = torch.stack([pose.T for pose in found]) if found else torch.zeros(0, 4, 4, dtype=torch.float64)
+        K, none = torch.eye(3) if item.camera_matrix is None else item.camera_matrix, torch.zeros(len(T))
+        poses = Poses.at(T, K.double().expand(len(T), 3, 3), self.describer.centre, none.long(), none.double())
+        views = torch.tensor([nearest_view(self, R) for R in poses.rotation], dtype=torch.long)
+        return replace(poses, view=views), torch.tensor([float(pose.count) for pose in found])
+
+    @cached_property
+    def _landmarks(self) -> Landmarks:
+        return Landmarks(self.describer)
+
     @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:
         """What makes every pose of this mesh questionable, in words."""
@@ -390,6 +410,10 @@ class Registrar:
             poses = work.limits.moved_inside(poses)
         if work.crops is not None and len(poses) > count:
             poses = self._screened(work.crops, poses, count)
+        if work.crops is not None and work.exact:
+            found, _ = self.landmark_poses(work.item, work.item.box)
+            kept = torch.arange(len(found)) if work.limits is None else work.limits.keeps(found).nonzero()[:, 0]
+            poses = Poses.cat([poses, found[kept[:1]]])
         outside = torch.zeros(len(poses), dtype=torch.bool)
         if work.limits is None:
             return poses, outside

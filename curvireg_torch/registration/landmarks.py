@@ -1,0 +1,185 @@
+"""Landmarks: local features of a mesh's print, found again in photographs; where enough agree, they give a pose.
+
+The ranking compares whole views; print that is seen at a slant, small or half hidden still shows some landmarks. They
+need colours, and the camera of the photograph.
+"""
+
+import math
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..geometry.cameras import transform
+from ..geometry.viewpoint import uniform_views
+from ..matching import ViewDescriber
+from ..utils.threads import map_on_threads
+from .least_squares import nearest_rigid
+
+VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and their side in px
+VIEW_DISTANCE = 4.0  # of the camera from the object's centre in these views, in object radii
+SILHOUETTE_BORDER = 4  # Width in px of the rim of the silhouette, where the background has a part in the features
+MIN_CONTRAST = 0.02  # of features, SIFT's threshold: prints are fainter in photographs than in views
+CROP_SIDE, MAX_SIDE = 400, 1920  # Longer side in px to which crops are resized, and of the largest whole photograph
+CROP_MARGIN = 0.05  # Space around a given box, as a fraction of its longer side
+SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look alike
+NEIGHBOURS, MAX_DISTANCE_RATIO = 8, 0.8  # Nearest landmarks of a feature, and Lowe's ratio of those at two places
+# Distance in object radii, and factor between sizes, within which two matches predict the same object
+CLUSTER_DISTANCE, CLUSTER_FACTOR = 0.4, 1.5
+MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
+MIN_LANDMARKS = 10  # that a pose must put where the photograph shows them
+REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
+RANSAC_ROUNDS = 500
+FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks
+
+
+@dataclass(frozen=True)
+class _Features:
+    """F features of a picture: ``uv`` (F, 2) in px, ``size`` (F,) in px, ``angle`` (F,) in rad, and unit ``vectors``
+    (F, 128)."""
+
+    uv: np.ndarray
+    size: np.ndarray
+    angle: np.ndarray
+    vectors: np.ndarray
+
+    @staticmethod
+    def of(picture: Tensor, mask: np.ndarray | None = None) -> "_Features":
+        """RootSIFT features of a picture (C, H, W) in [0, 1]; no place has two."""
+        grey = (255.0 * picture.mean(dim=0)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+        points, vectors = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST).detectAndCompute(grey, mask)
+        if vectors is None or not len(points):
+            return _Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.float32))
+        vectors = np.sqrt(vectors / np.maximum(vectors.sum(axis=1, keepdims=True), 1e-9))
+        values = np.array([(*p.pt, p.size, math.radians(p.angle)) for p in points])
+        return _Features(values[:, :2], values[:, 2], values[:, 3], vectors.astype(np.float32))
+
+    def __getitem__(self, index: np.ndarray) -> "_Features":
+        return _Features(*(getattr(self, f.name)[index] for f in fields(_Features)))
+
+
+@dataclass(frozen=True)
+class LandmarkPose:
+    """A pose ``T`` (4, 4) and the number of landmarks that agree with it."""
+
+    T: Tensor
+    count: int
+
+
+class Landmarks:
+    """Features of the views of a mesh with colours, with their places on its surface."""
+
+    def __init__(self, describer: ViewDescriber) -> None:
+        self._centre, self._radius = describer.centre.numpy(), describer.radius
+        R = uniform_views(VIEWS).rotations.double()
+        position = torch.tensor([0.0, 0.0, VIEW_DISTANCE * self._radius], dtype=torch.float64)
+        T = transform(R, position - R @ describer.centre)
+        focal = 0.5 * VIEW_SIZE * math.sqrt(VIEW_DISTANCE**2 - 1.0)  # the bounding sphere fills the picture
+        middle = 0.5 * (VIEW_SIZE - 1)
+        K = torch.tensor([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+        def features(k: int) -> tuple[_Features, np.ndarray]:
+            view, size = T[k : k + 1], (VIEW_SIZE, VIEW_SIZE)
+            depth = describer.renderer.render(view, K[None], size)[0, 0].cpu().double().numpy()
+            rim = np.ones((2 * SILHOUETTE_BORDER + 1,) * 2, np.uint8)
+            found = _Features.of(describer.draw(view, K[None], size)[0], cv2.erode((depth > 0).astype(np.uint8), rim))
+            column, row = found.uv.round().astype(int).clip(0, VIEW_SIZE - 1).T
+            z = depth[row, column]
+            rays = (np.column_stack([found.uv, np.ones(len(z))]) @ np.linalg.inv(K.numpy()).T) * z[:, None]
+            return found[z > 0], ((rays - T[k, :3, 3].numpy()) @ T[k, :3, :3].numpy())[z > 0]
+
+        found = map_on_threads(features, range(VIEWS))
+        self._features = _Features(
+            *(np.concatenate([getattr(one, f.name) for one, _ in found]) for f in fields(_Features))
+        )
+        self._points = np.concatenate([points for _, points in found])
+        # Of a feature of size 1 that is upright: the way to the object's centre, and the object's radius, both in px.
+        turn = np.exp(-1j * self._features.angle) / self._features.size
+        self._to_centre = (middle * (1 + 1j) - self._features.uv @ [1, 1j]) * turn
+        self._radii = focal / VIEW_DISTANCE / self._features.size
+
+    def poses(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> list[LandmarkPose]:
+        """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first, in a photograph (C, H, W),
+        floating in [0, 1] or uint8, with camera ``K`` (3, 3), or in a box (4,) of it."""
+        found = self._photograph_features(image, box)
+        landmark, clear = self._nearest(found)
+        found, landmark = found[clear], landmark[clear]
+        scale = found.size * np.exp(1j * found.angle)
+        centre = found.uv @ [1, 1j] + self._to_centre[landmark] * scale
+        radius = self._radii[landmark] * found.size
+        near = np.abs(centre[:, None] - centre) < CLUSTER_DISTANCE * np.sqrt(radius[:, None] * radius)
+        near &= np.abs(np.log(radius[:, None] / radius)) < math.log(CLUSTER_FACTOR)
+        poses, left = [], np.ones(len(landmark), dtype=bool)
+        for _ in range(MAX_CLUSTERS):
+            votes = (near & left).sum(axis=1) * left
+            if not len(votes) or votes.max() < MIN_LANDMARKS:
+                break
+            cluster = near[votes.argmax()] & left
+            error = REPROJECTION_ERROR * float(np.median(radius[cluster]))
+            pose = _pose(self._points[landmark[cluster]], found.uv[cluster], K.double().cpu().numpy(), error)
+            if pose is not None:
+                poses.append(pose)
+            left &= ~cluster
+        return sorted(poses, key=lambda pose: -pose.count)
+
+    def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:
+        """Features in px of the photograph."""
+        H, W = image.shape[-2:]
+        x0, y0, x1, y1 = 0, 0, W, H
+        if box is not None:
+            margin = CROP_MARGIN * float((box[2:] - box[:2]).max())
+            low, high = (box[:2] - margin).floor().int().tolist(), (box[2:] + margin).ceil().int().tolist()
+            x0, y0, x1, y1 = max(low[0], 0), max(low[1], 0), min(high[0] + 1, W), min(high[1] + 1, H)
+        crop = image[:, y0:y1, x0:x1].detach().cpu()
+        crop = crop.float() / 255.0 if crop.dtype == torch.uint8 else crop.float()
+        if not bool(crop.isfinite().all()):
+            crop = crop.nan_to_num(0.0, 0.0, 0.0)
+        longer = max(crop.shape[-2:])
+        scale = min(MAX_SIDE / longer, 1.0) if box is None else CROP_SIDE / longer
+        if scale != 1.0:
+            size = [max(1, round(scale * side)) for side in crop.shape[-2:]]
+            scale = size[0] / crop.shape[-2] if crop.shape[-2] >= crop.shape[-1] else size[1] / crop.shape[-1]
+            crop = F.interpolate(crop[None], size, mode="bicubic", align_corners=False, antialias=scale < 1.0)[0]
+            crop = crop.clamp(0.0, 1.0)
+        found = _Features.of(crop)
+        uv = (found.uv + 0.5) / scale - 0.5 + [x0, y0]
+        return _Features(uv, found.size / scale, found.angle, found.vectors)
+
+    def _nearest(self, found: _Features) -> tuple[np.ndarray, np.ndarray]:
+        """(F,) the most similar landmark of each feature, and whether those at other places are clearly less so."""
+        known, points = torch.from_numpy(self._features.vectors), torch.from_numpy(self._points)
+        count = min(NEIGHBOURS, len(points))
+        if count < 2 or not len(found.uv):
+            return np.zeros(len(found.uv), dtype=int), np.zeros(len(found.uv), dtype=bool)
+        landmark, clear = [], []
+        for vectors in torch.from_numpy(found.vectors).split(FEATURES_AT_A_TIME):
+            similarity, index = (vectors @ known.T).topk(count, dim=1)
+            distance = (2.0 - 2.0 * similarity).clamp(min=0.0)
+            apart = (points[index] - points[index[:, :1]]).norm(dim=2) > SAME_PLACE * self._radius
+            apart[:, -1] |= ~apart.any(dim=1)
+            other = distance.masked_fill(~apart, torch.inf).amin(dim=1)
+            landmark.append(index[:, 0])
+            clear.append(distance[:, 0] < MAX_DISTANCE_RATIO**2 * other)
+        return torch.cat(landmark).numpy(), torch.cat(clear).numpy()
+
+
+def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> LandmarkPose | None:
+    """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px; None if few do."""
+    try:
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            points, uv, K, None, iterationsCount=RANSAC_ROUNDS, reprojectionError=error, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # points in one place
+        return None
+    # Several features at one place are one landmark.
+    if not found or inliers is None:
+        return None
+    count = len(np.unique((uv[inliers[:, 0]] / max(error, 1e-9)).round(), axis=0))
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
+    if count < MIN_LANDMARKS or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
+        return None
+    return LandmarkPose(nearest_rigid(T[None])[0], count)
