@@ -28,7 +28,7 @@ from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 CACHE_LIMIT = 2_000_000_000
 ABANDONED_SECONDS = 3600.0  # Age from which an incomplete file counts as the remains of a killed process
 # Code that turns a mesh into described views: a bank that another version of it built is not found
-_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms", "pipeline.py", "matching/describe.py")
+_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms.py", "pipeline.py", "matching/describe.py")
 
 
 class CachedBank(NamedTuple):
