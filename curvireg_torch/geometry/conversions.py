@@ -19,10 +19,6 @@ from ..utils.checks import check_fraction, check_last_axes, check_numbers, check
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
     """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera: view matrices, whose inverse is
     the camera's pose in the model frame, as trimesh and Blender expect it.
-
-    Example:
-        >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
-        [1.0, -1.0, -1.0, 1.0]
     """
     check_pose(T_cam_from_model, "T_cam_from_model")
     signs = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=T_cam_from_model.dtype, device=T_cam_from_model.device)
