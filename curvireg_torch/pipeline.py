@@ -27,22 +27,10 @@ from .geometry import ViewSphere, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
-from .utils.choices import DEFAULT
+from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
 
-__all__ = [
-    "DEFAULT",
-    "DEPTH_FIELDS",
-    "FIELDS",
-    "PRESETS",
-    "BankSettings",
-    "DetectionSettings",
-    "Pipeline",
-    "ViewPolicy",
-    "field_digest",
-    "preset_named",
-]
-
+__all__ = ["DEPTH_FIELDS", "FIELDS", "PRESETS", "BankSettings", "DetectionSettings", "Pipeline", "ViewPolicy"]
 VERSION = 1  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
 
@@ -183,8 +171,7 @@ class Pipeline:
             call.
         weights: digest of the field's weights; "" for a field without any. Filled in for packaged weights.
         terms: ranking terms, each at most once.
-        box_jitter: error that boxes are allowed, as a fraction of their longer side (:func:`jittered_boxes`); 0: exact
-            boxes.
+        box_jitter: error that boxes are allowed, as a fraction of their longer side in [0, 0.45]; 0: exact boxes.
         hypotheses: distinct views that are carried through search and contour fit.
         search: search around hypotheses in small rotation steps.
         contours: fit the mesh's contours to the photograph's edges.
@@ -251,10 +238,6 @@ class Pipeline:
         """The appearance term, if a bank of ``count`` views holds the features of all its views."""
         return next((t for t in self.terms if isinstance(t, Appearance) and count <= t.exhaustive_limit), None)
 
-    def bank_key_fields(self, count: int) -> dict[str, Any]:
-        """What decides the contents of a bank of ``count`` views, besides mesh and viewpoints."""
-        return {**asdict(self.bank), "appearance": self.stored_appearance(count) is not None}
-
     def describe(self) -> dict[str, Any]:
         """All settings as plain numbers, strings, lists and dictionaries for JSON."""
         described = {"version": VERSION, **asdict(self), "terms": {term.name: asdict(term) for term in self.terms}}
@@ -274,14 +257,6 @@ class Pipeline:
         data = _object(data, "pipeline")
         if data.pop("version", VERSION) != VERSION:
             raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
-        for name, settings in (("views", ViewPolicy), ("bank", BankSettings), ("detection", DetectionSettings)):
-            if name in data:
-                data[name] = _settings(settings, data[name], f"pipeline: {name}")
-        if "terms" in data:
-            options = _object(data["terms"], "pipeline: terms")
-            for name in options:
-                check_option(name, TERMS, "term")
-            data["terms"] = tuple(_settings(TERMS[n], given, f"pipeline: terms: {n}") for n, given in options.items())
         return _settings(cls, data, "pipeline")
 
     @classmethod
@@ -309,11 +284,16 @@ def _settings(kind: type[Settings], data: Any, name: str) -> Settings:
     for key, value in values.items():
         if key not in defaults:
             raise InvalidInputError(f"{name}: unknown key {key!r}; expected one of {', '.join(defaults)}")
-        default = defaults[key]
-        if is_dataclass(default) or key == "terms":
-            continue
-        if not _fits(value, default):
-            raise InvalidInputError(f"{name}: {key}: expected a value like {default!r}, got {value!r}")
+        default, path = defaults[key], f"{name}: {key}"
+        if is_dataclass(default):
+            values[key] = _settings(type(default), value, path)
+        elif key == "terms":
+            options = _object(value, path)
+            for term in options:
+                check_option(term, TERMS, "term")
+            values[key] = tuple(_settings(TERMS[term], given, f"{path}: {term}") for term, given in options.items())
+        elif not _fits(value, default):
+            raise InvalidInputError(f"{path}: expected a value like {default!r}, got {value!r}")
     return kind(**values)
 
 

@@ -110,9 +110,8 @@ def synthesize_photograph(
     # Normals come from neighbouring points; at occluding contours they point to the camera.
     dv, du = torch.gradient(points, dim=(0, 1))
     normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
-    normal[torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale] = torch.tensor(
-        [0.0, 0.0, -1.0]
-    ).double()
+    border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
+    normal[border] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)  # from above, in front
     shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
@@ -129,20 +128,13 @@ def synthesize_photograph(
     image = front + (1.0 - coverage) * gaussian_smooth(back[None], DEFOCUS)[0]
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     # Outer borders of the outermost pixels, converted from the fine grid to the picture's.
-    border = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
-    return image.clamp(0, 1), (border - 0.5) / 2.0
+    box = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
+    return image.clamp(0, 1), (box - 0.5) / 2.0
 
 
 class DemoScene(NamedTuple):
-    """A generated photograph of a known object.
-
-    Attributes:
-        mesh: of the object, in metres.
-        image: (3, 720, 960) float32 RGB in [0, 1].
-        box: (4,) x0, y0, x1, y1 in px.
-        camera_matrix: (3, 3) float64.
-        truth: (4, 4) float64 ``T_cam_from_model``.
-    """
+    """A generated ``image`` (3, 720, 960), float32 RGB in [0, 1], of a known object, its ``mesh`` in metres and ``box``
+    (4,) x0, y0, x1, y1 in px; ``camera_matrix`` (3, 3) and ``truth`` (4, 4), ``T_cam_from_model``, in float64."""
 
     mesh: trimesh.Trimesh
     image: Tensor

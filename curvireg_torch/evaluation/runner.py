@@ -34,7 +34,7 @@ from ..visualization.sheet import thumbnail
 from .store import ResultStore, Row, workers
 
 POSE_SOURCES = (
-    *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms"),
+    *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms.py"),
     *("utils", "errors.py", "pipeline.py"),
 )
 """Parts of the package that results depend on."""

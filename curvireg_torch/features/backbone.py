@@ -1,6 +1,7 @@
 """Appearance scores: the first stages of EfficientNet-Lite0 with ImageNet weights, and what compares their features."""
 
 import hashlib
+from collections.abc import Mapping
 from functools import cache
 from importlib.util import find_spec
 from io import BytesIO
@@ -80,15 +81,12 @@ class Backbone(nn.Module):
             self.stem = _Conv(3, 32, 3, 2)
             blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
         self.blocks = nn.ModuleList(blocks)
-        weights, device = _read_weights(_weights_path()), torch.get_default_device()
-        # Not by to_empty, which imports sympy: that takes a second.
-        self.load_state_dict({name: x.to(device) for name, x in _fold_batch_norm(weights).items()}, assign=True)
+        weights = _read_weights(_weights_path())
+        assign_weights(self, _fold_batch_norm(weights))
         for i, indices in enumerate(_OUTPUT_BLOCKS):
             scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in indices])
             self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
         self.requires_grad_(False)
-        self.eval()
-        filters_channels_last(self)
 
     @property
     def spreads(self) -> tuple[Tensor, Tensor]:
@@ -107,10 +105,15 @@ class Backbone(nn.Module):
         return outputs[0], outputs[1]
 
 
-def filters_channels_last(module: nn.Module) -> None:
-    """Store the filters of convolutions in the order of memory in which a CPU computes them a quarter faster."""
-    for weight in (p for p in module.parameters() if p.ndim == 4):
+def assign_weights(network: nn.Module, weights: Mapping[str, Tensor]) -> None:
+    """Give a network on the meta device its weights, on the default device, and set it to evaluation. Filters of
+    convolutions are stored in the order of memory in which a CPU computes them a quarter faster."""
+    device = torch.get_default_device()
+    # Not by to_empty, which imports sympy: that takes a second.
+    network.load_state_dict({name: x.to(device) for name, x in weights.items()}, assign=True)
+    for weight in (p for p in network.parameters() if p.ndim == 4):
         weight.data = weight.data.to(memory_format=torch.channels_last)
+    network.eval()
 
 
 def _fold_batch_norm(weights: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -111,14 +111,8 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
 
 
 class HOG(FunctionModule):
-    """Module twin of :func:`hog`.
-
-    Args:
-        grid, bins, block, clip: as in the function.
-        learnable: make ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
-
-    Shape:
-        Input (B, 2, H, W); output (B, D), D = ``length``.
+    """Module twin of :func:`hog`: (B, 2, H, W) to (B, D), D = ``length``. ``learnable`` makes ``bin_weights`` (bins,),
+    initially 1, a positive parameter; otherwise it is None.
 
     Example:
         >>> layer = HOG(grid=4)

@@ -13,7 +13,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..filters import operations as ops
 from ..utils.checks import check_colour_image
 from ..utils.files import write_tensors
-from .backbone import filters_channels_last
+from .backbone import assign_weights
 
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
 SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"  # of WEIGHTS; other files are refused
@@ -130,11 +130,13 @@ class LearnedCurvilinearSaliency(nn.Module):
     def __init__(self, *, weights: Path | str | None = None) -> None:
         super().__init__()
         self.weights = None if weights is None else str(weights)
-        state, device = _read_weights(Path(weights or WEIGHTS), packaged=weights is None), torch.get_default_device()
-        self.network = _network_on_meta()
-        # Not by to_empty, which imports sympy: that takes a second.
-        self.network.load_state_dict({name: x.to(device) for name, x in state.items()}, assign=True)
-        filters_channels_last(self.network)
+        path = Path(weights or WEIGHTS)
+        with torch.device("meta"):  # random initial values would advance the global random generator
+            self.network = FieldNetwork()
+        try:
+            assign_weights(self.network, _read_weights(path, packaged=weights is None))
+        except RuntimeError as error:  # other names or shapes
+            raise InvalidInputError(f"weights: {path} does not hold the weights of FieldNetwork") from error
         self.eval()
 
     def forward(self, image: Tensor) -> Tensor:
@@ -168,23 +170,14 @@ def save_weights(network: FieldNetwork, path: Path) -> None:
     write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
 
 
-def _network_on_meta() -> FieldNetwork:
-    """The network on the meta device: random initial values would advance the global random generator."""
-    with torch.device("meta"):
-        return FieldNetwork()
-
-
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
         raise MissingFileError(f"weights: {path} does not exist; train it with scripts/training/train_learned_field.py")
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")
-    expected = {k: v.shape for k, v in _network_on_meta().state_dict().items()}
     try:
         weights = load(content)
     except SafetensorError as error:
         raise InvalidInputError(f"weights: {path} is not a safetensors file ({error})") from error
-    if {k: v.shape for k, v in weights.items()} != expected:
-        raise InvalidInputError(f"weights: {path} does not hold the weights of FieldNetwork")
     return {k: v.float() if v.is_floating_point() else v for k, v in weights.items()}

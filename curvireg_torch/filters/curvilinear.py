@@ -1,6 +1,6 @@
 """Curvilinear saliency of depth (the paper's contribution 1); gradient, curvilinear saliency and PCI of photographs."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -30,11 +30,37 @@ def visible_range(depth: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor, T
     return surface, near, torch.where(span > MIN_RELATIVE_RANGE * far, span, torch.where(visible, far, 1.0))
 
 
-def fill_depth(depth: Tensor, mask: Tensor | None, depth_scale: float | None) -> Tensor:
-    """Depth as a graph surface: nearest visible point at 0, missing pixels at ``BACKGROUND_DEPTH`` depth ranges."""
-    surface, near, span = visible_range(depth, mask)
-    scale = 1.0 / span if depth_scale is None else depth_scale
-    return torch.minimum(surface - near, BACKGROUND_DEPTH * span).mul_(scale)
+def apply_to_depth(
+    layer: Callable[..., ops.Planes],
+    depth: Tensor,
+    mask: Tensor | None,
+    sigma: float | Tensor,
+    depth_scale: float | None,
+    camera_matrix: Tensor | None = None,
+) -> Tensor:
+    """Apply ``layer`` to smoothed surfaces, enlarged by 1 px, in which missing pixels lie ``BACKGROUND_DEPTH`` depth
+    ranges behind the nearest visible point. They are graph surfaces with this point at 0; with cameras (B, 3, 3), which
+    the layer then gets too, they keep their distance and are in units of the depth range."""
+    check_image(depth, "depth")
+    scale = None if depth_scale is None else check_positive(depth_scale, "depth_scale")
+    checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    if mask is not None:
+        fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
+        if not fits or mask.dtype != torch.bool:
+            raise InvalidInputError(f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}")
+        check_same_device(mask, depth, "mask")
+        mask = mask.expand(depth.shape)
+
+    def on_surface(depth: Tensor, mask: Tensor | None, *cameras: Tensor) -> ops.Planes:
+        surface, near, span = visible_range(depth, mask)
+        if cameras:
+            z = torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span
+        else:
+            z = torch.minimum(surface - near, BACKGROUND_DEPTH * span).mul_(1.0 / span if scale is None else scale)
+        return layer(ops.smooth(z, checked_sigma, linear=True), *cameras)
+
+    cameras = () if camera_matrix is None else (camera_matrix,)
+    return ops.apply_in_blocks(on_surface, ops.at_least_float32(depth), mask, *cameras).to(depth.dtype)
 
 
 def depth_curvilinear_saliency(
@@ -74,31 +100,14 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
     check_option(formula, ("geometric", "paper"), "formula")
 
-    def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
-        factor, *m = _shape_operator(ops.smooth(fill_depth(depth, mask, scale), sigma, linear=True), formula)
+    def layer(z: Tensor) -> ops.Planes:
+        factor, *m = _shape_operator(z, formula)
         vx, vy, half_gap = dominant_eigenvector(*m)
         return scaled_direction(factor.mul_(half_gap), vx, vy)
 
-    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask).to(depth.dtype)
-
-
-def check_depth(
-    depth: Tensor, mask: Tensor | None, depth_scale: float | None, sigma: float | Tensor
-) -> tuple[Tensor | None, float | None, float | Tensor]:
-    """Return the mask expanded to the shape of the depth, and the checked options."""
-    check_image(depth, "depth")
-    scale = None if depth_scale is None else check_positive(depth_scale, "depth_scale")
-    sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
-    if mask is None:
-        return None, scale, sigma
-    fits = mask.ndim <= 4 and all(m in (1, n) for m, n in zip(mask.shape[::-1], depth.shape[::-1], strict=False))
-    if not fits or mask.dtype != torch.bool:
-        raise InvalidInputError(f"mask: expected bool of shape {tuple(depth.shape)}, got {type_and_shape(mask)}")
-    check_same_device(mask, depth, "mask")
-    return mask.expand(depth.shape), scale, sigma
+    return apply_to_depth(layer, depth, mask, sigma, depth_scale)
 
 
 def _shape_operator(z: Tensor, formula: str) -> ops.Planes:

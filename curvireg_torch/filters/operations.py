@@ -170,11 +170,11 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
     """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite differences need it:
     ``linear`` by the slope at the borders, else by replicating them."""
-    radius = _kernel_radius(sigma)
+    weights = _gaussian_kernel(sigma, x)
+    radius = len(weights) // 2
     x = (extrapolate_pad if linear else replicate_pad)(x, radius + margin)
     if radius == 0:
         return x
-    weights = _gaussian_kernel(sigma, radius, x)
     # Sums of shifted images: much faster than a convolution on few images, and one loop when compiled.
     for dim in (-1, -2):
         padded, length = x, x.shape[dim] - 2 * radius
@@ -185,24 +185,20 @@ def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = 
     return x
 
 
-def _gaussian_kernel(sigma: float | Tensor, radius: int, like: Tensor) -> Sequence[float] | Tensor:
-    """2 radius + 1 weights: floats for a float, a tensor for a tensor."""
+def _gaussian_kernel(sigma: float | Tensor, like: Tensor) -> Sequence[float] | Tensor:
+    """Weights of a kernel of odd length: floats for a float, a tensor for a tensor."""
     if not isinstance(sigma, Tensor):
-        kernel = [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-radius, radius + 1)]
+        radius = math.ceil(4.0 * sigma)
+        kernel = [math.exp(-0.5 * (i / sigma) ** 2) if i else 1.0 for i in range(-radius, radius + 1)]
         total = sum(kernel)
         return [weight / total for weight in kernel]
+    radius = MAX_TENSOR_RADIUS
+    if is_host_readable(sigma):
+        radius = min(max(math.ceil(4.0 * float(sigma.detach())), 1), radius)
     sigma = sigma.to(like.dtype).clamp(min=MIN_TENSOR_SIGMA)
     offsets = torch.arange(-radius, radius + 1, device=like.device, dtype=like.dtype)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2) * (offsets.abs() <= torch.ceil(4.0 * sigma))
     return weights / weights.sum()
-
-
-def _kernel_radius(sigma: float | Tensor) -> int:
-    if not isinstance(sigma, Tensor):
-        return math.ceil(4.0 * sigma)
-    if not is_host_readable(sigma):
-        return MAX_TENSOR_RADIUS
-    return min(max(math.ceil(4.0 * float(sigma.detach())), 1), MAX_TENSOR_RADIUS)
 
 
 def replicate_pad(x: Tensor, radius: int) -> Tensor:

@@ -10,15 +10,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_same_device, check_tensor
 from . import operations as ops
-from .curvilinear import (
-    BACKGROUND_DEPTH,
-    check_depth,
-    default_to_x,
-    dominant_eigenvector,
-    fill_depth,
-    scaled_direction,
-    visible_range,
-)
+from .curvilinear import apply_to_depth, default_to_x, dominant_eigenvector, scaled_direction
 from .modules import DepthModule
 
 
@@ -80,29 +72,23 @@ def _field_of_normals(
         if depth_scale is not None:
             raise InvalidInputError("depth_scale: has no meaning with a camera_matrix; leave one of them out")
         camera_matrix = camera_matrix.to(ops.at_least_float32(depth).dtype)
-    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
 
-    def layer(depth: Tensor, mask: Tensor | None, camera: Tensor | None) -> ops.Planes:
-        a, b, c = _normal_structure_tensor(depth, mask, camera, sigma, scale)
+    def layer(z: Tensor, camera: Tensor | None = None) -> ops.Planes:
+        a, b, c = _normal_structure_tensor(z, camera)
         vx, vy, half_gap = dominant_eigenvector(a, b, b, c)
         vx = default_to_x(vx, vy)
         return scaled_direction(length(a + c, half_gap, vx, vy), vx, vy)
 
-    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask, camera_matrix).to(depth.dtype)
+    return apply_to_depth(layer, depth, mask, sigma, depth_scale, camera_matrix)
 
 
-def _normal_structure_tensor(
-    depth: Tensor, mask: Tensor | None, camera: Tensor | None, sigma: float | Tensor, depth_scale: float | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form."""
+def _normal_structure_tensor(z: Tensor, camera: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """N_x . N_x, N_x . N_y, N_y . N_y per px^2, each (B, 1, H, W), from the Hessian in closed form; ``z`` has a margin
+    of 1 px."""
+    zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
     if camera is None:
-        z = ops.smooth(fill_depth(depth, mask, depth_scale), sigma, linear=True)
-        zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
         one, zero = torch.ones_like(zx), torch.zeros_like(zx)
         return _unit_vector_products((-zx, -zy, one), (-zxx, -zxy, zero), (-zxy, -zyy, zero))
-    surface, near, span = visible_range(depth, mask)
-    z = ops.smooth(torch.minimum(surface, near + BACKGROUND_DEPTH * span) / span, sigma, linear=True)
-    zx, zy, zxx, zyy, zxy = ops.central_derivatives(z)
     z = z[..., 1:-1, 1:-1]
     H, W = z.shape[-2:]
     fx, fy, cx, cy = (camera[:, i, j].view(-1, 1, 1, 1) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -152,14 +138,13 @@ def hessian_frobenius_norm(
         >>> hessian_frobenius_norm(bowl, sigma=0.0, depth_scale=1.0)[0, :, 16, 16].tolist()
         [1.0, 0.0]
     """
-    mask, scale, sigma = check_depth(depth, mask, depth_scale, sigma)
 
-    def layer(depth: Tensor, mask: Tensor | None) -> ops.Planes:
-        _, _, zxx, zyy, zxy = ops.central_derivatives(ops.smooth(fill_depth(depth, mask, scale), sigma, linear=True))
+    def layer(z: Tensor) -> ops.Planes:
+        _, _, zxx, zyy, zxy = ops.central_derivatives(z)
         vx, vy, _ = dominant_eigenvector(zxx, zxy, zxy, zyy)
         return scaled_direction(ops.safe_sqrt(zxx * zxx + 2.0 * zxy * zxy + zyy * zyy), default_to_x(vx, vy), vy)
 
-    return ops.apply_in_blocks(layer, ops.at_least_float32(depth), mask).to(depth.dtype)
+    return apply_to_depth(layer, depth, mask, sigma, depth_scale)
 
 
 def apparent_ridges(

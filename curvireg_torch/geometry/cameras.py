@@ -101,12 +101,6 @@ def pose_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> t
 
     Raises:
         InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is unusable.
-
-    Example:
-        >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-        >>> R, t = pose_from_box(cube, torch.eye(3), torch.tensor([25.0, 25, 75, 75]), camera_matrix(100, 100, 50, 50))
-        >>> [round(v, 3) for v in t.tolist()]
-        [0.0, 0.0, 5.0]
     """
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")

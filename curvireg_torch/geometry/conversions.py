@@ -19,10 +19,6 @@ from ..utils.checks import check_fraction, check_last_axes, check_numbers, check
 def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
     """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera: view matrices, whose inverse is
     the camera's pose in the model frame, as trimesh and Blender expect it.
-
-    Example:
-        >>> opengl_from_opencv(torch.eye(4)).diagonal().tolist()
-        [1.0, -1.0, -1.0, 1.0]
     """
     check_pose(T_cam_from_model, "T_cam_from_model")
     signs = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=T_cam_from_model.dtype, device=T_cam_from_model.device)
@@ -91,13 +87,21 @@ def symmetry_transforms(info: Mapping[str, Any], *, max_step_fraction: float = 0
     check_fraction(max_step_fraction, "max_step_fraction")
     matrices = [check_numbers(matrix, "symmetries_discrete", 16) for matrix in _list(info, "symmetries_discrete")]
     discrete = torch.stack([torch.eye(4, dtype=torch.float64), *(matrix.view(4, 4) for matrix in matrices)])
+    count = math.ceil(math.pi / max_step_fraction)
+    angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count))[:, None]
     rotations = [discrete[:1]]
     for symmetry in _list(info, "symmetries_continuous"):
         if not isinstance(symmetry, Mapping):
             raise InvalidInputError(f"symmetries_continuous: expected axis and offset, got {symmetry!r:.80}")
         axis = check_numbers(symmetry.get("axis"), "axis", 3)
         offset = check_numbers(symmetry.get("offset", (0.0, 0.0, 0.0)), "offset", 3)
-        rotations.append(_axis_rotations(axis, offset, math.ceil(math.pi / max_step_fraction)))
+        length = torch.linalg.vector_norm(axis)
+        if not bool(length > 0):
+            raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
+        about_axis = torch.eye(4, dtype=torch.float64).repeat(count - 1, 1, 1)
+        about_axis[:, :3, :3] = rotation_from_axis_angle(angles * axis / length)
+        about_axis[:, :3, 3] = offset - about_axis[:, :3, :3] @ offset
+        rotations.append(about_axis)
     # (C, 1, 4, 4) @ (D, 4, 4): the discrete symmetry acts first.
     return (torch.cat(rotations).unsqueeze(1) @ discrete).flatten(0, 1)
 
@@ -107,15 +111,3 @@ def _list(info: Mapping[str, Any], key: str) -> Sequence[Any]:
     if not isinstance(values, list | tuple):
         raise InvalidInputError(f"{key}: expected a list, got {values!r:.80}")
     return values
-
-
-def _axis_rotations(axis: Tensor, offset: Tensor, count: int) -> Tensor:
-    """(count - 1, 4, 4) rotations by multiples of 360 / count degrees about the axis through ``offset``."""
-    length = torch.linalg.vector_norm(axis)
-    if not bool(length > 0):
-        raise InvalidInputError(f"axis: expected a direction of length > 0, got {axis.tolist()}")
-    angles = (torch.arange(1, count, dtype=torch.float64) * (2.0 * math.pi / count))[:, None]
-    transforms = torch.eye(4, dtype=torch.float64).repeat(count - 1, 1, 1)
-    transforms[:, :3, :3] = rotation_from_axis_angle(angles * axis / length)
-    transforms[:, :3, 3] = offset - transforms[:, :3, :3] @ offset
-    return transforms

@@ -56,12 +56,7 @@ def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float) -> 
 
 
 def square_boxes(boxes: Tensor, margin: float) -> Tensor:
-    """(..., 4) squares around the boxes' centres, side = longer side x (1 + 2 margin).
-
-    Example:
-        >>> square_boxes(torch.tensor([0.0, 0.0, 10.0, 20.0]), 0.1).tolist()
-        [-7.0, -2.0, 17.0, 22.0]
-    """
+    """(..., 4) squares around the boxes' centres, side = longer side x (1 + 2 margin)."""
     check_positive(margin, "margin", zero_ok=True)
     centre = 0.5 * (boxes[..., :2] + boxes[..., 2:])
     half = (0.5 + margin) * (boxes[..., 2:] - boxes[..., :2]).amax(dim=-1, keepdim=True)

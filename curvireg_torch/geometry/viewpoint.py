@@ -179,22 +179,17 @@ def sample_views(
 def uniform_views(
     count: int, *, thetas: Sequence[float] = (0.0,), distances: Sequence[float] = (DEFAULT_DISTANCE,)
 ) -> ViewSphere:
-    """Near-uniform view directions on the sphere, by the Fibonacci spiral. No direction is farther than
-    ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000 directions).
-
-    Args:
-        count: number of view directions; each is combined with every theta and distance.
-        thetas, distances: as in :func:`sample_views`.
+    """``count`` near-uniform view directions on the sphere, by the Fibonacci spiral, each with every theta and distance
+    as in :func:`sample_views`. No direction is farther than ``157 / sqrt(count)`` degrees from the nearest view
+    (measured for 2 to 3000 directions).
 
     Example:
         >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))
         400
     """
     check_integer(count, "count")
-    i = torch.arange(count, dtype=torch.float64)
-    elevations = torch.rad2deg(torch.asin(-1.0 + 2.0 * (i + 0.5) / count))
-    azimuths = (i * 180.0 * (3.0 - math.sqrt(5.0))) % 360.0
-    t, d = check_numbers(thetas, "thetas"), check_numbers(distances, "distances")
-    k, theta, distance = (v.flatten() for v in torch.meshgrid(i, t, d, indexing="ij"))
-    k = k.long()
-    return ViewSphere(azimuths[k].float(), elevations[k].float(), theta.float(), distance.float())
+    axes = torch.arange(count).double(), check_numbers(thetas, "thetas"), check_numbers(distances, "distances")
+    i, theta, distance = (v.flatten() for v in torch.meshgrid(*axes, indexing="ij"))
+    elevation = torch.rad2deg(torch.asin(-1.0 + 2.0 * (i + 0.5) / count))
+    azimuth = (i * 180.0 * (3.0 - math.sqrt(5.0))) % 360.0
+    return ViewSphere(azimuth.float(), elevation.float(), theta.float(), distance.float())

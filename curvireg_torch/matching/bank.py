@@ -208,8 +208,17 @@ class ViewBank:
             BankError: truncated, changed, not a bank, or written by another version of the format.
         """
         path = Path(path)
-        metadata, tensors = _read(path)
+        if not path.is_file():
+            raise MissingFileError(f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path)
         try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                if metadata.get("format") != FORMAT:
+                    raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
+                if (version := metadata.get("version")) != str(FORMAT_VERSION):
+                    message = f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
+                    raise BankError(message, subject=path)
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
             if metadata["checksum"] != tensor_digest(tensors, size=16):
                 raise BankError(f"changed since it was written (its checksum differs); {REBUILD}", subject=path)
             pipeline = Pipeline.from_json(metadata["pipeline"])
@@ -218,26 +227,11 @@ class ViewBank:
             _check_contents(views, pipeline.bank, tensors)
         except BankError:
             raise
+        except (SafetensorError, OSError) as error:
+            raise BankError(f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path) from error
         except (KeyError, TypeError, ValueError, CurviregError) as error:
             raise BankError(f"incomplete bank ({error!r}); {REBUILD}", subject=path) from error
         return cls(mesh, views, pipeline, tensors).to(device)
-
-
-def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a file of this format and version."""
-    if not path.is_file():
-        raise MissingFileError(f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path)
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
-            if (version := metadata.get("version")) != str(FORMAT_VERSION):
-                message = f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
-                raise BankError(message, subject=path)
-            return metadata, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
-        raise BankError(f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path) from error
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:

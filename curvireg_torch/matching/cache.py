@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 
-from ..errors import BankError, OutputError
+from ..errors import BankError
 from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
@@ -28,7 +28,7 @@ from .bank import FORMAT_VERSION, ViewBank, colour_arrays
 CACHE_LIMIT = 2_000_000_000
 ABANDONED_SECONDS = 3600.0  # Age from which an incomplete file counts as the remains of a killed process
 # Code that turns a mesh into described views: a bank that another version of it built is not found
-_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms", "pipeline.py", "matching/describe.py")
+_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms.py", "pipeline.py", "matching/describe.py")
 
 
 class CachedBank(NamedTuple):
@@ -56,7 +56,8 @@ def bank_key(
     mesh: trimesh.Trimesh, views: ViewSphere, *, pipeline: Pipeline | None = None, renderer: str = "auto"
 ) -> str:
     """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings, renderer and code."""
-    settings = (pipeline or Pipeline()).bank_key_fields(len(views))
+    pipeline = pipeline or Pipeline()
+    settings = {**asdict(pipeline.bank), "appearance": pipeline.stored_appearance(len(views)) is not None}
     arrays = {"vertices": np.array(mesh.vertices, np.float64), "faces": np.array(mesh.faces, np.int64)}
     tensors = {name: torch.from_numpy(np.array(x)) for name, x in {**arrays, **colour_arrays(mesh)}.items()}
     tensors |= {f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)}
@@ -116,11 +117,8 @@ def cached_bank(
     try:
         bank.save(path)
         _trim(folder, keep=path)
-    except OutputError as error:
-        warning = f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
-        warnings.warn(warning, stacklevel=2)
-    except OSError as error:  # files may be added to the folder, but not removed
-        warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
+    except OSError as error:  # not written, or an old bank not removed
+        warning = f"the bank is not cached, or the cache exceeds its limit: {error}, by CURVIREG_CACHE=FOLDER"
         warnings.warn(warning, stacklevel=2)
     return bank
 

@@ -100,9 +100,8 @@ class ViewDescriber:
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
-        S = self.settings.image_size
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self.view_renderer.render(T, K, (S, S), orthographic=self._orthographic)
+        depth = self.view_renderer.render(T, K, (self.settings.image_size,) * 2, orthographic=self._orthographic)
         return depth.to(self._device), boxes.to(self._device)
 
     @torch.no_grad()

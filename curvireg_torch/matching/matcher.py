@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,6 @@ from ..features import field_points
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import Appearance, QueryFeatures, crop_regions, jittered_boxes, photograph_field, whole_box_shapes
-from ..terms.terms import AppearanceModule
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
@@ -138,8 +137,9 @@ class ViewMatcher(nn.Module):
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
-        self.terms = tuple(term for term in pipeline.terms if term.weight > 0)
-        self._terms = nn.ModuleDict({term.name: term.build(bank) for term in self.terms}).to(bank.device)
+        terms = [term for term in pipeline.terms if term.weight > 0]
+        self._terms = [(term, term.build(bank)) for term in terms if not isinstance(term, Appearance)]
+        self._appearance = next((term.build().to(bank.device) for term in terms if isinstance(term, Appearance)), None)
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
@@ -183,30 +183,27 @@ class ViewMatcher(nn.Module):
         """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
         views out, whose score is 0."""
         check_pixels(query.crops, "of the box")
-        first = [t for t in self.terms if not isinstance(t, Appearance)]
-        terms = {t.name: self._terms[t.name](query) for t in first}
-        first_log = torch.stack([t.weight * t.log_score(terms[t.name]) for t in first]).sum(dim=0)
-        log, compared = self._with_appearance(query, first_log)
-        if allowed is None:
-            order = log.argsort(dim=1, descending=True, stable=True)
-            return Ranking(log.exp(), order, {**terms, **compared})
-        allowed = allowed.to(log.device)
-        without, (log, compared) = log, self._with_appearance(query, first_log.masked_fill(~allowed, -torch.inf))
-        order = log.argsort(dim=1, descending=True, stable=True)
-        R = self.bank.rotations
-        near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE
-        best, outside = without.masked_fill(allowed | near, -torch.inf).max(dim=1)
-        outside = outside.masked_fill(best == -torch.inf, -1)
+        terms = {term.name: compare(query) for term, compare in self._terms}
+        first = torch.stack([term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]).sum(dim=0)
+        log, compared = self._with_appearance(query, first)
+        if allowed is not None:
+            allowed, without_limits = allowed.to(log.device), log
+            log, compared = self._with_appearance(query, first.masked_fill(~allowed, -torch.inf))
+        order, outside = log.argsort(dim=1, descending=True, stable=True), None
+        if allowed is not None:
+            R = self.bank.rotations
+            near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE
+            best, outside = without_limits.masked_fill(allowed | near, -torch.inf).max(dim=1)
+            outside = outside.masked_fill(best == -torch.inf, -1)
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
     def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""
-        term = next((t for t in self.terms if isinstance(t, Appearance)), None)
-        if term is None:
+        if (appearance := self._appearance) is None:
             return log, {}
-        raw, score, compare = torch.full_like(log, torch.nan), torch.zeros_like(log), self._appearance.compare
+        term, raw, score = appearance.term, torch.full_like(log, torch.nan), torch.zeros_like(log)
         if len(log) and len(self.bank) <= term.exhaustive_limit:
-            raw = compare(query, self._appearance_of(torch.arange(len(self.bank)))).to(log)
+            raw = appearance.compare(query, self._features_of_views(torch.arange(len(self.bank)))).to(log)
             score = term.log_score(raw)
         elif len(log):
             R = self.bank.rotations
@@ -214,28 +211,25 @@ class ViewMatcher(nn.Module):
             selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
             selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
             compared = torch.cat(selected).unique()
-            similarity = compare(query, self._appearance_of(compared)).to(log)
+            similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
             for b, index in enumerate(selected):
                 raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
                 traces = R.flatten(1) @ R[index].flatten(1).T  # a relative rotation's trace grows as its angle falls
                 score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return log + term.weight * score, {term.name: raw}
 
-    @property
-    def _appearance(self) -> AppearanceModule:
-        return cast(AppearanceModule, self._terms[Appearance.name])
-
-    def _appearance_of(self, views: Tensor) -> Tensor:
+    def _features_of_views(self, views: Tensor) -> Tensor:
         """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
         if (features := self.bank.appearance) is not None:
             return features if len(views) == len(features) else features[views.to(self.bank.device)]
-        cache = self._known_appearance
+        appearance, cache = self._appearance, self._known_appearance
+        assert appearance is not None
         found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
         missing = [view for view in views.tolist() if view not in found]
 
         def describe(chunk: list[int]) -> Tensor:
             R, distances = self.bank.rotations[chunk], self.bank.distances[chunk]
-            return self._appearance.describe(self.describer.shaded(R, distances))
+            return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
         chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
@@ -250,14 +244,12 @@ class ViewMatcher(nn.Module):
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
         """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
         that of the most similar view of its ranking."""
-        (term,) = (t for t in self.terms if isinstance(t, Appearance))
+        assert self._appearance is not None
         raw = self._appearance.compare(query, self._appearance.describe(pictures))[0].cpu().double()
-        views = ranking.terms[term.name][0].cpu().double()
-        views, out = views[views.isfinite()], torch.zeros(len(raw), dtype=torch.float64)
-        for h in range(len(raw)):
-            scores = term.log_score(torch.cat([views, raw[h : h + 1]])[None])[0]
-            out[h] = scores[-1] - scores[:-1].max()  # positive if the pose is more similar than every view
-        return out
+        views = ranking.terms[Appearance.name][0].cpu().double()
+        views = views[views.isfinite()].expand(len(raw), -1)
+        scores = self._appearance.term.log_score(torch.cat([views, raw[:, None]], dim=1))
+        return scores[:, -1] - scores[:, :-1].amax(dim=1)  # positive if the pose is more similar than every view
 
     @cached_property
     def describer(self) -> ViewDescriber:

@@ -8,7 +8,6 @@ A test module defines its layers and inherits the tests::
 A subclass disables a test that does not apply with ``test_gradcheck = None``.
 """
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -98,12 +97,6 @@ class LayerContract:
             assert y.device == x.device
             assert len(y) == len(x)
             assert torch.isfinite(y).all()
-
-    def test_options_are_keyword_only(self, case: LayerCase) -> None:
-        for call in (case.function, case.module.__init__) if case.module is not None else (case.function,):
-            for name, parameter in inspect.signature(call).parameters.items():
-                if parameter.default is not inspect.Parameter.empty and name != "mask":
-                    assert parameter.kind is inspect.Parameter.KEYWORD_ONLY, name
 
     def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
         """The images differ in contrast and depth range, so that a normalisation over the batch is detected."""

@@ -2,10 +2,10 @@
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -13,14 +13,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..errors import InvalidInputError
-from ..features.backbone import SHA256, Backbone, describe, similarity
-from ..filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
-from ..geometry.crops import check_boxes, crop_squares, square_boxes
-from ..utils.checks import as_numbers, check_integer, check_option, check_photograph, check_positive, check_tensor
-from ..utils.threads import map_on_threads
+from .errors import InvalidInputError
+from .features.backbone import SHA256, Backbone, describe, similarity
+from .filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
+from .geometry.crops import check_boxes, crop_squares, square_boxes
+from .utils.checks import check_integer, check_option, check_photograph, check_positive, check_tensor
+from .utils.threads import map_on_threads
 
+__all__ = ["TERMS", "Appearance", "BoxShape", "Correlation", "QueryFeatures", "Repeatability", "Term", "Whitening"]
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
+VIEWS_AT_A_TIME = 64  # whose points are compared
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 
@@ -54,8 +56,6 @@ class QueryFeatures:
 def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
     """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``.
     Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there."""
-    if crops.shape[1] not in (1, 3):
-        raise InvalidInputError(f"images: expected 1 (grey) or 3 (RGB) channels, got {crops.shape[1]}")
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
     holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
@@ -66,8 +66,6 @@ def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
     ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
-    boxes = as_numbers(boxes, "boxes")
-    check_tensor(boxes, "boxes", (None, 4))
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
     jitter = torch.tensor(_JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device)
@@ -90,8 +88,6 @@ def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int,
     for image in images:
         check_photograph(image)
     sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
-    boxes = as_numbers(boxes, "boxes")
-    check_tensor(boxes, "boxes", (len(sizes), None, 4))
     check_boxes(boxes[:, 0], sizes)
     if not sizes:
         return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
@@ -120,27 +116,13 @@ def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
     return torch.where(inside, box_shapes(boxes), torch.nan)
 
 
-VIEWS_AT_A_TIME = 64  # whose points are compared
-
-
-class Views(Protocol):
-    """N described views, for instance a :class:`curvireg_torch.ViewBank`, which documents the attributes."""
-
-    @property
-    def settings(self) -> Any: ...
-    @property
-    def descriptors(self) -> Tensor: ...
-    @property
-    def boxes(self) -> Tensor: ...
-    def __len__(self) -> int: ...
-    def points_at(self, index: Tensor | slice) -> Tensor: ...
-    def silhouettes_at(self, index: Tensor | slice) -> Tensor: ...
+Comparison = Callable[[QueryFeatures], Tensor]
 
 
 @dataclass(frozen=True)
 class Term(ABC):
     """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its ``weight`` w is 0. A new
-    term is a frozen dataclass of plain numbers with a ``name`` and these two methods, added to
+    term is a frozen dataclass of plain numbers with a ``name`` and a method ``build``, added to
     ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
 
     name: ClassVar[str]
@@ -150,20 +132,16 @@ class Term(ABC):
         check_positive(self.weight, f"{self.name}: weight", zero_ok=True)
 
     @abstractmethod
-    def build(self, views: Views) -> nn.Module:
-        """A module that compares photographs with these N views: :class:`QueryFeatures` -> (B, N) raw scores."""
+    def build(self, views: Any) -> Comparison:
+        """A function that compares B photographs with the N views of a :class:`curvireg_torch.ViewBank`, on its device:
+        :class:`QueryFeatures` -> (B, N) raw scores."""
 
-    @abstractmethod
     def log_score(self, raw: Tensor) -> Tensor:
-        """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it."""
-
-
-def log_unit_score(similarity: Tensor) -> Tensor:
-    """(B, N) ``(s - max s) / std s`` of similarities per photograph: the log of a softmax of z-scores, best view 0."""
-    # Not by std, which warns of empty batches.
-    spread = (similarity - similarity.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
-    spread = torch.where(spread > 0, spread, torch.ones_like(spread))
-    return (similarity - similarity.amax(dim=1, keepdim=True)) / spread
+        """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it. By default
+        ``(s - max s) / std s`` of each photograph's scores s: the log of a softmax of z-scores."""
+        # Not by std, which warns of empty batches.
+        spread = (raw - raw.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
+        return (raw - raw.amax(dim=1, keepdim=True)) / torch.where(spread > 0, spread, torch.ones_like(spread))
 
 
 class Whitening(nn.Module):
@@ -210,7 +188,7 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Correlation(Term):
-    """S_hog: normalised correlation of descriptors, the best over the jittered crops, mapped by ``log_unit_score``.
+    """S_hog: normalised correlation of descriptors, the best over the jittered crops.
 
     Attributes:
         whitening: "none", or "bank": both descriptors are whitened by the mean mu and the covariance Sigma of the
@@ -226,30 +204,20 @@ class Correlation(Term):
         super().__post_init__()
         check_option(self.whitening, ("none", "bank"), "whitening")
 
-    def build(self, views: Views) -> nn.Module:
+    def build(self, views: Any) -> Comparison:
         whitening = None if self.whitening == "none" else Whitening(*ledoit_wolf(views.descriptors))
-        return _CorrelationModule(views.descriptors, whitening)
 
-    def log_score(self, raw: Tensor) -> Tensor:
-        return log_unit_score(raw)
+        def normalized(descriptors: Tensor) -> Tensor:
+            return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
 
+        known = normalized(views.descriptors)
 
-class _CorrelationModule(nn.Module):
-    """Compares photographs with (N, D) descriptors of views, whitened or not; a zero descriptor scores 0."""
+        def compare(query: QueryFeatures) -> Tensor:
+            B, K = query.descriptors.shape[:2]
+            queries = normalized(query.descriptors.flatten(0, 1)).to(known.dtype)
+            return (queries @ known.T).float().view(B, K, len(known)).amax(dim=1)
 
-    def __init__(self, descriptors: Tensor, whitening: Whitening | None = None) -> None:
-        super().__init__()
-        self.whitening = whitening
-        self.views: Tensor
-        self.register_buffer("views", self._normalized(descriptors), persistent=False)
-
-    def _normalized(self, descriptors: Tensor) -> Tensor:
-        return F.normalize(descriptors if self.whitening is None else self.whitening(descriptors), dim=1)
-
-    def forward(self, query: QueryFeatures) -> Tensor:
-        B, K = query.descriptors.shape[:2]
-        queries = self._normalized(query.descriptors.flatten(0, 1)).to(self.views.dtype)
-        return (queries @ self.views.T).float().view(B, K, len(self.views)).amax(dim=1)
+        return compare
 
 
 @dataclass(frozen=True)
@@ -278,45 +246,35 @@ class Repeatability(Term):
         check_option(self.mode, ("monotone", "paper"), "mode")
         check_positive(self.eps, "eps", zero_ok=True)
 
-    def build(self, views: Views) -> nn.Module:
-        return _RepeatabilityModule(views, self.eps)
+    def build(self, views: Any) -> Comparison:
+        S = views.settings.image_size
+        # Cells of at most eps px keep the matrix product small.
+        cell = max(1, min(int(self.eps * S), S // 64))
+
+        def count(start: int) -> Tensor:
+            points = dilate_points(views.points_at(slice(start, start + VIEWS_AT_A_TIME)), self.eps * S)
+            return cell_counts(points, cell).flatten(1)
+
+        # Pixels of each cell within eps of a view's points, (N, cells), and all of its pixels, (1, cells)
+        near = torch.cat(map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device))
+        area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=near.device), cell).flatten(1)
+
+        def compare(query: QueryFeatures) -> Tensor:
+            B, K = query.points.shape[:2]
+            # A point in a cut cell counts as much as any other.
+            points = cell_counts(query.points.flatten(0, 1), cell).flatten(1).float()
+            queries = points / area
+            # A float32 copy of all views would take longer than the product.
+            matched = torch.cat([queries @ few.float().T for few in near.split(VIEWS_AT_A_TIME)], dim=1)
+            rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+            return rep.view(B, K, len(near)).amax(dim=1)
+
+        return compare
 
     def log_score(self, raw: Tensor) -> Tensor:
         R = 1.0 - raw
         centre = R.amin(dim=1, keepdim=True) if self.mode == "monotone" else R.mean(dim=1, keepdim=True)
         return -(R - centre).square() / (2.0 * self.sigma**2)
-
-
-class _RepeatabilityModule(nn.Module):
-    """``near`` (N, cells) counts the pixels of each cell within eps of a view's points, ``area`` (1, cells) all."""
-
-    near: Tensor
-    area: Tensor
-
-    def __init__(self, views: Views, eps: float) -> None:
-        super().__init__()
-        S = views.settings.image_size
-        # Cells of at most eps px keep the matrix product small.
-        self.cell = max(1, min(int(eps * S), S // 64))
-
-        def count(i: int) -> Tensor:
-            points = dilate_points(views.points_at(slice(i, i + VIEWS_AT_A_TIME)), eps * S)
-            return cell_counts(points, self.cell).flatten(1)
-
-        near = map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device)
-        whole = torch.ones(1, S, S, dtype=torch.bool, device=near[0].device)
-        self.register_buffer("near", torch.cat(near), persistent=False)
-        self.register_buffer("area", cell_counts(whole, self.cell).flatten(1), persistent=False)
-
-    def forward(self, query: QueryFeatures) -> Tensor:
-        B, K = query.points.shape[:2]
-        # A point in a cut cell counts as much as any other.
-        points = cell_counts(query.points.flatten(0, 1), self.cell).flatten(1).float()
-        queries = points / self.area
-        # A float32 copy of all views would take longer than the product.
-        matched = torch.cat([queries @ few.float().T for few in self.near.split(VIEWS_AT_A_TIME)], dim=1)
-        rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-        return rep.view(B, K, len(self.near)).amax(dim=1)
 
 
 def dilate_points(points: Tensor, eps: float) -> Tensor:
@@ -354,33 +312,24 @@ class BoxShape(Term):
         super().__post_init__()
         check_positive(self.sigma, "sigma")
 
-    def build(self, views: Views) -> nn.Module:
-        return _BoxShapeModule(box_shapes(views.boxes).float(), self.sigma)
+    def build(self, views: Any) -> Comparison:
+        shapes = box_shapes(views.boxes).float()
+
+        def compare(query: QueryFeatures) -> Tensor:
+            square = (query.shapes.float()[:, None] - shapes).nan_to_num(0.0).square()
+            return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * self.sigma**2))
+
+        return compare
 
     def log_score(self, raw: Tensor) -> Tensor:
         return raw.clamp(min=torch.finfo(raw.dtype).tiny).log()
-
-
-class _BoxShapeModule(nn.Module):
-    """Compares boxes with (N,) shapes of views; NaN is the shape of an unknown box of a photograph."""
-
-    def __init__(self, shapes: Tensor, sigma: float) -> None:
-        super().__init__()
-        self.sigma = sigma
-        self.shapes: Tensor
-        self.register_buffer("shapes", shapes, persistent=False)
-
-    def forward(self, query: QueryFeatures) -> Tensor:
-        square = (query.shapes.float()[:, None] - self.shapes).nan_to_num(0.0).square()
-        return torch.exp((square.amin(dim=1, keepdim=True) - square) / (2.0 * self.sigma**2))
 
 
 @dataclass(frozen=True)
 class Appearance(Term):
     """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view. A mesh
     with colours is rendered in grey and in its colours, and the better match counts for each view: a print
-    distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines
-    (``features.backbone.similarity``), mapped by ``log_unit_score`` over the compared views.
+    distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines.
 
     A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank only the best
     distinct views of the other terms are compared, ``top`` of them, at least ``min_angle`` degrees apart; every other
@@ -402,30 +351,26 @@ class Appearance(Term):
         if self.weights != SHA256[:16]:
             raise InvalidInputError(f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}")
 
-    def build(self, views: Views | None = None) -> "AppearanceModule":
-        return AppearanceModule()
-
-    def log_score(self, raw: Tensor) -> Tensor:
-        return log_unit_score(raw)
+    def build(self, views: Any = None) -> "AppearanceModule":
+        return AppearanceModule(self)
 
 
-class AppearanceModule(nn.Module):
+class AppearanceModule(Backbone):
     """Describes pictures of views, and compares photographs with them."""
 
-    def __init__(self) -> None:
+    def __init__(self, term: Appearance) -> None:
         super().__init__()
-        self.backbone = Backbone()
+        self.term = term
 
     def describe(self, pictures: Tensor) -> Tensor:
         """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours."""
         grey, colour = pictures[:, :1], pictures[:, 1:]
-        features = [describe(picture, self.backbone) for picture in (grey, colour) if picture.shape[1]]
-        return torch.cat(features, dim=1)
+        return torch.cat([describe(picture, self) for picture in (grey, colour) if picture.shape[1]], dim=1)
 
     def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
         """(B, N) raw scores of B photographs and the (N, D) features of N views."""
         if Appearance.name not in query.computed:  # shared by ranking and rescoring
-            query.computed[Appearance.name] = describe(query.crops, self.backbone)
+            query.computed[Appearance.name] = describe(query.crops, self)
         crops = query.computed[Appearance.name]
         similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
