@@ -2,11 +2,11 @@
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
+from .session import STATIC
 from .side import Answers, Inputs, Preview
 from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
@@ -28,9 +28,8 @@ BOX_HINT_IN_RIG = "Drag a rectangle around the object. Where there is none, the 
 
 def build_page(workspace: Workspace) -> None:
     """Lay out one browser window. It holds nothing: several times a second it shows what changed in the workspace."""
-    static = Path(__file__).parent / "static"
-    ui.add_css((static / "page.css").read_text())
-    ui.add_body_html(f"<script>{(static / 'page.js').read_text()}</script>")
+    ui.add_css((STATIC / "page.css").read_text())
+    ui.add_body_html(f"<script>{(STATIC / 'page.js').read_text()}</script>")
     text("a", "To the photograph", "skip", href="#work")
     ui.dark_mode(None)
     with region("header", "top"):
@@ -153,7 +152,7 @@ class Steps:
         elif workspace.searching:
             words = "starting"
         elif workspace.receiving:
-            words = f"receiving {', '.join(workspace.receiving.values())}"
+            words = f"receiving {', '.join(name for name, _ in workspace.receiving.values())}"
         elif session.shot.result is not None:
             changed = session.shot.result.inputs != session.inputs()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"

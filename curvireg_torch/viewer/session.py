@@ -29,8 +29,9 @@ from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
 from .shot import Numbers, Result, Shot, numbers
 
-__all__ = ["Session"]
+__all__ = ["STATIC", "Session"]
 
+STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
 
 Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
@@ -77,11 +78,11 @@ class Session:
 
     def name(self, path: str | Path) -> str:
         """What the user calls a file."""
-        return Path(path).name if self.folder in Path(path).parents else str(path)
+        return Path(path).name if {self.folder, STATIC} & {*Path(path).parents} else str(path)
 
     def usable_name(self, path: Path) -> str:
-        """:meth:`name`, in commands and programs; the sample is there as long as the page is."""
-        return str(path) if path.parent == self.folder else self.name(path)
+        """:meth:`name`, in commands and programs; the sample has no other place than its own."""
+        return str(path) if path.parent == STATIC else self.name(path)
 
     def close(self) -> None:
         """Forget the photographs, the rig and the mesh."""
@@ -140,24 +141,26 @@ class Session:
         """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to photographs by their file
         names. A rig that cannot be used has no rows."""
         self.rig_path, self.rig = path, ()
-        self._replace_shots([self._open_again(shot, None) if shot.view else shot for shot in self.shots])
-        if path is None:
-            return
-        folder = path if path.is_dir() else path.parent
         try:
-            rig = tuple(read_rig(path, self.mesh_path))
-            names = [_key(view.photo) for view in rig]
-            if twice := [view.name for view, key in zip(rig, names, strict=True) if names.count(key) > 1]:
+            self.rig = () if path is None else tuple(read_rig(path, self.mesh_path))
+            names = [_key(view.photo) for view in self.rig]
+            if twice := [view.name for view, key in zip(self.rig, names, strict=True) if names.count(key) > 1]:
                 message = f"{' and '.join(twice[:2])} have the same file name; rename the photographs"
                 raise InvalidInputError(message, subject=path)
-            self.rig, shots = rig, list[Shot]()
-            for shot in self.shots:
-                view = self._row_of(shot.path, shots)
-                shots.append(self._open_again(shot, view) if view else shot)
+            self._match_rig()
         except CurviregError as error:
             self.rig = ()
-            subject = str(error.subject or "").replace(f"{folder}/", "")
+            self._match_rig()
+            folder = "" if path is None else path if path.is_dir() else path.parent
+            subject = str(error.subject).replace(f"{folder}/", "")
             raise error.with_subject(subject.replace(str(path), self.rig_name)) from error
+
+    def _match_rig(self) -> None:
+        """Give each photograph its row of the rig; the first of several that have one name gets it."""
+        shots: list[Shot] = []
+        for shot in self.shots:
+            view = self._row_of(shot.path, shots)
+            shots.append(self._open_again(shot, view) if view or shot.view else shot)
         self._replace_shots(shots)
 
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
@@ -234,7 +237,7 @@ class Session:
 
     def remove_limits(self) -> None:
         """Forget what was known of the pose, but not which side of the mesh is its front."""
-        self.set_limits(**{name: None for name in self.options.limits or {} if name != "front"})
+        self.set_limits(**{name: None for name in self.options.limits or {} if name not in QUALIFIERS})
 
     def object_frame(self) -> Tensor:
         """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""

@@ -140,6 +140,20 @@ class Browser:
             held()
         ActionChains(self.driver, duration=50).release().perform()
 
+    def extent(self):
+        """Box of the mesh that is drawn over the photograph, in px of that layer."""
+        script = """
+            const image = document.querySelectorAll('.canvas img')[1], canvas = document.createElement('canvas');
+            [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+            const context = canvas.getContext('2d');
+            context.drawImage(image, 0, 0);
+            const alpha = context.getImageData(0, 0, canvas.width, canvas.height).data.filter((_, k) => k % 4 === 3);
+            const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
+            const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
+            const y = drawn.map(k => Math.floor(k / canvas.width));
+            return [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))]"""
+        return self.driver.execute_script(script)
+
     def box(self):
         facts = self.text("box-facts")
         return [float(v) for v in facts.split()] if facts[:1].isdigit() else None

@@ -153,7 +153,7 @@ def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
     assert result.reliable
-    assert workspace.session.shot.found_box.tolist() == list(module.sample.BOX)
+    assert workspace.session.shot.found_box.tolist() == list(module.SAMPLE_BOX)
     T, K = workspace.session.shot.projection
     vertices = torch.tensor(workspace.session.mesh.vertices) @ T[:3, :3].mT + T[:3, 3]
     seen = (vertices @ K.mT)[:, :2] / vertices[:, 2:]
@@ -276,22 +276,6 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
     assert ended == [True, True]
     assert names(workspace) == []
     assert workspace.messages == {}
-
-
-def test_a_sample_that_fails_leaves_the_work_as_it_is(workspace, scene, monkeypatch):
-    def fail():
-        raise OSError("disk full")
-
-    monkeypatch.setattr(module.sample, "cup", fail)
-
-    async def work():
-        await upload(workspace, scene / "photo.png", "a.png")
-        await workspace.load_sample()
-        assert workspace.messages == {"file": "disk full"}
-        await upload(workspace, scene / "photo.png", "b.png")
-
-    asyncio.run(work())
-    assert names(workspace) == ["a.png", "b.png"]
 
 
 def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene, search, monkeypatch):
