@@ -12,8 +12,6 @@ from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Steps", "build_page"]
-
 TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
     "bank": "rendering views of the mesh",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data import read_photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
-from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
+from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
 from ..evaluation.result_files import RigPicture
 from ..evaluation.rigs import read_rig, register_rig
 from ..evaluation.runner import View, register_entry
@@ -29,13 +29,8 @@ from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
 from .shot import Numbers, Result, Shot, numbers
 
-__all__ = ["STATIC", "Session"]
-
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
-HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
-
 Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
-
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
@@ -249,7 +244,7 @@ class Session:
         x, y, z = position
         azimuth, elevation = math.degrees(math.atan2(x, -y)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
         self.remove_limits()
-        self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=HINT_WIDTH)
+        self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=WITHIN)
 
     def mesh_axis(self, position: Sequence[float]) -> str:
         """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
@@ -304,7 +299,7 @@ class Session:
             registrar = self._open_registrar(request)
             registrar.progress = self._report_progress
             register = self._register_alone if shot.view is None else self._register_rig
-            found, boxes = register(shots, request, registrar, time.perf_counter() - start)
+            found = register(shots, request, registrar, time.perf_counter() - start)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
@@ -312,6 +307,7 @@ class Session:
             self.cancelled, self.searched = False, ()
         result = Result(registrar, *found, inputs)
         result.document["viewer"] = {"command": command}
+        boxes = [view.box for view in result.registration.views] or [torch.tensor(used_box(result.document))]
         for each, box in zip(shots, boxes, strict=True):
             each.result, each.found_box = result, box
         shot.choose(0)
@@ -319,7 +315,7 @@ class Session:
 
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> Found:
         ((shot,), camera) = shots, self.options.camera
         assert shot.photo is not None
         entry = request.entry(request.photos[0])
@@ -329,11 +325,11 @@ class Session:
         if isinstance(camera, Camera):
             document["camera"] = camera.at(shot.size).describe()
             document["inputs"]["camera_source"] = "file"
-        return (registration, document, ()), [torch.tensor(used_box(document))]
+        return registration, document, ()
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> Found:
         views = []
         for shot in shots:
             assert shot.view is not None
@@ -345,8 +341,7 @@ class Session:
         for row, shot in zip(document["views"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
             row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
-        boxes = [view.box for view in registration.views]
-        return (registration, document, photographs), boxes
+        return registration, document, photographs
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""

@@ -20,8 +20,6 @@ from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 
-__all__ = ["Answer", "Numbers", "Point", "Result", "Shot", "dragged_box", "numbers"]
-
 MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 

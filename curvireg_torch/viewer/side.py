@@ -17,8 +17,6 @@ from .shot import Answer, Numbers, Result, Shot
 from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
 
-__all__ = ["Answers", "Inputs", "Preview"]
-
 DOWNLOADS = {
     "picture": ("overlay.png", "image/png"),
     "result.json": ("result.json", "application/json"),
@@ -113,10 +111,10 @@ class Answers:
         set_text(self.facts, "\n".join(lines))
         self.repairs.clear()
         with self.repairs:
-            for label, repair in self._repairs(document, word).items():
+            for label, repair in self._repairs(document).items():
                 button(label, repair, label.lower().replace(" ", "-"))
 
-    def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
+    def _repairs(self, document: Mapping[str, Any]) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
         session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
         shot, options = session.shot, session.options
@@ -136,10 +134,6 @@ class Answers:
             found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
-        if shot.view is options.camera is options.guess is None and session.has_exif:
-            found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
-        if word == "no match":
-            found["Draw the box again"] = lambda: shot.set_box(None)
         return found
 
     async def _draw_cards(self, shot: Shot) -> None:

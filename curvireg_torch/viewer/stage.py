@@ -13,13 +13,11 @@ from ..geometry import Camera
 from ..registration import Registrar
 from ..rendering import shade
 from ..visualization.contours import contour_layer
-from ..visualization.encoding import jpeg, png, shrink
-from ..visualization.overlay import LEGEND, to_uint8
+from ..visualization.encoding import jpeg, png, shrink, to_uint8
+from ..visualization.overlay import LEGEND
 from .shot import Numbers, Point, Shot, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
-
-__all__ = ["Stage"]
 
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
 THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs

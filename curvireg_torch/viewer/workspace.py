@@ -21,8 +21,6 @@ from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from .session import STATIC, Session
 
-__all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
-
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")

@@ -10,8 +10,6 @@ from torch import Tensor
 from ..rendering import DepthRenderer
 from .encoding import to_uint8
 
-__all__ = ["close_up", "contour_layer", "draw_box", "draw_window", "line_width"]
-
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
 JUMP = 0.03  # step at an occluding edge inside the outline, as a fraction of the depth range

@@ -22,8 +22,6 @@ from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
 from .encoding import to_uint8
 
-__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "views_sheet"]
-
 LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
 NARROWEST = 720  # px of width that the caption needs
 TILE = 180  # least side of a small picture in px

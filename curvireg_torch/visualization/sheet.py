@@ -13,8 +13,6 @@ from ..utils.files import write_file
 from .contours import close_up, draw_window
 from .encoding import jpeg
 
-__all__ = ["SheetEntry", "thumbnail", "write_sheet"]
-
 SIDE = 224  # longer side of a thumbnail in px
 MAX_ENTRIES = 500  # of the best, and of the worst: a larger page would be slow to open
 
