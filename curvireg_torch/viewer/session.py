@@ -27,7 +27,7 @@ from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
 from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
-from .shot import Numbers, Result, Shot, numbers
+from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
@@ -305,12 +305,11 @@ class Session:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled, self.searched = False, ()
-        result = Result(registrar, *found, inputs)
+        result = Result(registrar, *found, inputs, Answer(found[0].hypotheses[0]))
         result.document["viewer"] = {"command": command}
         boxes = [view.box for view in result.registration.views] or [torch.tensor(used_box(result.document))]
         for each, box in zip(shots, boxes, strict=True):
             each.result, each.found_box = result, box
-        shot.choose(0)
         return result.registration
 
     def _register_alone(
@@ -345,8 +344,8 @@ class Session:
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
-        result, answer = self.shot.require_result()
-        document, registration = dict(result.document), answer.registration(result.registration)
+        result = self.shot.require_result()
+        document, registration, answer = dict(result.document), result.chosen, result.answer
         if registration is not result.registration:
             document |= registration.to_dict()
             if registration.views:
@@ -363,7 +362,7 @@ class Session:
 
     def python(self) -> str:
         """A Python program that gives the answer."""
-        result, answer = self.shot.require_result()
+        result = self.shot.require_result()
         (request, boxes), prior = result.inputs, result.registration.prior
         mesh, rows = repr(self.usable_name(request.meshes[0])), result.document["views"]
         photos = [repr(self.usable_name(path)) for path in request.photos]
@@ -394,8 +393,8 @@ class Session:
             "",
             f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
             *call,
-            f"pose = result.hypotheses[{answer.number}].pose_dict()",
-            *([f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []),
+            f"pose = result.hypotheses[{result.answer.number}].pose_dict()",
+            *([f"pose = {result.answer.pose.pose_dict()}  # corrected by hand"] if result.answer.edits else []),
         ]
         return "\n".join([*lines, "print(pose)", ""])
 

@@ -83,8 +83,8 @@ class Answers:
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
-        result, answer = self.session.shot.require_result()
-        document, shot, pose = self.session.document(), self.session.shot, answer.pose
+        document, shot, result = self.session.document(), self.session.shot, self.session.shot.require_result()
+        answer, pose = result.answer, result.answer.pose
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = verdict(document["confidence"], document["none"], document["reliable"])
@@ -137,7 +137,7 @@ class Answers:
         return found
 
     async def _draw_cards(self, shot: Shot) -> None:
-        (result, _), photo, box = shot.require_result(), shot.photo, shot.found_box
+        result, photo, box = shot.require_result(), shot.photo, shot.found_box
         assert photo is not None
         image, around = photo.image, [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses

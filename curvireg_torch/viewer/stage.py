@@ -131,7 +131,7 @@ class Stage:
             shot.set_box(None)
 
     def _change_pose(self, what: Any, point: Point) -> None:
-        (result, _), (T, K) = self.session.shot.require_result(), self.session.shot.projection
+        result, (T, K) = self.session.shot.require_result(), self.session.shot.projection
         kind = what["type"]
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
@@ -166,7 +166,7 @@ class Stage:
             return
         self._following, drawn = True, None
         shot = self.session.shot
-        registrar, K = shot.require_result()[0].registrar, shot.projection[1]
+        registrar, K = shot.require_result().registrar, shot.projection[1]
         try:
             while self.moved is not None and self.moved is not drawn:
                 drawn = self.moved
@@ -282,7 +282,7 @@ class Stage:
         shot = self.session.shot
         if shot.answer is None:
             return
-        registrar, projection = shot.require_result()[0].registrar, shot.projection
+        registrar, projection = shot.require_result().registrar, shot.projection
         if layers := await self.workspace.run(
             "page", lambda: pose_layers(registrar, projection, shot.size, LAYER_SIDE)
         ):

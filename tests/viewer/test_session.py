@@ -22,7 +22,7 @@ from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
-from curvireg_torch.viewer.shot import Answer, dragged_box
+from curvireg_torch.viewer.shot import dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -102,7 +102,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     assert session.document()["none"] == pytest.approx(0.02)
     assert session.document()["covariance"] is None
     session.shot.choose(0)
-    assert Answer(found.hypotheses[0]).registration(calibrated) is calibrated
+    assert session.shot.result.chosen is calibrated
     session.shot.result = replace(session.shot.result, registration=found)
     # The file is a start for the command line, and picture and scene show the same pose.
     folder = registered[1]
