@@ -172,22 +172,18 @@ def _check_sizes(tree: dict[str, Any]) -> None:
             raise ValueError("an accessor of a part is sparse or without data, which is not read; export without it")
         return int(accessor["count"])
 
-    def sizes(mesh: dict[str, Any]) -> tuple[int, int, int]:
-        """Parts, vertices and faces of a mesh."""
-        vertices, faces = 0, 0
-        for part in mesh["primitives"]:
-            n = max(map(count, part["attributes"].values()), default=0)
-            corners = count(part["indices"]) if "indices" in part else n
-            vertices, faces = vertices + n, faces + (corners if part.get("mode", 4) == 5 else corners // 3)
-        return len(mesh["primitives"]), vertices, faces
+    def corners(part: dict[str, Any]) -> int:
+        """Corners of the faces of a part, or its vertices if these are more."""
+        used = [*part["attributes"].values(), *([part["indices"]] if "indices" in part else [])]
+        return max(map(count, used), default=0)
 
-    meshes = [sizes(mesh) for mesh in tree.get("meshes", [])]
+    meshes = [(len(mesh["primitives"]), sum(map(corners, mesh["primitives"]))) for mesh in tree.get("meshes", [])]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
     for each in (meshes, copies):
-        parts, vertices, faces = (sum(column) for column in zip((0, 0, 0), *each, strict=True))
+        parts, most = (sum(column) for column in zip((0, 0), *each, strict=True))
         if parts > MAX_MESH_PARTS:
             raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-        if max(vertices / 3, faces) > MAX_MESH_FACES:
+        if most > 3 * MAX_MESH_FACES:
             raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
 
 

@@ -36,12 +36,8 @@ def build_page(workspace: Workspace) -> None:
     with region("div", "work", id="work"):
         stage = Stage(workspace)
         with region("div", "side"):
-            steps, answers, preview, inputs = (
-                Steps(workspace),
-                Answers(workspace),
-                Preview(workspace),
-                Inputs(workspace),
-            )
+            steps, answers = Steps(workspace), Answers(workspace)
+            preview, inputs = Preview(workspace), Inputs(workspace)
 
     async def refresh() -> None:
         steps.refresh()
@@ -76,7 +72,7 @@ class Steps:
                         self.messages["rig"] = self._message("rig")
                         with region("div", "row below"):
                             self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
-                            self.no_rig = button("Without the rig", workspace.remove_rig, "no-rig", "quiet")
+                            self.no_rig = button("Without the rig", lambda: workspace.open_rig(None), "no-rig", "quiet")
                     if name == "mesh":
                         self.use_mm = button(
                             "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
@@ -106,10 +102,8 @@ class Steps:
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        set_text(
-            self.facts["box"],
-            " ".join(f"{v:g}" for v in shot.box or ()) or (BOX_HINT_IN_RIG if shot.view else BOX_HINT),
-        )
+        box = " ".join(f"{v:g}" for v in shot.box or ())
+        set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())
         counted = f"{together} photograph{'s' * (together > 1)}"
         set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
@@ -136,7 +130,7 @@ class Steps:
         path = self.session.mesh_path
         if path is None:
             return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
-        return f"{self.session.name(path)}: {self.workspace.mesh_facts}"
+        return f"{self.session.name(path)}: {self.session.mesh_facts}"
 
     def _show_progress(self) -> None:
         session, workspace = self.session, self.workspace

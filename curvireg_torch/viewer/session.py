@@ -44,7 +44,8 @@ class Session:
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
         rig_path, rig: the file of a rig, and its rows; none if it could not be read.
-        searched: those in which a registration runs.
+        mesh_path, mesh, mesh_facts: the mesh, and what it is in words.
+        searched: photographs in which a registration runs.
         progress, cancelled: stage, done and total of a registration; True ends it at its next step.
     """
 
@@ -57,19 +58,21 @@ class Session:
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: trimesh.Trimesh | None = None
+    mesh_facts: str = ""
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
 
-    def load(self) -> str:
-        """Open the files that the options name, and take their box; describes the mesh, or ""."""
+    def load(self) -> None:
+        """Open the files that the options name, and take their box."""
         options = self.options
         if options.box is not None and not options.photos:
             raise InvalidInputError("--box: needs a photograph; name one, or draw the box on the page")
         self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
             self.open_photo(path, options.box)
-        return "".join([self.open_mesh(path) for path in options.meshes])
+        for path in options.meshes:
+            self.open_mesh(path)
 
     def name(self, path: str | Path) -> str:
         """What the user calls a file."""
@@ -203,7 +206,7 @@ class Session:
             raise
         self._replace_shots(shots)
 
-    def open_mesh(self, path: Path) -> str:
+    def open_mesh(self, path: Path) -> None:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
         if path.suffix == ".safetensors":
             bank = ViewBank.load(path)
@@ -213,12 +216,11 @@ class Session:
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
             colours = "in its colours" if has_colours(mesh) else "in grey"
             facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
-        self.mesh_path, self.mesh = path, mesh
+        self.mesh_path, self.mesh, self.mesh_facts = path, mesh, facts
         for shot in self.shots:
             shot.result = None
         if self.rig_path is not None and self.rig_path.is_dir():  # boxes of a BOP scene are those of the mesh
             self.open_rig(self.rig_path)
-        return facts
 
     @property
     def has_exif(self) -> bool:
@@ -441,7 +443,6 @@ def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: st
     for option, value in values.items():
         if value is not None:
             texts = [str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))]
-            words += (
-                [f"--{option}={value}"] if texts[0][0] == "-" and isinstance(value, str) else [f"--{option}", *texts]
-            )
+            is_like_option = texts[0][0] == "-" and isinstance(value, str)
+            words += [f"--{option}={value}"] if is_like_option else [f"--{option}", *texts]
     return shlex.join([*words, "--out", "result"])

@@ -45,7 +45,7 @@ class Workspace:
         session: inputs and results.
         messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
-        receiving, mesh_facts: folders, names and sizes of files that are being received; the mesh in words.
+        receiving: folders, names and sizes of files that are being received.
         started: when the search began, in seconds of ``time.monotonic``.
     """
 
@@ -54,7 +54,7 @@ class Workspace:
         self.messages: dict[str, str] = {}
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving = dict[Path, tuple[str, int]]()
-        self.mesh_facts, self.started, self._version = "", 0.0, 0
+        self.started, self._version = 0.0, 0
         self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
         self._begun = False  # whether the search has waited for the jobs before it
@@ -74,7 +74,9 @@ class Workspace:
             if stop and self._search is not None and self._begun:  # else it waits for this job
                 self.stop()
                 await asyncio.wait({self._search})
-            return await self._attempt(part, job)
+            result = await self._attempt(part, job)
+            self._remove_unused()
+            return result
 
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
         self.messages.pop(part, None)
@@ -150,10 +152,10 @@ class Workspace:
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
             if path.name == "scene_camera.json" and session.options.unit == "m":
                 await self.set_option("unit", "mm")  # of BOP sets
-            await self._open_rig(path.parent if path.name == "scene_camera.json" else path)
+            await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
-            await self._open_rig(rig)
+            await self.open_rig(rig)
         elif suffix in CALIBRATIONS:
             await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
         elif suffix == ".zip":
@@ -172,13 +174,9 @@ class Workspace:
             if not any(folder in (path, *path.parents) for path in used):
                 shutil.rmtree(folder)
 
-    async def _open_rig(self, path: Path | None) -> None:
+    async def open_rig(self, path: Path | None) -> None:
+        """Replace the rig; None: each photograph is registered alone."""
         await self.run("rig", lambda: self.session.open_rig(path), stop=True)
-
-    async def remove_rig(self) -> None:
-        """Forget the rig: each photograph is registered alone."""
-        await self._open_rig(None)
-        self._remove_unused()
 
     async def open_photo(self, path: Path) -> None:
         """Add a photograph, and show it."""
@@ -186,13 +184,12 @@ class Workspace:
 
     async def open_mesh(self, path: Path) -> None:
         """Replace the mesh; a search for the former one is stopped."""
-        self.mesh_facts = await self.run("mesh", lambda: self.session.open_mesh(path), stop=True) or self.mesh_facts
+        await self.run("mesh", lambda: self.session.open_mesh(path), stop=True)
 
     async def remove_photo(self) -> None:
         """Close the photograph that is shown; a search in it is stopped."""
         shot = self.session.shot
         await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot in self.session.searched)
-        self._remove_unused()
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
@@ -210,7 +207,7 @@ class Workspace:
         """Open the files that the options name; their warnings become messages."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            self.mesh_facts = self.session.load()
+            self.session.load()
         if caught:
             self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
@@ -227,7 +224,7 @@ class Workspace:
         shot = session.open_photo(STATIC / "coffee.jpg", SAMPLE_BOX)
         assert shot.photo is not None
         shot.photo = replace(shot.photo, notes=(SAMPLE_CREDIT,))
-        self.mesh_facts = session.open_mesh(STATIC / "cup.ply")
+        session.open_mesh(STATIC / "cup.ply")
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""

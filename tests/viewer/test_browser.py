@@ -12,10 +12,7 @@ from tests.viewer.test_session import run_command
 
 OPTIONS = ["--pipeline", "small.json"]  # of the command that starts the viewer
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
-]
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")]
 
 
 def test_uploads_that_are_too_large_or_have_no_length_are_refused_before_they_are_read(address):

@@ -15,10 +15,7 @@ from tests.viewer.test_browser import scroll
 
 OPTIONS = []  # of the command that starts the viewer
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
-]
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")]
 
 
 @pytest.fixture(autouse=True)

@@ -181,10 +181,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert len(shot.answer.edits) == 2
     send(posed, "undo")
     assert len(shot.answer.edits) == 1
-    for kind, values in (
-        ("scale", {"factor": 1.1, "roll": 5.0}),
-        ("nudge", {"dx": 1, "dy": 0, "shift": True}),
-    ):
+    for kind, values in (("scale", {"factor": 1.1, "roll": 5.0}), ("nudge", {"dx": 1, "dy": 0, "shift": True})):
         send(posed, kind, **values)
     assert len(shot.answer.edits) == 1, "one change, when it rests"
     posed._last_gesture -= 10

@@ -55,7 +55,7 @@ def test_uploads_find_their_place(workspace, scene):
     session = workspace.session
     for name in ("truck.ply", "part.PLY"):
         asyncio.run(upload(workspace, scene / "truck.ply", name))
-        assert "968 faces" in workspace.mesh_facts
+        assert "968 faces" in workspace.session.mesh_facts
     for name in ("a.png", "b.png"):
         asyncio.run(upload(workspace, scene / "photo.png", name))
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "b.png")
@@ -123,7 +123,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
         assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
     assert session.shot.photo.image.shape == (3, 400, 600)
     assert "CC0" in session.shot.photo.notes[0]
-    assert workspace.mesh_facts.endswith("mm, rendered in its colours")
+    assert workspace.session.mesh_facts.endswith("mm, rendered in its colours")
     assert workspace.messages == {}
     asyncio.run(upload(workspace, scene, "notes.pdf", b"x"))
     assert session.options.pose == "upright", "it replaces nothing"
@@ -132,7 +132,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     assert (names(workspace), session.mesh_path, session.shot.box) == (["photo.png"], None, None)
     assert session.request().guess is None
     asyncio.run(upload(workspace, scene / "truck.ply"))
-    assert workspace.mesh_facts.endswith(" ft, rendered in grey")
+    assert workspace.session.mesh_facts.endswith(" ft, rendered in grey")
 
 
 def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
