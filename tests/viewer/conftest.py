@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.viewer.workspace import Workspace
 from tests._support.exif import exif, with_exif
 from tests.viewer.browser import Browser, wait_for
 from tests.viewer.test_session import new_session, write_scene
@@ -80,3 +82,9 @@ def registered(tmp_path_factory):
         session.set_camera((260.0, 260.0, 119.5, 89.5))
         session.register()
         yield session, folder, T
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    (tmp_path / "uploads").mkdir()
+    return Workspace(RegisterOptions(), tmp_path / "uploads")

@@ -51,12 +51,6 @@ def rig(tmp_path_factory):
     return folder, write_rig(folder)
 
 
-@pytest.fixture
-def workspace(tmp_path):
-    (tmp_path / "uploads").mkdir()
-    return Workspace(RegisterOptions(), tmp_path / "uploads")
-
-
 def send(workspace, folder, *names):
     async def work():
         for name in names:

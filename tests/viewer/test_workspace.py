@@ -17,7 +17,7 @@ import trimesh
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.viewer import workspace as module
-from curvireg_torch.viewer.workspace import Workspace, file_name, show_warning, unpack
+from curvireg_torch.viewer.workspace import file_name, show_warning, unpack
 from tests.viewer.test_session import write_scene
 
 
@@ -25,12 +25,6 @@ from tests.viewer.test_session import write_scene
 def scene(tmp_path):
     write_scene(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def workspace(tmp_path):
-    (tmp_path / "uploads").mkdir()
-    return Workspace(RegisterOptions(), tmp_path / "uploads")
 
 
 async def upload(workspace, path, name=None, content=None):
