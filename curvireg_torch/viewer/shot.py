@@ -27,7 +27,7 @@ Numbers = tuple[float, float, float, float]
 Point = tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
     """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
 
@@ -36,7 +36,7 @@ class Answer:
     edits: tuple[str, ...] = ()
 
 
-@dataclass
+@dataclass(eq=False)
 class Result:
     """A registration with its inputs, of one photograph or of those of a rig, and its chosen answer.
 
@@ -68,6 +68,10 @@ class Result:
         rest: dict[str, Any] = {"confidence_features": {}, "views": views}
         return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
 
+    def centre(self, T: Tensor) -> Tensor:
+        """(3,) of the object in the camera, at a (4, 4) pose."""
+        return T[:3, :3] @ self.registrar.describer.centre + T[:3, 3]
+
     def moved(
         self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
     ) -> Tensor:
@@ -77,7 +81,7 @@ class Result:
         """
         describer = self.registrar.describer
         angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
-        centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
+        centre = self.centre(T) + describer.radius * shift
         if float(centre[2]) < NEAREST * describer.radius:
             raise InvalidInputError("the object would touch the camera; move it away")
         T = T.clone()
@@ -87,21 +91,18 @@ class Result:
 
     def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
         """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
-        describer, (dx, dy) = self.registrar.describer, (end[0] - start[0], end[1] - start[1])
+        dx, dy = end[0] - start[0], end[1] - start[1]
         if max(abs(dx), abs(dy)) < 1.0:  # a click
             return T
-        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
-        radii = depth / float(K[0, 0]) / describer.radius  # that one pixel is long
+        radii = float(self.centre(T)[2]) / float(K[0, 0]) / self.registrar.describer.radius  # that one pixel is long
         if turns:
             return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
         return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
 
     def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
         """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
-        describer = self.registrar.describer
-        centre = T[:3, :3] @ describer.centre + T[:3, 3]
-        shift = ((1.0 / factor - 1.0) * centre / describer.radius).tolist()
-        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift)
+        shift = (1.0 / factor - 1.0) * self.centre(T) / self.registrar.describer.radius
+        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift.tolist())
 
 
 @dataclass(eq=False)
@@ -174,10 +175,9 @@ class Shot:
     def place(self, T: Tensor, edit: str = "moved") -> None:
         """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
         result = self.require_result()
-        answer, describer, (before, K) = result.answer, result.registrar.describer, self.projection
-        old, centre = (pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T))
+        answer, (before, K), centre = result.answer, self.projection, result.centre(T)
         degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        radii = float(torch.linalg.vector_norm(centre - old)) / describer.radius
+        radii = float(torch.linalg.vector_norm(centre - result.centre(before))) / result.registrar.describer.radius
         allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
         placed = T if self.view is None else torch.linalg.inv(self.view.T_cam_from_world) @ T
         pose = replace(

@@ -13,7 +13,7 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .shot import Answer, Numbers, Result, Shot
+from .shot import Answer, Numbers, Result, Shot, numbers
 from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
 
@@ -71,11 +71,11 @@ class Answers:
         """Show the answer of the session, if it changed."""
         shot, answer = self.session.shot, self.session.shot.answer
         self.section.set_visibility(answer is not None)
-        if self.shown_answer[0] is not answer or self.shown_answer[1] is not shot:
+        if self.shown_answer != (answer, shot):
             self.shown_answer = answer, shot
             if answer is not None:
                 self._describe()
-        if self.shown_cards[0] is not shot.result or self.shown_cards[1] is not shot:
+        if self.shown_cards != (shot.result, shot):
             self.shown_cards = shot.result, shot
             if shot.result is not None:
                 await self._draw_cards(shot)
@@ -95,9 +95,8 @@ class Answers:
         set_text(self.certainty, "" if document["confidence"] is None else f"probability {document['confidence']:.2f}")
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
-        azimuth, elevation, theta = pose.viewpoint
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
-        lines.append(f"azimuth {azimuth:.1f}, elevation {elevation:.1f}, theta {theta:.1f} degrees")
+        lines.append("azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint))
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
             frame = "translation" if shot.view is None else "translation in the world"
@@ -197,14 +196,11 @@ class Inputs:
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
     async def _typed(self) -> None:
-        typed = _numbers(self.camera.value)
+        typed = _typed_numbers(self.camera.value)
         if typed is None or typed == self._camera():  # unfinished, or shown by refresh
             return
-        match typed:
-            case fx, fy, cx, cy:
-                await self._set_camera((fx, fy, cx, cy))
-            case _:
-                await self._set_camera(guess=next(iter(typed), None))
+        camera = numbers(typed) if len(typed) == 4 else None
+        await self._set_camera(camera, None if camera else next(iter(typed), None))
 
     async def _set_camera(self, camera: Numbers | None = None, guess: str | float | None = None) -> None:
         await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
@@ -223,7 +219,7 @@ class Inputs:
         if now == self.shown:
             return
         self.shown, camera = now, self._camera()
-        if _numbers(self.camera.value) != camera:
+        if _typed_numbers(self.camera.value) != camera:
             self.camera.value = " ".join(repr(value).removesuffix(".0") for value in camera)
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
@@ -245,13 +241,13 @@ class Inputs:
         return "" if camera else "unknown: the result is a rotation without translation"
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
+def _typed_numbers(text: str | None) -> tuple[float, ...] | None:
     """fx, fy, cx, cy, a field of view, or nothing; None while they are being typed."""
     try:
-        numbers = tuple(float(word) for word in (text or "").replace(",", " ").split())
+        found = tuple(float(word) for word in (text or "").replace(",", " ").split())
     except ValueError:
         return None
-    return numbers if len(numbers) in (0, 4) or (len(numbers) == 1 and 1 < numbers[0] < 180) else None
+    return found if len(found) in (0, 4) or (len(found) == 1 and 1 < found[0] < 180) else None
 
 
 class Preview:
@@ -310,11 +306,8 @@ class Preview:
             self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))
 
     def _draw(self, url: str) -> None:
-        camera, grey = ui.scene.perspective_camera(fov=40), "#c8ced3"
-        with (
-            self.place,
-            ui.scene(340, 240, grid=False, camera=camera, on_click=self._clicked, background_color=grey) as scene,
-        ):
+        look = {"grid": False, "camera": ui.scene.perspective_camera(fov=40), "background_color": "#c8ced3"}
+        with self.place, ui.scene(340, 240, on_click=self._clicked, **look) as scene:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")

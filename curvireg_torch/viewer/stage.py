@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,8 @@ class Stage:
                 self.strip = region("div", "strip", role="group", aria_label="photographs", data_testid="strip")
                 with region("div", "toolbar", role="toolbar", aria_label="photograph, box and pose"):
                     self.modes = {
-                        "box": button("Box", lambda: self._set_mode("box"), "mode-box", "quiet"),
-                        "pose": button("Pose", lambda: self._set_mode("pose"), "mode-pose", "quiet"),
+                        mode: button(mode.capitalize(), lambda mode=mode: self._set_mode(mode), f"mode-{mode}", "quiet")
+                        for mode in HELP
                     }
                     self.undo = button("Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it")
                     self.fit = button("Fit the contours", self._fit, "fit", "quiet")
@@ -238,12 +239,9 @@ class Stage:
             self.strip.clear()
             for number, picture in enumerate(pictures):
                 url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
-                test_id = f"photograph-{number + 1}"
                 name = self.session.name(shots[number].path)
-                with (
-                    self.strip,
-                    region("button", "thumbnail", type="button", title=name, data_testid=test_id) as thumbnail,
-                ):
+                attributes = {"type": "button", "title": name, "data_testid": f"photograph-{number + 1}"}
+                with self.strip, region("button", "thumbnail", **attributes) as thumbnail:
                     region("img", src=url, alt=name)
                 thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
         for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
@@ -283,9 +281,8 @@ class Stage:
         if shot.answer is None:
             return
         registrar, projection = shot.require_result().registrar, shot.projection
-        if layers := await self.workspace.run(
-            "page", lambda: pose_layers(registrar, projection, shot.size, LAYER_SIDE)
-        ):
+        draw = partial(pose_layers, registrar, projection, shot.size, LAYER_SIDE)
+        if layers := await self.workspace.run("page", draw):
             self._show_layers(layers)
 
     def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:
