@@ -140,8 +140,8 @@ class Browser:
             held()
         ActionChains(self.driver, duration=50).release().perform()
 
-    def extent(self):
-        """Box of the mesh that is drawn over the photograph, in px of that layer."""
+    def extent(self, width):
+        """Box of the mesh that is drawn over the photograph, which is ``width`` px wide."""
         script = """
             const image = document.querySelectorAll('.canvas img')[1], canvas = document.createElement('canvas');
             [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
@@ -151,8 +151,9 @@ class Browser:
             const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
             const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
             const y = drawn.map(k => Math.floor(k / canvas.width));
-            return [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))]"""
-        return self.driver.execute_script(script)
+            const box = [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))];
+            return box.map(v => v * arguments[0] / canvas.width)"""
+        return self.driver.execute_script(script, width)
 
     def box(self):
         facts = self.text("box-facts")

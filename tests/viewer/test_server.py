@@ -13,8 +13,6 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen
 
-OPTIONS = []  # of the command that starts the viewer
-
 
 async def page(scope, _, send):
     if scope["type"] == "websocket":
