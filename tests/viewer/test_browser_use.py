@@ -101,6 +101,7 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
 
 
 def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser):
+    browser.unfold("command-line")
     first = saved(browser)
     assert first["viewer"]["command"] == browser.text("command")
     browser.click("answer-2")
