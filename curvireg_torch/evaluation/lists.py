@@ -14,8 +14,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import check_table_size, write_csv, write_file
-from ..visualization.encoding import png
-from ..visualization.overlay import to_uint8
+from ..visualization.encoding import png, to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .runner import Entry, OpenRegistrar, failed_row, run_entries, thumbnail_of

@@ -15,6 +15,7 @@ TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are 
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
+_Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]  # by their ids, images, which so keep them, and pixels
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,11 @@ def has_colours(mesh: Any) -> bool:
 def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[SurfaceColours | None]:
     """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used. A texture is decoded once,
     however many meshes share it. ``close`` frees its picture then."""
-    textures, found = _Textures(close=close), []
+    known: _Textures = {}
+    found = []
     for mesh in meshes:
         try:
-            colours = _surface_colours(mesh, textures)
+            colours = _surface_colours(mesh, known, close=close)
             if colours is not None and len(colours) != len(mesh.faces):
                 raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
@@ -105,10 +107,10 @@ def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[Surf
 def surface_colours(mesh: Any) -> SurfaceColours | None:
     """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white. They come from
     ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``."""
-    return _surface_colours(mesh, _Textures())
+    return _surface_colours(mesh, {})
 
 
-def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
+def _surface_colours(mesh: Any, known: _Textures, *, close: bool = False) -> SurfaceColours | None:
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
@@ -131,7 +133,7 @@ def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
         x = np.asarray(factor[:3], np.float64) / 255
         srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
         colour = np.asarray((255 * srgb).round(), np.uint8)
-    texture = None if image is None or visual.uv is None else textures(image)
+    texture = None if image is None or visual.uv is None else _decoded(image, known, close)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
@@ -140,24 +142,19 @@ def _surface_colours(mesh: Any, textures: "_Textures") -> SurfaceColours | None:
     return None if unset else SurfaceColours.plain(len(faces), colour)
 
 
-class _Textures:
-    """(h, w, 3) uint8 of PIL images, each decoded once. None, with a warning, if one cannot be used."""
-
-    def __init__(self, *, close: bool = False) -> None:
-        self._close, self._known = close, dict[int, tuple[Any, NDArray[np.uint8] | None]]()
-
-    def __call__(self, image: Any) -> NDArray[np.uint8] | None:
-        if id(image) not in self._known:
-            try:
-                texture = _texture(image)
-            except Exception as error:  # decoders raise anything
-                message = f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
-                warnings.warn(message, stacklevel=2)
-                texture = None
-            if self._close:
-                image.close()
-            self._known[id(image)] = image, texture  # the image, so that no other one gets its id
-        return self._known[id(image)][1]
+def _decoded(image: Any, known: _Textures, close: bool) -> NDArray[np.uint8] | None:
+    """(h, w, 3) uint8 of a PIL image, decoded once; None, with a warning, if it cannot be used."""
+    if id(image) not in known:
+        texture = None
+        try:
+            texture = _texture(image)
+        except Exception as error:  # decoders raise anything
+            message = f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
+            warnings.warn(message, stacklevel=2)
+        if close:
+            image.close()
+        known[id(image)] = image, texture
+    return known[id(image)][1]
 
 
 def _texture(image: Any) -> NDArray[np.uint8]:

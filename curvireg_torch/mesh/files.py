@@ -92,13 +92,13 @@ def _read(path: Path, folder: "_Folder") -> Any:
         if suffix == ".obj":
             data = obj_with_triangles(data)
         elif suffix == ".off":
-            data = off_with_triangles(data)
+            return _off_mesh(data)
         elif suffix in (".glb", ".gltf"):
             check_gltf(data)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of values that as_mesh reports
             content = trimesh.load(BytesIO(data), file_type=suffix[1:], resolver=folder, process=False)
-            return ply_with_triangles(content) if suffix == ".ply" else content
+            return _ply_mesh(content) if suffix == ".ply" else content
     except IndexError as error:
         message = "cannot be read as a mesh (a face names a vertex that the file lacks); re-export the file"
         raise MeshError(message, subject=path) from error
@@ -132,31 +132,22 @@ class _Folder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 def check_gltf(data: bytes) -> None:
     """Raise ValueError for glTF that trimesh would read wrongly, or for which it would take too much memory."""
     if data.startswith(b"glTF"):
-        if len(data) < 20:
-            raise ValueError("the file ends too early")
         data = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
     if len(data) > MAX_TABLE_BYTES:
         raise ValueError(f"its JSON is larger than {MAX_TABLE_BYTES:,} bytes")
+    tree = json.loads(data)
     try:
-        tree = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"its JSON is damaged ({error})") from None
-    try:
-        _check_extensions(tree)
+        if not str(tree["asset"]["version"]).startswith("2."):
+            raise ValueError("only glTF version 2 is read; export version 2")
+        names = [str(name) for name in tree.get("extensionsRequired", [])]
+        names += [name for node in tree.get("nodes", []) for name in node.get("extensions", {}) if "instancing" in name]
+        for name in names:
+            if not name.startswith(_READ_EXTENSIONS):
+                raise ValueError(f"it requires the glTF extension {name[:60]}, which is not read; export without it")
         _check_sizes(tree)
         _check_nodes(tree)
     except (TypeError, AttributeError, KeyError, IndexError) as error:
         raise ValueError(f"not valid glTF ({type(error).__name__}: {error})") from error
-
-
-def _check_extensions(tree: dict[str, Any]) -> None:
-    if not str(tree["asset"]["version"]).startswith("2."):
-        raise ValueError("only glTF version 2 is read; export version 2")
-    names = [str(name) for name in tree.get("extensionsRequired", [])]
-    names += [name for node in tree.get("nodes", []) for name in node.get("extensions", {}) if "instancing" in name]
-    for name in names:
-        if not name.startswith(_READ_EXTENSIONS):
-            raise ValueError(f"it requires the glTF extension {name[:60]}, which is not read; export without it")
 
 
 def _natural(value: Any) -> int:
@@ -181,22 +172,18 @@ def _check_sizes(tree: dict[str, Any]) -> None:
             raise ValueError("an accessor of a part is sparse or without data, which is not read; export without it")
         return int(accessor["count"])
 
-    def sizes(mesh: dict[str, Any]) -> tuple[int, int, int]:
-        """Parts, vertices and faces of a mesh."""
-        vertices, faces = 0, 0
-        for part in mesh["primitives"]:
-            n = max(map(count, part["attributes"].values()), default=0)
-            corners = count(part["indices"]) if "indices" in part else n
-            vertices, faces = vertices + n, faces + (corners if part.get("mode", 4) == 5 else corners // 3)
-        return len(mesh["primitives"]), vertices, faces
+    def corners(part: dict[str, Any]) -> int:
+        """Corners of the faces of a part, or its vertices if these are more."""
+        used = [*part["attributes"].values(), *([part["indices"]] if "indices" in part else [])]
+        return max(map(count, used), default=0)
 
-    meshes = [sizes(mesh) for mesh in tree.get("meshes", [])]
+    meshes = [(len(mesh["primitives"]), sum(map(corners, mesh["primitives"]))) for mesh in tree.get("meshes", [])]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
     for each in (meshes, copies):
-        parts, vertices, faces = (sum(column) for column in zip((0, 0, 0), *each, strict=True))
+        parts, most = (sum(column) for column in zip((0, 0), *each, strict=True))
         if parts > MAX_MESH_PARTS:
             raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-        if max(vertices / 3, faces) > MAX_MESH_FACES:
+        if most > 3 * MAX_MESH_FACES:
             raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
 
 
@@ -286,26 +273,29 @@ def _absolute(corner: bytes, counts: dict[bytes, int]) -> bytes:
     return b"/".join(b"" if i is None else b"%d" % (count + 1 + i if i < 0 else i) for i, count in indices)
 
 
-def off_with_triangles(data: bytes) -> bytes:
-    """The content of an OFF file with every face a triangle; the same bytes if all are."""
+def _off_mesh(data: bytes) -> trimesh.Trimesh:
     header, _, rest = re.sub(rb"#[^\r\n]*", b"", data).partition(b"OFF")
-    lines = [line for line in rest.splitlines() if line.strip()]
+    lines = [line.split() for line in rest.splitlines() if line.strip()]
     if len(header) > 16 or not lines:
         raise ValueError("not an OFF file")
-    V, F = (int(n) for n in lines[0].split()[:2])
+    V, F = map(int, lines[0][:2])
     if V < 0 or F < 0 or len(lines) < 1 + V + F:
         raise ValueError("the file ends too early")
-    words = [line.split() for line in lines[1 + V : 1 + V + F]]
-    if all(line[0] == b"3" for line in words):
-        return data
-    faces = [[int(n) for n in line[1 : 1 + int(line[0])]] for line in words]
-    vertices = np.array([line.split()[:3] for line in lines[1 : 1 + V]], dtype=np.float64).reshape(-1, 3)
-    divided = zip(faces, divide_faces(vertices, faces), strict=True)
-    rows = [b"3 %d %d %d" % tuple(face[i] for i in one) for face, triangles in divided for one in triangles]
-    return b"\n".join([b"OFF", b"%d %d 0" % (V, len(rows)), *lines[1 : 1 + V], *rows, b""])
+    vertices = np.array([line[:3] for line in lines[1 : 1 + V]], dtype=np.float64).reshape(-1, 3)
+    faces = [list(map(int, line[1 : 1 + int(line[0])])) for line in lines[1 + V : 1 + V + F]]
+    return trimesh.Trimesh(vertices, _triangles(vertices, faces)[0], process=False)
 
 
-def ply_with_triangles(mesh: Any) -> Any:
+def _triangles(
+    vertices: NDArray[np.float64], faces: Sequence[Sequence[int]]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(T, 3) vertices of the triangles of :func:`divide_faces`, and (T,) the faces that they are of."""
+    divided = divide_faces(vertices, faces)
+    triangles = [[face[i] for i in one] for face, parts in zip(faces, divided, strict=True) for one in parts]
+    return np.array(triangles, np.int64).reshape(-1, 3), np.repeat(np.arange(len(faces)), list(map(len, divided)))
+
+
+def _ply_mesh(mesh: Any) -> Any:
     """The mesh that trimesh read from a PLY file, its faces divided by :func:`divide_faces`."""
     elements: dict[str, dict[str, Any]] = mesh.metadata.get("_ply_raw", {})
     for name, element in elements.items():
@@ -326,16 +316,14 @@ def ply_with_triangles(mesh: Any) -> Any:
         return mesh
     vertices = np.column_stack([elements["vertex"]["data"][axis] for axis in "xyz"]).astype(np.float64)
     faces = [row.tolist() for row in lists]
-    divided = divide_faces(vertices, faces)
     if mesh.visual.kind == "texture":  # trimesh's vertices are others, one for each texture coordinate
-        if any(one[0] for triangles in divided for one in triangles):
+        if any(one[0] for triangles in divide_faces(vertices, faces) for one in triangles):
             raise ValueError("concave faces with texture coordinates are not read from PLY files; export triangles")
         return mesh
-    owner = np.repeat(np.arange(len(faces)), [len(triangles) for triangles in divided])
-    triangles = [[face[i] for i in one] for face, parts in zip(faces, divided, strict=True) for one in parts]
+    triangles, owner = _triangles(vertices, faces)
     options = {}
     if {"red", "green", "blue"} <= set(names):
         options["face_colors"] = np.column_stack([values[name] for name in ("red", "green", "blue")])[owner]
     elif mesh.visual.kind == "vertex":
         options["vertex_colors"] = mesh.visual.vertex_colors
-    return type(mesh)(vertices, np.array(triangles, np.int64).reshape(-1, 3), process=False, **options)
+    return type(mesh)(vertices, triangles, process=False, **options)

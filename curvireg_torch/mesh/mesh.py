@@ -70,7 +70,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
             raise MeshError(f"its parts cannot be put together ({error}); re-export the file", subject=name) from error
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
-    if not isinstance(source, trimesh.Trimesh):
+    if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
     triangles, is_degenerate = _checked_triangles(source, name)
     vertices, faces = np.asarray(source.vertices, dtype=np.float64), triangles[~is_degenerate]
@@ -91,14 +91,11 @@ MANY_POINTS = 4096  # Points of a hull: to project more of them in every view co
 def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """(F, 3) faces, and (F,) whether a face has no area."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    if len(faces) == 0:
-        raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
     if len(faces) > MAX_MESH_FACES:
         raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise MeshError(
-            f"expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}", subject=name
-        )
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        message = f"expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}"
+        raise MeshError(message, subject=name)
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError("faces name vertices that do not exist; the file is damaged, re-export it", subject=name)
     corners = vertices[faces]

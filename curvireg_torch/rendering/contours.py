@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
-from .embree import RayScene
+from .embree import RayScene, float32
 
 MAX_OCCLUDING, MAX_CREASES = 256, 128  # Points per pose on occluding contours and on creases
 OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256  # Places per pose at which visibility is tested; some are hidden
@@ -52,15 +52,15 @@ class _Level:
 
     def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int) -> None:
         self.radius, self.edges = radius, MeshEdges(mesh, centre, max_faces)
-        self._vertices = _float32(self.edges.vertices)
+        self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
 
     def lengths(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> np.ndarray:
         """(N, E) float32 lengths of the edges in px; 0 for those outside the crop and behind the camera."""
-        x, y, z = np.moveaxis(self._vertices @ _float32(R.transpose(0, 2, 1)) + _float32(position)[:, None], -1, 0)
+        x, y, z = np.moveaxis(self._vertices @ float32(R.transpose(0, 2, 1)) + float32(position)[:, None], -1, 0)
         behind = z <= NEAR_PLANE * self.radius
         z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
-        fx, fy, cx, cy = (_float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         u, v = fx * x / z + cx, fy * y / z + cy
         beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
         a, b = self.edges.edges.T
@@ -151,10 +151,6 @@ class MeshContours:
             chosen, valid = _evenly(valid, round(density * most))
             parts.append((model[rows, chosen], normal[rows, chosen], valid, outline[rows, chosen] & valid))
         return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
-
-
-def _float32(x: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(x, np.float32)
 
 
 def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import math
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,19 +34,19 @@ class RayScene:
 
     def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """(N,) float32 distances to the first hit, in units of the directions, which may be (1, 3); inf without one."""
-        distance: np.ndarray = self._scene.run(_float32(origins), _float32(directions), query="DISTANCE")
+        distance: np.ndarray = self._scene.run(float32(origins), float32(directions), query="DISTANCE")
         distance[distance >= _MISS] = np.inf
         return distance
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
         """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3; the distance."""
-        found = self._scene.run(_float32(origins), _float32(directions), query="INTERSECT", output=True)
+        found = self._scene.run(float32(origins), float32(directions), query="INTERSECT", output=True)
         missed = found["tfar"] >= _MISS
         face, distance = np.where(missed, -1, found["primID"]), np.where(missed, np.inf, found["tfar"])
         return face, found["u"], found["v"], distance
 
 
-def _float32(x: np.ndarray) -> np.ndarray:
+def float32(x: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(x, np.float32)
 
 
@@ -56,58 +57,51 @@ class EmbreeRenderer:
     name = "embree"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        # Embree computes in float32, so the object is centred and scaled to radius 1.
-        self._centre = mesh_centre(mesh).numpy()
-        self._radius = mesh_radius(mesh)
-        vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
-        outline = extreme_points(mesh) if len(vertices) <= _MAX_HULL_VERTICES else box_corners(mesh)
-        self._outline = (outline.numpy() - self._centre) / self._radius
-        self._scene = RayScene(vertices, mesh.faces)
+        # Embree and OpenCV compute in float32, so the object is centred and scaled to radius 1.
+        self._mesh, self._centre, self._radius = mesh, mesh_centre(mesh).numpy(), mesh_radius(mesh)
+
+    def _scaled(self, points: Any) -> np.ndarray:
+        return np.asarray((np.asarray(points) - self._centre) / self._radius)
+
+    @cached_property
+    def _scene(self) -> tuple[RayScene, np.ndarray]:
+        """The triangles, and points (P, 3) whose hull is the object's."""
+        few = len(self._mesh.vertices) <= _MAX_HULL_VERTICES
+        outline = extreme_points(self._mesh) if few else box_corners(self._mesh)
+        return RayScene(self._scaled(self._mesh.vertices), self._mesh.faces), self._scaled(outline)
 
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
-        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
-        out = np.zeros((len(T), 1, *size), dtype=np.float32)
-
-        def cast(i: int) -> None:
-            if rays := self._rays(T[i], K[i], size, orthographic):
-                mask, starts, directions, near = rays
-                out[i, 0][mask] = self._depth(self._scene.distance(starts, directions), near)
-
-        for_each(len(T), cast)
-        return torch.from_numpy(out)
+        return self.faces_at(T_cam_from_model, camera_matrix, size, orthographic=orthographic)[3]
 
     def faces_at(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
         """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their points (1 - u - v) a
-        + u b + v c, with the face's corners a, b, c; and the depth of :meth:`render`."""
+        + u b + v c, with the face's corners a, b, c; and (N, 1, H, W) depth."""
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
+        scene, outline = self._scene
 
         def cast(i: int) -> None:
-            if rays := self._rays(T[i], K[i], size, orthographic):
+            if rays := self._rays(outline, T[i], K[i], size, orthographic):
                 mask, starts, directions, near = rays
-                face[i][mask], u[i][mask], v[i][mask], along = self._scene.hits(starts, directions)
-                depth[i][mask] = self._depth(along, near)
+                face[i][mask], u[i][mask], v[i][mask], along = scene.hits(starts, directions)
+                z = (along + np.float32(near)) * np.float32(self._radius)
+                depth[i][mask] = np.where(np.isinf(z), 0.0, z)
 
         for_each(len(T), cast)
         return face, u, v, torch.from_numpy(depth)[:, None]
 
-    def _depth(self, along: np.ndarray, near: float) -> np.ndarray:
-        z = (along + np.float32(near)) * np.float32(self._radius)
-        z[np.isinf(z)] = 0.0
-        return z
-
     def _rays(
-        self, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
+        self, outline: np.ndarray, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
         """Pixels (H, W) that may show the object, origins and directions of their rays, and their start depth."""
         R = T[:3, :3]
         t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
-        outline = self._outline @ R.T + t
+        outline = outline @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
             return None  # entirely behind the camera
@@ -120,7 +114,7 @@ class EmbreeRenderer:
         x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
         pixels = np.nonzero(mask)
         starts = _combined(pixels, reach * x - t[0], reach * y - t[1], near - t[2], R)
-        return mask, starts, _float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R), near
+        return mask, starts, float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R), near
 
     def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
         """(H, W) bool: pixels inside the outline's projection, dilated by one pixel."""
@@ -148,46 +142,32 @@ def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: f
     return rays
 
 
-class RasterRenderer:
-    """Draws into OpenCV's z-buffer, views in parallel on threads; ``rays`` take over where OpenCV is slower or wrong.
-    The time of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer
-    faces than the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and
-    knows no parallel projection."""
+class RasterRenderer(EmbreeRenderer):
+    """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower or wrong. The time
+    of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer faces than
+    the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and knows no
+    parallel projection."""
 
     name = "auto"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._mesh = mesh
-        # OpenCV computes in float32, so the object is centred and scaled to radius 1.
-        self._centre, self._radius = mesh_centre(mesh).numpy(), mesh_radius(mesh)
-        self._corners = (box_corners(mesh).numpy() - self._centre) / self._radius
-        vertices = (np.asarray(mesh.vertices) - self._centre) / self._radius
-        self._vertices = np.ascontiguousarray(vertices, np.float32)[:, None]
+        super().__init__(mesh)
+        self._corners = self._scaled(box_corners(mesh))
+        self._vertices = float32(self._scaled(mesh.vertices))[:, None]
         self._faces = np.array(mesh.faces, np.int32)[:, None]
         self._settings = cv2.TriangleRasterizeSettings()
         self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
-
-    @cached_property
-    def rays(self) -> EmbreeRenderer:
-        return EmbreeRenderer(self._mesh)
-
-    def faces_at(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
-        """See :meth:`EmbreeRenderer.faces_at`."""
-        return self.rays.faces_at(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
 
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
     ) -> Tensor:
         if orthographic or len(self._faces) > size[0] * size[1]:
-            return self.rays.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+            return super().render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         position = (T[:, :3, 3] + T[:, :3, :3] @ self._centre) / self._radius  # of the object's centre, in radii
         z = position[:, 2:] + T[:, 2, :3] @ self._corners.T
         near, far = z.min(axis=1) - BESIDE, z.max(axis=1) + BESIDE
         depth = np.zeros((len(T), 1, *size), np.float32)
-
         drawn = (near > NEAREST) & (far < FARTHEST)
 
         def draw(i: int) -> None:
@@ -196,7 +176,7 @@ class RasterRenderer:
 
         for_each(len(T), draw)
         if len(rest := np.nonzero(~drawn & (far > NEAREST))[0]):
-            depth[rest] = self.rays.render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
+            depth[rest] = super().render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
         return torch.from_numpy(depth)
 
     def _draw(
@@ -205,13 +185,8 @@ class RasterRenderer:
         """(H, W) depth of one view."""
         H, W = size
         # OpenCV's camera: axes of OpenGL, 90 degrees from the top to the bottom of the image, centred, square pixels.
-        shear = np.array(
-            [
-                [2.0 * K[0, 0] / H, 0.0, (2.0 * K[0, 2] - (W - 1)) / H],
-                [0.0, -2.0 * K[1, 1] / H, -(2.0 * K[1, 2] - (H - 1)) / H],
-                [0.0, 0.0, -1.0],
-            ]
-        )
+        x, y = [2.0 * K[0, 0], 0.0, 2.0 * K[0, 2] - (W - 1)], [0.0, -2.0 * K[1, 1], -(2.0 * K[1, 2] - (H - 1))]
+        shear = np.array([x, y, [0.0, 0.0, -H]]) / H
         camera = (shear @ np.column_stack([R, t])).astype(np.float32)
         z = np.full(size, far, np.float32)
         cv2.triangleRasterizeDepth(self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings)

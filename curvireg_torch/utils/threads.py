@@ -41,20 +41,16 @@ def one_torch_thread() -> Iterator[None]:
 def for_each(count: int, job: Callable[[int], object]) -> None:
     """Call ``job(0)`` to ``job(count - 1)`` on as many threads as torch may use; jobs must not call torch.
 
-    Nested calls, and those on threads of :func:`single_threaded_pool`, run in sequence unless :func:`map_on_threads`
-    left threads over. The first error stops all threads after their current job and is raised.
+    On threads of :func:`single_threaded_pool`, they run in sequence unless :func:`map_on_threads` left threads over.
+    The first error stops all threads after their current job and is raised.
     """
     threads = min(available_threads(), count)
-    if threads <= 1 or getattr(_this_thread, "working", False):
+    if threads <= 1:
         for number in range(count):
             job(number)
         return
-    with ThreadPoolExecutor(threads, initializer=_start_working) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(job, range(count)))
-
-
-def _start_working() -> None:
-    _this_thread.working = True
 
 
 def available_threads() -> int:

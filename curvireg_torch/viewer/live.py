@@ -13,8 +13,6 @@ from ..visualization.encoding import jpeg
 from ..visualization.video import annotated_frame
 from .server import listen, make_server
 
-__all__ = ["LivePage"]
-
 HOST = "127.0.0.1"
 TICK_SECONDS = 0.04  # between two looks for a new frame
 QUALITY = 80  # of the JPEG files

@@ -2,17 +2,15 @@
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
+from .session import STATIC
 from .side import Answers, Inputs, Preview
 from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
-
-__all__ = ["Steps", "build_page"]
 
 TICK_SECONDS = 0.15  # between two looks at what changed
 STAGES: Mapping[str, str] = {
@@ -28,9 +26,8 @@ BOX_HINT_IN_RIG = "Drag a rectangle around the object. Where there is none, the 
 
 def build_page(workspace: Workspace) -> None:
     """Lay out one browser window. It holds nothing: several times a second it shows what changed in the workspace."""
-    static = Path(__file__).parent / "static"
-    ui.add_css((static / "page.css").read_text())
-    ui.add_body_html(f"<script>{(static / 'page.js').read_text()}</script>")
+    ui.add_css((STATIC / "page.css").read_text())
+    ui.add_body_html(f"<script>{(STATIC / 'page.js').read_text()}</script>")
     text("a", "To the photograph", "skip", href="#work")
     ui.dark_mode(None)
     with region("header", "top"):
@@ -39,12 +36,8 @@ def build_page(workspace: Workspace) -> None:
     with region("div", "work", id="work"):
         stage = Stage(workspace)
         with region("div", "side"):
-            steps, answers, preview, inputs = (
-                Steps(workspace),
-                Answers(workspace),
-                Preview(workspace),
-                Inputs(workspace),
-            )
+            steps, answers = Steps(workspace), Answers(workspace)
+            preview, inputs = Preview(workspace), Inputs(workspace)
 
     async def refresh() -> None:
         steps.refresh()
@@ -79,7 +72,7 @@ class Steps:
                         self.messages["rig"] = self._message("rig")
                         with region("div", "row below"):
                             self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
-                            self.no_rig = button("Without the rig", workspace.remove_rig, "no-rig", "quiet")
+                            self.no_rig = button("Without the rig", lambda: workspace.open_rig(None), "no-rig", "quiet")
                     if name == "mesh":
                         self.use_mm = button(
                             "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
@@ -109,10 +102,8 @@ class Steps:
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
-        set_text(
-            self.facts["box"],
-            " ".join(f"{v:g}" for v in shot.box or ()) or (BOX_HINT_IN_RIG if shot.view else BOX_HINT),
-        )
+        box = " ".join(f"{v:g}" for v in shot.box or ())
+        set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())
         counted = f"{together} photograph{'s' * (together > 1)}"
         set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
@@ -139,7 +130,7 @@ class Steps:
         path = self.session.mesh_path
         if path is None:
             return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
-        return f"{self.session.name(path)}: {self.workspace.mesh_facts}"
+        return f"{self.session.name(path)}: {self.session.mesh_facts}"
 
     def _show_progress(self) -> None:
         session, workspace = self.session, self.workspace
@@ -153,7 +144,7 @@ class Steps:
         elif workspace.searching:
             words = "starting"
         elif workspace.receiving:
-            words = f"receiving {', '.join(workspace.receiving.values())}"
+            words = f"receiving {', '.join(name for name, _ in workspace.receiving.values())}"
         elif session.shot.result is not None:
             changed = session.shot.result.inputs != session.inputs()
             share, words = 1.0, "the inputs have changed since this answer" if changed else "done"

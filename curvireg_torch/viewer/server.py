@@ -28,8 +28,6 @@ from ..utils.threads import one_torch_thread
 from .page import build_page
 from .workspace import Workspace, file_name, show_warning
 
-__all__ = ["SECURITY_HEADERS", "guarded", "listen", "make_server", "serve"]
-
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
     "content-security-policy": "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "

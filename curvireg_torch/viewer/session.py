@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..data import read_photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
-from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
+from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
 from ..evaluation.result_files import RigPicture
 from ..evaluation.rigs import read_rig, register_rig
 from ..evaluation.runner import View, register_entry
@@ -27,14 +27,10 @@ from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
 from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
-from .shot import Numbers, Result, Shot, numbers
+from .shot import Answer, Numbers, Result, Shot, numbers
 
-__all__ = ["Session"]
-
-HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
-
+STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
-
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
@@ -48,7 +44,8 @@ class Session:
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
         rig_path, rig: the file of a rig, and its rows; none if it could not be read.
-        searched: those in which a registration runs.
+        mesh_path, mesh, mesh_facts: the mesh, and what it is in words.
+        searched: photographs in which a registration runs.
         progress, cancelled: stage, done and total of a registration; True ends it at its next step.
     """
 
@@ -61,27 +58,29 @@ class Session:
     searched: tuple[Shot, ...] = ()
     mesh_path: Path | None = None
     mesh: trimesh.Trimesh | None = None
+    mesh_facts: str = ""
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
 
-    def load(self) -> str:
-        """Open the files that the options name, and take their box; describes the mesh, or ""."""
+    def load(self) -> None:
+        """Open the files that the options name, and take their box."""
         options = self.options
         if options.box is not None and not options.photos:
             raise InvalidInputError("--box: needs a photograph; name one, or draw the box on the page")
         self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
             self.open_photo(path, options.box)
-        return "".join([self.open_mesh(path) for path in options.meshes])
+        for path in options.meshes:
+            self.open_mesh(path)
 
     def name(self, path: str | Path) -> str:
         """What the user calls a file."""
-        return Path(path).name if self.folder in Path(path).parents else str(path)
+        return Path(path).name if {self.folder, STATIC} & {*Path(path).parents} else str(path)
 
     def usable_name(self, path: Path) -> str:
-        """:meth:`name`, in commands and programs; the sample is there as long as the page is."""
-        return str(path) if path.parent == self.folder else self.name(path)
+        """:meth:`name`, in commands and programs; the sample has no other place than its own."""
+        return str(path) if path.parent == STATIC else self.name(path)
 
     def close(self) -> None:
         """Forget the photographs, the rig and the mesh."""
@@ -140,24 +139,26 @@ class Session:
         """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to photographs by their file
         names. A rig that cannot be used has no rows."""
         self.rig_path, self.rig = path, ()
-        self._replace_shots([self._open_again(shot, None) if shot.view else shot for shot in self.shots])
-        if path is None:
-            return
-        folder = path if path.is_dir() else path.parent
         try:
-            rig = tuple(read_rig(path, self.mesh_path))
-            names = [_key(view.photo) for view in rig]
-            if twice := [view.name for view, key in zip(rig, names, strict=True) if names.count(key) > 1]:
+            self.rig = () if path is None else tuple(read_rig(path, self.mesh_path))
+            names = [_key(view.photo) for view in self.rig]
+            if twice := [view.name for view, key in zip(self.rig, names, strict=True) if names.count(key) > 1]:
                 message = f"{' and '.join(twice[:2])} have the same file name; rename the photographs"
                 raise InvalidInputError(message, subject=path)
-            self.rig, shots = rig, list[Shot]()
-            for shot in self.shots:
-                view = self._row_of(shot.path, shots)
-                shots.append(self._open_again(shot, view) if view else shot)
+            self._match_rig()
         except CurviregError as error:
             self.rig = ()
-            subject = str(error.subject or "").replace(f"{folder}/", "")
+            self._match_rig()
+            folder = "" if path is None else path if path.is_dir() else path.parent
+            subject = str(error.subject).replace(f"{folder}/", "")
             raise error.with_subject(subject.replace(str(path), self.rig_name)) from error
+
+    def _match_rig(self) -> None:
+        """Give each photograph its row of the rig; the first of several that have one name gets it."""
+        shots: list[Shot] = []
+        for shot in self.shots:
+            view = self._row_of(shot.path, shots)
+            shots.append(self._open_again(shot, view) if view or shot.view else shot)
         self._replace_shots(shots)
 
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
@@ -205,7 +206,7 @@ class Session:
             raise
         self._replace_shots(shots)
 
-    def open_mesh(self, path: Path) -> str:
+    def open_mesh(self, path: Path) -> None:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
         if path.suffix == ".safetensors":
             bank = ViewBank.load(path)
@@ -215,12 +216,11 @@ class Session:
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
             colours = "in its colours" if has_colours(mesh) else "in grey"
             facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
-        self.mesh_path, self.mesh = path, mesh
+        self.mesh_path, self.mesh, self.mesh_facts = path, mesh, facts
         for shot in self.shots:
             shot.result = None
         if self.rig_path is not None and self.rig_path.is_dir():  # boxes of a BOP scene are those of the mesh
             self.open_rig(self.rig_path)
-        return facts
 
     @property
     def has_exif(self) -> bool:
@@ -234,7 +234,7 @@ class Session:
 
     def remove_limits(self) -> None:
         """Forget what was known of the pose, but not which side of the mesh is its front."""
-        self.set_limits(**{name: None for name in self.options.limits or {} if name != "front"})
+        self.set_limits(**{name: None for name in self.options.limits or {} if name not in QUALIFIERS})
 
     def object_frame(self) -> Tensor:
         """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
@@ -246,7 +246,7 @@ class Session:
         x, y, z = position
         azimuth, elevation = math.degrees(math.atan2(x, -y)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
         self.remove_limits()
-        self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=HINT_WIDTH)
+        self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=WITHIN)
 
     def mesh_axis(self, position: Sequence[float]) -> str:
         """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
@@ -301,22 +301,22 @@ class Session:
             registrar = self._open_registrar(request)
             registrar.progress = self._report_progress
             register = self._register_alone if shot.view is None else self._register_rig
-            found, boxes = register(shots, request, registrar, time.perf_counter() - start)
+            found = register(shots, request, registrar, time.perf_counter() - start)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
             self.cancelled, self.searched = False, ()
-        result = Result(registrar, *found, inputs)
+        result = Result(registrar, *found, inputs, Answer(found[0].hypotheses[0]))
         result.document["viewer"] = {"command": command}
+        boxes = [view.box for view in result.registration.views] or [torch.tensor(used_box(result.document))]
         for each, box in zip(shots, boxes, strict=True):
             each.result, each.found_box = result, box
-        shot.choose(0)
         return result.registration
 
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> Found:
         ((shot,), camera) = shots, self.options.camera
         assert shot.photo is not None
         entry = request.entry(request.photos[0])
@@ -326,11 +326,11 @@ class Session:
         if isinstance(camera, Camera):
             document["camera"] = camera.at(shot.size).describe()
             document["inputs"]["camera_source"] = "file"
-        return (registration, document, ()), [torch.tensor(used_box(document))]
+        return registration, document, ()
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> tuple[Found, list[Tensor | None]]:
+    ) -> Found:
         views = []
         for shot in shots:
             assert shot.view is not None
@@ -342,13 +342,12 @@ class Session:
         for row, shot in zip(document["views"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
             row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
-        boxes = [view.box for view in registration.views]
-        return (registration, document, photographs), boxes
+        return registration, document, photographs
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
-        result, answer = self.shot.require_result()
-        document, registration = dict(result.document), answer.registration(result.registration)
+        result = self.shot.require_result()
+        document, registration, answer = dict(result.document), result.chosen, result.answer
         if registration is not result.registration:
             document |= registration.to_dict()
             if registration.views:
@@ -365,7 +364,7 @@ class Session:
 
     def python(self) -> str:
         """A Python program that gives the answer."""
-        result, answer = self.shot.require_result()
+        result = self.shot.require_result()
         (request, boxes), prior = result.inputs, result.registration.prior
         mesh, rows = repr(self.usable_name(request.meshes[0])), result.document["views"]
         photos = [repr(self.usable_name(path)) for path in request.photos]
@@ -396,8 +395,8 @@ class Session:
             "",
             f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
             *call,
-            f"pose = result.hypotheses[{answer.number}].pose_dict()",
-            *([f"pose = {answer.pose.pose_dict()}  # corrected by hand"] if answer.edits else []),
+            f"pose = result.hypotheses[{result.answer.number}].pose_dict()",
+            *([f"pose = {result.answer.pose.pose_dict()}  # corrected by hand"] if result.answer.edits else []),
         ]
         return "\n".join([*lines, "print(pose)", ""])
 
@@ -444,7 +443,6 @@ def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: st
     for option, value in values.items():
         if value is not None:
             texts = [str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))]
-            words += (
-                [f"--{option}={value}"] if texts[0][0] == "-" and isinstance(value, str) else [f"--{option}", *texts]
-            )
+            is_like_option = texts[0][0] == "-" and isinstance(value, str)
+            words += [f"--{option}={value}"] if is_like_option else [f"--{option}", *texts]
     return shlex.join([*words, "--out", "result"])

@@ -20,8 +20,6 @@ from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 
-__all__ = ["Answer", "Numbers", "Point", "Result", "Shot", "dragged_box", "numbers"]
-
 MIN_SIDE = 3.0  # px of a new box; a smaller one was a click
 NEAREST = 1.2  # least depth of the object's centre, in its radii, to which it can be moved by hand
 
@@ -29,7 +27,7 @@ Numbers = tuple[float, float, float, float]
 Point = tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
     """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
 
@@ -37,23 +35,8 @@ class Answer:
     number: int = 0
     edits: tuple[str, ...] = ()
 
-    def registration(self, found: Registration) -> Registration:
-        """Return what was ``found`` with this pose first; nobody knows how probable a pose is that was set by hand."""
-        if self.number == 0 and not self.edits:
-            return found
-        order = sorted(range(len(found.hypotheses)), key=lambda k: k != self.number)
-        probabilities = () if self.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
-        hypotheses = (self.pose, *(found.hypotheses[k] for k in order[1:]))
-        views = found.views
-        if views:  # the same pose in the world, which nobody has compared with the photographs
-            from_found = torch.linalg.inv(found.transform) @ self.pose.transform
-            unknown: dict[str, Any] = {"edge_support": None, "similarity": None, "contribution": 0.0}
-            views = tuple(replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown) for v in views)
-        rest: dict[str, Any] = {"confidence_features": {}, "views": views}
-        return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
 
-
-@dataclass
+@dataclass(eq=False)
 class Result:
     """A registration with its inputs, of one photograph or of those of a rig, and its chosen answer.
 
@@ -65,8 +48,29 @@ class Result:
     document: dict[str, Any]  # the content of result.json, if the first answer is chosen
     photographs: Sequence[RigPicture]  # of a rig
     inputs: tuple[RegisterOptions, tuple[Numbers | None, ...]]  # what was asked for, in which boxes
-    answer: Answer | None = None
+    answer: Answer
     answer_before: Answer | None = None
+
+    @property
+    def chosen(self) -> Registration:
+        """The registration with the answer first; nobody knows how probable a pose is that was set by hand."""
+        found, answer = self.registration, self.answer
+        if answer.number == 0 and not answer.edits:
+            return found
+        order = sorted(range(len(found.hypotheses)), key=lambda k: k != answer.number)
+        probabilities = () if answer.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
+        hypotheses = (answer.pose, *(found.hypotheses[k] for k in order[1:]))
+        views = found.views
+        if views:  # the same pose in the world, which nobody has compared with the photographs
+            from_found = torch.linalg.inv(found.transform) @ answer.pose.transform
+            unknown: dict[str, Any] = {"edge_support": None, "similarity": None, "contribution": 0.0}
+            views = tuple(replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown) for v in views)
+        rest: dict[str, Any] = {"confidence_features": {}, "views": views}
+        return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
+
+    def centre(self, T: Tensor) -> Tensor:
+        """(3,) of the object in the camera, at a (4, 4) pose."""
+        return T[:3, :3] @ self.registrar.describer.centre + T[:3, 3]
 
     def moved(
         self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
@@ -77,7 +81,7 @@ class Result:
         """
         describer = self.registrar.describer
         angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
-        centre = T[:3, :3] @ describer.centre + T[:3, 3] + describer.radius * shift
+        centre = self.centre(T) + describer.radius * shift
         if float(centre[2]) < NEAREST * describer.radius:
             raise InvalidInputError("the object would touch the camera; move it away")
         T = T.clone()
@@ -87,21 +91,18 @@ class Result:
 
     def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
         """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
-        describer, (dx, dy) = self.registrar.describer, (end[0] - start[0], end[1] - start[1])
+        dx, dy = end[0] - start[0], end[1] - start[1]
         if max(abs(dx), abs(dy)) < 1.0:  # a click
             return T
-        depth = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
-        radii = depth / float(K[0, 0]) / describer.radius  # that one pixel is long
+        radii = float(self.centre(T)[2]) / float(K[0, 0]) / self.registrar.describer.radius  # that one pixel is long
         if turns:
             return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
         return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
 
     def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
         """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
-        describer = self.registrar.describer
-        centre = T[:3, :3] @ describer.centre + T[:3, 3]
-        shift = ((1.0 / factor - 1.0) * centre / describer.radius).tolist()
-        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift)
+        shift = (1.0 / factor - 1.0) * self.centre(T) / self.registrar.describer.radius
+        return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift.tolist())
 
 
 @dataclass(eq=False)
@@ -147,7 +148,7 @@ class Shot:
     @property
     def projection(self) -> tuple[Tensor, Tensor]:
         """(4, 4) ``T_cam_from_model`` of the answer in this photograph, and (3, 3) camera matrix."""
-        return self.projection_of(self.require_result()[1].pose)
+        return self.projection_of(self.require_result().answer.pose)
 
     def projection_of(self, pose: Hypothesis) -> tuple[Tensor, Tensor]:
         """Like :attr:`projection` of any pose of the result."""
@@ -160,25 +161,23 @@ class Shot:
         if box != self.box:
             self.box_before, self.box = self.box, box
 
-    def require_result(self) -> tuple[Result, Answer]:
-        """The result and the chosen pose; an error if there is none yet."""
-        if self.result is None or self.result.answer is None:
+    def require_result(self) -> Result:
+        """The result; an error if there is none yet."""
+        if self.result is None:
             raise InvalidInputError("there is no result yet; register first")
-        return self.result, self.result.answer
+        return self.result
 
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
-        assert self.result is not None
-        self.result.answer_before = None
-        self.result.answer = Answer(self.result.registration.hypotheses[number], number)
+        result = self.require_result()
+        result.answer, result.answer_before = Answer(result.registration.hypotheses[number], number), None
 
     def place(self, T: Tensor, edit: str = "moved") -> None:
         """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
-        result, answer = self.require_result()
-        describer, (before, K) = result.registrar.describer, self.projection
-        old, centre = (pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (before, T))
+        result = self.require_result()
+        answer, (before, K), centre = result.answer, self.projection, result.centre(T)
         degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        radii = float(torch.linalg.vector_norm(centre - old)) / describer.radius
+        radii = float(torch.linalg.vector_norm(centre - result.centre(before))) / result.registrar.describer.radius
         allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
         placed = T if self.view is None else torch.linalg.inv(self.view.T_cam_from_world) @ T
         pose = replace(
@@ -198,7 +197,7 @@ class Shot:
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
-        registrar, (T, K) = self.require_result()[0].registrar, self.projection
+        registrar, (T, K) = self.require_result().registrar, self.projection
         assert self.photo is not None
         contours, margin = registrar.describer.contours, registrar.bank.settings.margin
         fit = fit_contours(contours, self.photo.image, self.found_box, K, T[None], margin=margin)
@@ -213,19 +212,19 @@ class Shot:
 
     def glb(self) -> bytes:
         """The answer as a GLB file, see :func:`curvireg_torch.visualization.pose_glb`."""
-        result, answer = self.require_result()
+        result = self.require_result()
         assert self.photo is not None
         if result.photographs:
-            return views_glb(result.registrar, answer.registration(result.registration), result.photographs)
-        return pose_glb(result.registrar.bank.mesh, *answer.pose.projection, self.photo.image)
+            return views_glb(result.registrar, result.chosen, result.photographs)
+        return pose_glb(result.registrar.bank.mesh, *result.answer.pose.projection, self.photo.image)
 
     def overlay(self) -> bytes:
         """The contours at the answer on the photograph, or on those of the rig, as a PNG file."""
-        result, answer = self.require_result()
+        result = self.require_result()
         assert self.photo is not None
         if result.photographs:
-            return views_picture(result.registrar, answer.registration(result.registration), result.photographs)
-        return png(contour_overlay(result.registrar, answer.pose, self.photo.image, self.found_box))
+            return views_picture(result.registrar, result.chosen, result.photographs)
+        return png(contour_overlay(result.registrar, result.answer.pose, self.photo.image, self.found_box))
 
 
 def numbers(box: Sequence[float]) -> Numbers:

@@ -13,11 +13,9 @@ from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, verdict, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
-from .shot import Answer, Numbers, Result, Shot
+from .shot import Answer, Numbers, Result, Shot, numbers
 from .widgets import button, file_chooser, fold, region, set_text, text
 from .workspace import Workspace
-
-__all__ = ["Answers", "Inputs", "Preview"]
 
 DOWNLOADS = {
     "picture": ("overlay.png", "image/png"),
@@ -73,11 +71,11 @@ class Answers:
         """Show the answer of the session, if it changed."""
         shot, answer = self.session.shot, self.session.shot.answer
         self.section.set_visibility(answer is not None)
-        if self.shown_answer[0] is not answer or self.shown_answer[1] is not shot:
+        if self.shown_answer != (answer, shot):
             self.shown_answer = answer, shot
             if answer is not None:
                 self._describe()
-        if self.shown_cards[0] is not shot.result or self.shown_cards[1] is not shot:
+        if self.shown_cards != (shot.result, shot):
             self.shown_cards = shot.result, shot
             if shot.result is not None:
                 await self._draw_cards(shot)
@@ -85,8 +83,8 @@ class Answers:
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
-        result, answer = self.session.shot.require_result()
-        document, shot, pose = self.session.document(), self.session.shot, answer.pose
+        document, shot, result = self.session.document(), self.session.shot, self.session.shot.require_result()
+        answer, pose = result.answer, result.answer.pose
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = verdict(document["confidence"], document["none"], document["reliable"])
@@ -97,9 +95,8 @@ class Answers:
         set_text(self.certainty, "" if document["confidence"] is None else f"probability {document['confidence']:.2f}")
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
-        azimuth, elevation, theta = pose.viewpoint
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
-        lines.append(f"azimuth {azimuth:.1f}, elevation {elevation:.1f}, theta {theta:.1f} degrees")
+        lines.append("azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint))
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
             frame = "translation" if shot.view is None else "translation in the world"
@@ -113,10 +110,10 @@ class Answers:
         set_text(self.facts, "\n".join(lines))
         self.repairs.clear()
         with self.repairs:
-            for label, repair in self._repairs(document, word).items():
+            for label, repair in self._repairs(document).items():
                 button(label, repair, label.lower().replace(" ", "-"))
 
-    def _repairs(self, document: Mapping[str, Any], word: str) -> dict[str, Callable[[], None]]:
+    def _repairs(self, document: Mapping[str, Any]) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
         session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
         shot, options = session.shot, session.options
@@ -136,14 +133,10 @@ class Answers:
             found["Search without the hint"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
-        if shot.view is options.camera is options.guess is None and session.has_exif:
-            found["Search with the photograph's EXIF camera"] = lambda: search_with(guess="exif")
-        if word == "no match":
-            found["Draw the box again"] = lambda: shot.set_box(None)
         return found
 
     async def _draw_cards(self, shot: Shot) -> None:
-        (result, _), photo, box = shot.require_result(), shot.photo, shot.found_box
+        result, photo, box = shot.require_result(), shot.photo, shot.found_box
         assert photo is not None
         image, around = photo.image, [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
         renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
@@ -203,14 +196,11 @@ class Inputs:
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
     async def _typed(self) -> None:
-        typed = _numbers(self.camera.value)
+        typed = _typed_numbers(self.camera.value)
         if typed is None or typed == self._camera():  # unfinished, or shown by refresh
             return
-        match typed:
-            case fx, fy, cx, cy:
-                await self._set_camera((fx, fy, cx, cy))
-            case _:
-                await self._set_camera(guess=next(iter(typed), None))
+        camera = numbers(typed) if len(typed) == 4 else None
+        await self._set_camera(camera, None if camera else next(iter(typed), None))
 
     async def _set_camera(self, camera: Numbers | None = None, guess: str | float | None = None) -> None:
         await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
@@ -229,7 +219,7 @@ class Inputs:
         if now == self.shown:
             return
         self.shown, camera = now, self._camera()
-        if _numbers(self.camera.value) != camera:
+        if _typed_numbers(self.camera.value) != camera:
             self.camera.value = " ".join(repr(value).removesuffix(".0") for value in camera)
         for name, select in self.selects.items():
             select.value = getattr(session.options, name)
@@ -251,13 +241,13 @@ class Inputs:
         return "" if camera else "unknown: the result is a rotation without translation"
 
 
-def _numbers(text: str | None) -> tuple[float, ...] | None:
+def _typed_numbers(text: str | None) -> tuple[float, ...] | None:
     """fx, fy, cx, cy, a field of view, or nothing; None while they are being typed."""
     try:
-        numbers = tuple(float(word) for word in (text or "").replace(",", " ").split())
+        found = tuple(float(word) for word in (text or "").replace(",", " ").split())
     except ValueError:
         return None
-    return numbers if len(numbers) in (0, 4) or (len(numbers) == 1 and 1 < numbers[0] < 180) else None
+    return found if len(found) in (0, 4) or (len(found) == 1 and 1 < found[0] < 180) else None
 
 
 class Preview:
@@ -316,11 +306,8 @@ class Preview:
             self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))
 
     def _draw(self, url: str) -> None:
-        camera, grey = ui.scene.perspective_camera(fov=40), "#c8ced3"
-        with (
-            self.place,
-            ui.scene(340, 240, grid=False, camera=camera, on_click=self._clicked, background_color=grey) as scene,
-        ):
+        look = {"grid": False, "camera": ui.scene.perspective_camera(fov=40), "background_color": "#c8ced3"}
+        with self.place, ui.scene(340, 240, on_click=self._clicked, **look) as scene:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):
                 scene.line([0, 0, 0], end).material("#0a6b35" if name == "up" else "#a8201a")

@@ -2,10 +2,10 @@
 
 import asyncio
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from nicegui import ui
 from torch import Tensor
 
@@ -14,19 +14,15 @@ from ..geometry import Camera
 from ..registration import Registrar
 from ..rendering import shade
 from ..visualization.contours import contour_layer
-from ..visualization.encoding import jpeg, png, shrink
-from ..visualization.overlay import LEGEND, to_uint8
+from ..visualization.encoding import jpeg, png, shrink, to_uint8
+from ..visualization.overlay import LEGEND
 from .shot import Numbers, Point, Shot, dragged_box
 from .widgets import button, file_chooser, region, set_enabled, text
 from .workspace import Workspace
 
-__all__ = ["Stage", "contour_paths", "pose_layers"]
-
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
 THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs
-LAYER_SIDE = 1400  # px of the longer side of the layers over it
-CONTOUR_SIDE = 256  # px of the crop in which contours are followed while a pose is moved
-DASH = 0.011  # half the length of a contour's dash, as a fraction of that crop
+LAYER_SIDE, MOVING_SIDE = 1400, 480  # px of the longer side of the layers over it, and while a pose is moved
 COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
 HELP = {
     "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
@@ -42,59 +38,49 @@ class Stage:
         self.workspace, self.session = workspace, workspace.session
         self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
         self.mode, self.mask = "box", np.zeros((1, 1), bool)
-        self.pressed: tuple[Any, Point, bool] | None = (
-            None  # the box or the pose before the drag, where, whether it turns
-        )
+        # What a drag began with: the box or the pose, where, and whether it turns.
+        self.pressed: tuple[Any, Point, bool] | None = None
         self.drawn: Numbers | None = None  # the box, as it is dragged
         self.moved: Tensor | None = None  # the pose that is being moved by hand
         self._last_gesture, self._following = 0.0, False
         with region("section", "stage", aria_label="photograph", data_testid="stage"):
-            self._build_empty()
+            with region("div", "empty") as self.empty:
+                text("p", "Drop a photograph and a mesh anywhere on this page", "large")
+                text("p", "The two may come together and in any order. Nothing is sent to the internet.")
+                with region("div", "row"):
+                    file_chooser("Choose files", "upload-any")
+                    button("Try the sample", workspace.load_sample, "sample", "primary")
             with region("div", "photo-area") as self.area:
                 self.strip = region("div", "strip", role="group", aria_label="photographs", data_testid="strip")
-                self._build_toolbar()
+                with region("div", "toolbar", role="toolbar", aria_label="photograph, box and pose"):
+                    self.modes = {
+                        mode: button(mode.capitalize(), lambda mode=mode: self._set_mode(mode), f"mode-{mode}", "quiet")
+                        for mode in HELP
+                    }
+                    self.undo = button("Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it")
+                    self.fit = button("Fit the contours", self._fit, "fit", "quiet")
+                    for name, symbol in {"out": "−", "fit": "⤢", "in": "+"}.items():
+                        zoom = {"type": "button", "data_zoom": name, "aria_label": f"zoom {name}"}
+                        text("button", symbol, "button quiet", **zoom)
+                    self.hint = text("p", "", "facts", data_testid="hint")
                 with (
                     region("div", "viewport", tabindex="0", role="application") as self.viewport,
                     region("div", "canvas", data_testid="photograph") as self.canvas,
                 ):
                     self.photo = region("img", alt="the photograph", draggable="false")
-                    self.solid = region("img", alt="", draggable="false")
-                    self.lines = region("img", alt="", draggable="false")
+                    self.solid, self.lines = (region("img", alt="", draggable="false") for _ in range(2))
                     self.shapes = ui.html("", sanitize=False).classes("shapes")
-                self._build_layers()
+                with region("div", "layers") as self.layers:
+                    with region("label"):
+                        text("span", "Mesh")
+                        slider = {"type": "range", "min": "0", "max": "100", "value": "35"}
+                        region("input", data_testid="mesh", data_property="--mesh", **slider)
+                    with region("label"):
+                        contours = region("input", type="checkbox", data_testid="contours", checked="checked")
+                        text("span", "Contours")
+                    contours.on("change", lambda e: self.lines.set_visibility(bool(e.args)), args=["target.checked"])
+                    text("p", LEGEND, "facts")
         ui.on("stage", self._handle)
-
-    def _build_empty(self) -> None:
-        with region("div", "empty") as self.empty:
-            text("p", "Drop a photograph and a mesh anywhere on this page", "large")
-            text("p", "The two may come together and in any order. Nothing is sent to the internet.")
-            with region("div", "row"):
-                file_chooser("Choose files", "upload-any")
-                button("Try the sample", self.workspace.load_sample, "sample", "primary")
-
-    def _build_toolbar(self) -> None:
-        with region("div", "toolbar", role="toolbar", aria_label="photograph, box and pose"):
-            self.modes = {
-                "box": button("Box", lambda: self._set_mode("box"), "mode-box", "quiet"),
-                "pose": button("Pose", lambda: self._set_mode("pose"), "mode-pose", "quiet"),
-            }
-            self.undo = button("Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it")
-            self.fit = button("Fit the contours", self._fit, "fit", "quiet")
-            for name, symbol in {"out": "−", "fit": "⤢", "in": "+"}.items():
-                text("button", symbol, "button quiet", type="button", data_zoom=name, aria_label=f"zoom {name}")
-            self.hint = text("p", "", "facts", data_testid="hint")
-
-    def _build_layers(self) -> None:
-        with region("div", "layers") as self.layers:
-            with region("label"):
-                text("span", "Mesh")
-                values = {"min": "0", "max": "100", "value": "35", "data_testid": "mesh", "data_property": "--mesh"}
-                region("input", type="range", **values)
-            with region("label"):
-                self.contours = region("input", type="checkbox", data_testid="contours", checked="checked")
-                text("span", "Contours")
-            self.contours.on("change", lambda e: self.lines.set_visibility(bool(e.args)), args=["target.checked"])
-            text("p", LEGEND, "facts")
 
     def _set_mode(self, mode: str) -> None:
         self._commit()
@@ -146,7 +132,7 @@ class Stage:
             shot.set_box(None)
 
     def _change_pose(self, what: Any, point: Point) -> None:
-        (result, _), (T, K) = self.session.shot.require_result(), self.session.shot.projection
+        result, (T, K) = self.session.shot.require_result(), self.session.shot.projection
         kind = what["type"]
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
@@ -159,7 +145,7 @@ class Stage:
             elif kind == "release":
                 self._commit()
             elif kind == "cancel":
-                self.pressed = self.moved = None
+                self._end_gesture()
             elif kind == "scale":  # wheel and pinch
                 self.moved = result.scaled(T, float(what["factor"]), float(what["roll"]))
             elif kind == "nudge" and what["shift"]:
@@ -176,28 +162,35 @@ class Stage:
         return 0 <= row < rows and 0 <= column < columns and bool(self.mask[row, column])
 
     async def _follow(self) -> None:
-        """Draw the contours of the pose that is being moved; poses that come meanwhile are dropped but for the last."""
+        """Draw the pose that is being moved; poses that come meanwhile are dropped but for the last."""
         if self._following:
             return
         self._following, drawn = True, None
-        (result, _), (_, K) = self.session.shot.require_result(), self.session.shot.projection
+        shot = self.session.shot
+        registrar, K = shot.require_result().registrar, shot.projection[1]
         try:
             while self.moved is not None and self.moved is not drawn:
                 drawn = self.moved
-                paths = await asyncio.to_thread(contour_paths, result.registrar, drawn, K)
-                self._show_layers(shown=False)
-                self._draw_shapes(paths)
+                layers = await asyncio.to_thread(pose_layers, registrar, (drawn, K), shot.size, MOVING_SIDE)
+                if self.moved is not None:
+                    self._show_layers(layers)
         finally:
             self._following = False
 
     def _commit(self) -> None:
         """Make the pose that was moved the answer."""
-        moved, self.moved, self.pressed = self.moved, None, None
-        shot = self.session.shot
+        shot, moved = self.session.shot, self.moved
+        self._end_gesture()
         if moved is None or shot.answer is None or shot.photo is not self.shown.get("photo"):
             return
         if not moved.equal(shot.projection[0]):
             shot.place(moved)
+
+    def _end_gesture(self) -> None:
+        """Forget the pose that was moved; the answer is drawn again."""
+        if self.moved is not None:
+            self.shown["answer"] = "moved"
+        self.pressed = self.moved = None
 
     def _changed(self, name: str, value: Any) -> bool:
         """Whether something differs from what the page shows, which it does not afterwards."""
@@ -211,26 +204,25 @@ class Stage:
         self.area.set_visibility(shot.photo is not None)
         if shot.photo is None:
             return
-        if (
-            self._changed("box", shot.box) and self.pressed is None and self.moved is None
-        ):  # changed elsewhere on the page
-            self.mode = "box"
-        if self._changed("photo", shot.photo):
-            self.pressed = self.moved = None
-            self.shown |= {"result": "of another photograph", "answer": ""}  # those of a rig share them
-            await self._show_photo()
-        if self._changed("result", shot.result):
-            self.pressed = self.moved = None
+        new_photo, new_box = self._changed("photo", shot.photo), self._changed("box", shot.box)
+        if self._changed("result", shot.result) or new_photo:
+            self._end_gesture()
             self.mode = "box" if shot.result is None else "pose"
+        elif new_box and self.pressed is None and self.moved is None:  # changed elsewhere on the page
+            self.mode = "box"
+        if new_photo:
+            self.shown["answer"] = "of another photograph"  # those of a rig share theirs
+            await self._show_photo()
         if self.pressed is None and self.moved is not None and time.monotonic() - self._last_gesture > COMMIT_SECONDS:
             self._commit()
         self._show_mode()
         if self._changed("answer", shot.answer):
             self.pressed = self.moved = None
             await self._render_answer()
-        if self.moved is None:
-            self._show_layers(shown=shot.answer is not None)
-            self._draw_shapes()
+        for element in (self.solid, self.lines):
+            element.classes(**{"add" if shot.answer is None else "remove": "absent"})
+        self.layers.set_visibility(shot.answer is not None)
+        self._draw_shapes()
         await self._show_strip()
 
     async def _show_strip(self) -> None:
@@ -247,12 +239,9 @@ class Stage:
             self.strip.clear()
             for number, picture in enumerate(pictures):
                 url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
-                test_id = f"photograph-{number + 1}"
                 name = self.session.name(shots[number].path)
-                with (
-                    self.strip,
-                    region("button", "thumbnail", type="button", title=name, data_testid=test_id) as thumbnail,
-                ):
+                attributes = {"type": "button", "title": name, "data_testid": f"photograph-{number + 1}"}
+                with self.strip, region("button", "thumbnail", **attributes) as thumbnail:
                     region("img", src=url, alt=name)
                 thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
         for shot, thumbnail in zip(shots, self.strip.default_slot.children, strict=False):
@@ -288,23 +277,22 @@ class Stage:
             self.viewport.style(f"--ratio: {W / H:.5f}")
 
     async def _render_answer(self) -> None:
-        if self.session.shot.answer is None:
-            return
         shot = self.session.shot
-        registrar, projection = shot.require_result()[0].registrar, shot.projection
-        if layers := await self.workspace.run("page", lambda: pose_layers(registrar, projection, shot.size)):
-            self.mask = layers[2]
-            for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers, strict=False):
-                element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
+        if shot.answer is None:
+            return
+        registrar, projection = shot.require_result().registrar, shot.projection
+        draw = partial(pose_layers, registrar, projection, shot.size, LAYER_SIDE)
+        if layers := await self.workspace.run("page", draw):
+            self._show_layers(layers)
 
-    def _show_layers(self, *, shown: bool) -> None:
-        for element in (self.solid, self.lines):
-            element.classes(**{"remove" if shown else "add": "absent"})
-        self.layers.set_visibility(self.session.shot.answer is not None)
+    def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:
+        self.mask = layers[2]
+        for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers[:2], strict=True):
+            element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
 
-    def _draw_shapes(self, contours: str = "") -> None:
-        """Draw the box, with handles where it can be changed, and contours."""
-        shot, is_box, parts = self.session.shot, self.mode == "box", contours
+    def _draw_shapes(self) -> None:
+        """Draw the box, with handles where it can be changed."""
+        shot, is_box, parts = self.session.shot, self.mode == "box", ""
         box = self.drawn if is_box and self.pressed is not None else shot.box
         if shot.photo is None:
             return
@@ -321,33 +309,13 @@ class Stage:
         self.shapes.set_content(f"<svg viewBox='-0.5 -0.5 {W} {H}' preserveAspectRatio='none'>{parts}</svg>")
 
 
-def contour_paths(registrar: Registrar, T: Tensor, K: Tensor) -> str:
-    """SVG paths of the contours of a mesh at (4, 4) ``T``, with (3, 3) camera matrix: short dashes along its edges."""
-    describer = registrar.describer
-    centre = T[:3, :3] @ describer.centre + T[:3, 3]
-    u, v, _ = (K @ centre / centre[2]).tolist()
-    side = 2.4 * describer.radius * float(K[0, 0] / centre[2])  # of a crop around the object
-    scale, half = CONTOUR_SIDE / side, (CONTOUR_SIDE - 1) / 2
-    crop = torch.tensor([[scale, 0.0, half - scale * u], [0.0, scale, half - scale * v], [0.0, 0.0, 1.0]])
-    points = describer.contours.points(T[None], (crop.double() @ K)[None], CONTOUR_SIDE)
-    seen = points.valid[0]
-    at = (points.model[0][seen] @ T[:3, :3].mT + T[:3, 3]) @ K.mT
-    pixel, normal = at[:, :2] / at[:, 2:], points.normals[0][seen]
-    dash = DASH * side * torch.stack([-normal[:, 1], normal[:, 0]], dim=1)
-    ends = torch.cat([pixel - dash, pixel + dash], dim=1)
-    parts = []
-    for lines, name in ((ends[~points.outline[0][seen]], "crease"), (ends[points.outline[0][seen]], "outline")):
-        path = "".join("M{:.1f} {:.1f}L{:.1f} {:.1f}".format(*line) for line in lines.tolist())
-        parts.append(f"<path d='{path}' class='rim'/><path d='{path}' class='{name}'/>")
-    return "".join(parts)
-
-
 def pose_layers(
-    registrar: Registrar, projection: tuple[Tensor, Tensor], size: tuple[int, int]
+    registrar: Registrar, projection: tuple[Tensor, Tensor], size: tuple[int, int], side: int
 ) -> tuple[bytes, bytes, np.ndarray]:
-    """Two transparent PNGs over a photograph of ``size`` (H, W), the shaded mesh and its contours, and where it is."""
+    """Two transparent PNGs over a photograph of ``size`` (H, W), at most ``side`` px long: the shaded mesh and its
+    contours; and a mask of the mesh."""
     T, K = projection
-    scale = min(1.0, LAYER_SIDE / max(size))
+    scale = min(1.0, side / max(size))
     small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
     K = Camera(K, size=size).at(small).matrix
     depth = registrar.describer.renderer.render(T[None], K, small)[0, 0].cpu().float()

@@ -9,8 +9,6 @@ from nicegui import ui
 from ..utils.choices import IMAGES, MESHES_AND_BANKS
 from .workspace import CALIBRATIONS
 
-__all__ = ["button", "file_chooser", "fold", "region", "set_enabled", "set_text", "text"]
-
 
 def region(tag: str, classes: str = "", **values: str) -> Any:
     """An element that holds others; attributes are written with ``_`` for ``-``."""

@@ -19,16 +19,16 @@ from ..data import load_camera
 from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
-from ..utils.files import write_file
-from . import sample
-from .session import Session
-
-__all__ = ["CALIBRATIONS", "Workspace", "file_name", "show_warning", "unpack"]
+from .session import STATIC, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
 MAX_NAME = 60  # characters of the name of an uploaded file
+SAMPLE_CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
+SAMPLE_BOX = (172.0, 18.0, 409.0, 308.0)  # of the cup, in px
+SAMPLE_OPTIONS: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
+SAMPLE_OPTIONS |= {"camera": None, "guess": 30.0}  # estimated from the ellipses in the photograph
 
 _caught: ContextVar[list[Any]] = ContextVar("caught")
 
@@ -45,7 +45,7 @@ class Workspace:
         session: inputs and results.
         messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
-        receiving, mesh_facts: folders and names of files that are being received; the mesh in words.
+        receiving: folders, names and sizes of files that are being received.
         started: when the search began, in seconds of ``time.monotonic``.
     """
 
@@ -53,8 +53,8 @@ class Workspace:
         self.session, self.folder = Session(options, folder), folder
         self.messages: dict[str, str] = {}
         self.files: dict[str, tuple[bytes, str]] = {}
-        self.receiving, self._sizes = dict[Path, str](), dict[Path, int]()
-        self.mesh_facts, self.started, self._version = "", 0.0, 0
+        self.receiving = dict[Path, tuple[str, int]]()
+        self.started, self._version = 0.0, 0
         self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
         self._begun = False  # whether the search has waited for the jobs before it
@@ -74,7 +74,9 @@ class Workspace:
             if stop and self._search is not None and self._begun:  # else it waits for this job
                 self.stop()
                 await asyncio.wait({self._search})
-            return await self._attempt(part, job)
+            result = await self._attempt(part, job)
+            self._remove_unused()
+            return result
 
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
         self.messages.pop(part, None)
@@ -82,6 +84,8 @@ class Workspace:
         _caught.set(caught)
         try:
             result = await asyncio.to_thread(job)
+            if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
+                self.messages.pop("pose", None)
             if caught:
                 self.messages[part] = "; ".join(map(self.session.describe_warning, caught))
             return True if result is None else result
@@ -117,10 +121,10 @@ class Workspace:
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
         """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
         stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
-        if stored + sum(self._sizes.values()) + size > MAX_VIEWER_BYTES:
+        if stored + sum(each for _, each in self.receiving.values()) + size > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
         folder, received = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder)), 0
-        self.receiving[folder], self._sizes[folder] = name, size
+        self.receiving[folder] = name, size
         try:
             with (folder / name).open("wb") as file:
                 async for block in blocks:
@@ -130,7 +134,7 @@ class Workspace:
                     await asyncio.to_thread(file.write, block)
             await self._open_upload(folder / name)
         finally:
-            del self.receiving[folder], self._sizes[folder]
+            del self.receiving[folder]
             self._remove_unused()
 
     async def _open_upload(self, path: Path) -> None:
@@ -148,10 +152,10 @@ class Workspace:
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
             if path.name == "scene_camera.json" and session.options.unit == "m":
                 await self.set_option("unit", "mm")  # of BOP sets
-            await self._open_rig(path.parent if path.name == "scene_camera.json" else path)
+            await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
-            await self._open_rig(rig)
+            await self.open_rig(rig)
         elif suffix in CALIBRATIONS:
             await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
         elif suffix == ".zip":
@@ -170,32 +174,22 @@ class Workspace:
             if not any(folder in (path, *path.parents) for path in used):
                 shutil.rmtree(folder)
 
-    async def _open_rig(self, path: Path | None) -> None:
-        if await self.run("rig", lambda: self.session.open_rig(path), stop=True):
-            self.messages.pop("pose", None)
-
-    async def remove_rig(self) -> None:
-        """Forget the rig: each photograph is registered alone."""
-        await self._open_rig(None)
-        self._remove_unused()
+    async def open_rig(self, path: Path | None) -> None:
+        """Replace the rig; None: each photograph is registered alone."""
+        await self.run("rig", lambda: self.session.open_rig(path), stop=True)
 
     async def open_photo(self, path: Path) -> None:
         """Add a photograph, and show it."""
-        if await self.run("photograph", lambda: self.session.open_photo(path)):
-            self.messages.pop("pose", None)
+        await self.run("photograph", lambda: self.session.open_photo(path))
 
     async def open_mesh(self, path: Path) -> None:
         """Replace the mesh; a search for the former one is stopped."""
-        if opened := await self.run("mesh", lambda: self.session.open_mesh(path), stop=True):
-            self.mesh_facts = opened
-            self.messages.pop("pose", None)
+        await self.run("mesh", lambda: self.session.open_mesh(path), stop=True)
 
     async def remove_photo(self) -> None:
         """Close the photograph that is shown; a search in it is stopped."""
         shot = self.session.shot
-        if await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot in self.session.searched):
-            self.messages.pop("pose", None)
-            self._remove_unused()
+        await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot in self.session.searched)
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
@@ -213,7 +207,7 @@ class Workspace:
         """Open the files that the options name; their warnings become messages."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            self.mesh_facts = self.session.load()
+            self.session.load()
         if caught:
             self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
@@ -223,17 +217,14 @@ class Workspace:
         await self.run("file", self._open_sample, stop=True)
 
     def _open_sample(self) -> None:
-        session, photo, mesh = self.session, self.folder / sample.PHOTO.name, self.folder / "cup.ply"
-        write_file(photo, sample.PHOTO.read_bytes())
-        write_file(mesh, sample.cup().export(file_type="ply"))
-        options: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
+        session = self.session
         self._before_sample = self._before_sample or session.options
         session.close()
-        session.options = replace(session.options, **options, camera=None, guess=sample.FIELD_OF_VIEW)
-        shot = session.open_photo(photo, sample.BOX)
+        session.options = replace(session.options, **SAMPLE_OPTIONS)
+        shot = session.open_photo(STATIC / "coffee.jpg", SAMPLE_BOX)
         assert shot.photo is not None
-        shot.photo = replace(shot.photo, notes=(sample.CREDIT,))
-        self.mesh_facts = session.open_mesh(mesh)
+        shot.photo = replace(shot.photo, notes=(SAMPLE_CREDIT,))
+        session.open_mesh(STATIC / "cup.ply")
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
         """Put a file on the server; returns its address relative to the page, which is new each time."""

@@ -10,8 +10,6 @@ from torch import Tensor
 from ..rendering import DepthRenderer
 from .encoding import to_uint8
 
-__all__ = ["close_up", "contour_layer", "draw_box", "draw_window", "line_width"]
-
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
 JUMP = 0.03  # step at an occluding edge inside the outline, as a fraction of the depth range
@@ -56,7 +54,10 @@ def draw_window(
     resize = torch.tensor(moved, dtype=torch.float64)
     if box is not None:
         corners = resize @ torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
-        draw_box(picture, corners[:2].mT.flatten().tolist())
+        start, end = corners[:2].mT.round().int().tolist()
+        width = max(1, round(line_width(picture.shape[:2]) / 3))
+        for colour, thickness in ((RIM, width + 2), (BOX, width)):
+            cv2.rectangle(picture, start, end, colour, thickness)
     if projection is not None:
         T, K = projection
         K = resize @ K.cpu().double()
@@ -65,14 +66,6 @@ def draw_window(
         alpha = layer[drawn][:, 3:] / 255.0
         picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
     return picture
-
-
-def draw_box(picture: np.ndarray, box: Sequence[float]) -> None:
-    """Draw a thin white box with a dark rim into (H, W, 3) uint8."""
-    x0, y0, x1, y1 = (round(v) for v in box)
-    width = max(1, round(line_width(picture.shape[:2]) / 3))
-    for colour, thickness in ((RIM, width + 2), (BOX, width)):
-        cv2.rectangle(picture, (x0, y0), (x1, y1), colour, thickness)
 
 
 def contour_layer(depth: Tensor, camera_matrix: Tensor) -> np.ndarray:

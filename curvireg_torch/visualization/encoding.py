@@ -4,8 +4,6 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-__all__ = ["jpeg", "png", "shrink", "to_uint8"]
-
 
 def png(picture: np.ndarray) -> bytes:
     """A PNG file of (H, W, 3 or 4) uint8 RGB or RGBA."""

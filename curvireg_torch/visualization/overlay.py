@@ -22,8 +22,6 @@ from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
 from .encoding import to_uint8
 
-__all__ = ["contour_overlay", "registration_sheet", "side_pictures", "to_uint8", "views_sheet"]
-
 LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
 NARROWEST = 720  # px of width that the caption needs
 TILE = 180  # least side of a small picture in px
@@ -172,13 +170,11 @@ def _small_pictures(
     scale = side / max(window[2] - window[0], window[3] - window[1])
     close_ups = [draw_window(renderer, h.projection, item.image, window, scale) for h in result.hypotheses]
     sides = side_pictures(registrar, result, item.image, item.box)
-    names = {"edges of the photograph": "photograph field", "edges of the mesh": "view field"}
-    names["mesh at this pose"] = "pose"
-    found = [
-        (text, cv2.resize(sides[name], (side, side), interpolation=cv2.INTER_CUBIC)) for text, name in names.items()
-    ]
+    names = "photograph field", "view field", "pose"
+    captions = "edges of the photograph", "edges of the mesh", "mesh at this pose"
+    found = [cv2.resize(sides[name], (side, side), interpolation=cv2.INTER_CUBIC) for name in names]
     rivals = [(_rival(result, k), close_ups[k]) for k in range(1, len(close_ups))]
-    return [("close-up", close_ups[0]), *found, *rivals]
+    return [("close-up", close_ups[0]), *zip(captions, found, strict=True), *rivals]
 
 
 def _rival(result: Registration, index: int) -> str:

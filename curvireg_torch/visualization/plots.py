@@ -7,8 +7,6 @@ from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration
 from .overlay import side_pictures
 
-__all__ = ["fields", "picture", "viewpoints"]
-
 
 def viewpoints(bank: ViewBank, result: Registration) -> Any:
     """Best score of each viewing direction of a bank over azimuth and elevation; several maxima are rival poses.

@@ -16,10 +16,7 @@ from ..mesh.colours import surface_colours
 from ..mesh.mesh import mesh_centre, mesh_radius, mesh_unit
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
-from .encoding import jpeg, shrink
-from .overlay import to_uint8
-
-__all__ = ["mesh_glb", "pose_glb", "scene_glb"]
+from .encoding import jpeg, shrink, to_uint8
 
 _PHOTO_SIDE = 1024
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera to glTF's, which has y up and looks along -z

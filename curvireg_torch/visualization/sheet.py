@@ -13,8 +13,6 @@ from ..utils.files import write_file
 from .contours import close_up, draw_window
 from .encoding import jpeg
 
-__all__ = ["SheetEntry", "thumbnail", "write_sheet"]
-
 SIDE = 224  # longer side of a thumbnail in px
 MAX_ENTRIES = 500  # of the best, and of the worst: a larger page would be slow to open
 
@@ -59,12 +57,11 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
     return jpeg(draw_window(renderer, projection, image, window, scale, box), 80)
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int | None = None) -> None:
+def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int = MAX_ENTRIES) -> None:
     """Write the page of ``rows``, best first, as one file; ``table`` is the name of the file that has all of them.
 
-    Of many rows, ``each`` of the best and of the worst are shown (default: 500).
+    Of many rows, ``each`` of the best and of the worst are shown.
     """
-    each = MAX_ENTRIES if each is None else each
     note = "Best first; failed ones last."
     if len(rows) > 2 * each:
         rows = [*rows[:each], *rows[-each:]]

@@ -14,8 +14,6 @@ from ..registration.result import verdict
 from .contours import draw_window
 from .overlay import VERDICT_COLOURS
 
-__all__ = ["OverlayVideo", "annotated_frame"]
-
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 
 

@@ -34,7 +34,7 @@ from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 # Commands that are not run here, and the reason
 SKIPPED = {
     r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
-    r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser.py opens it
+    r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser_use.py opens it
     r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",
     r"python scripts/results_table": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",

@@ -140,6 +140,21 @@ class Browser:
             held()
         ActionChains(self.driver, duration=50).release().perform()
 
+    def extent(self, width):
+        """Box of the mesh that is drawn over the photograph, which is ``width`` px wide."""
+        script = """
+            const image = document.querySelectorAll('.canvas img')[1], canvas = document.createElement('canvas');
+            [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+            const context = canvas.getContext('2d');
+            context.drawImage(image, 0, 0);
+            const alpha = context.getImageData(0, 0, canvas.width, canvas.height).data.filter((_, k) => k % 4 === 3);
+            const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
+            const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
+            const y = drawn.map(k => Math.floor(k / canvas.width));
+            const box = [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))];
+            return box.map(v => v * arguments[0] / canvas.width)"""
+        return self.driver.execute_script(script, width)
+
     def box(self):
         facts = self.text("box-facts")
         return [float(v) for v in facts.split()] if facts[:1].isdigit() else None

@@ -1,6 +1,5 @@
 """A viewer and a browser that shows it."""
 
-import json
 import os
 import re
 import shutil
@@ -11,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.viewer.workspace import Workspace
 from tests._support.exif import exif, with_exif
 from tests.viewer.browser import Browser, wait_for
 from tests.viewer.test_session import new_session, write_scene
@@ -19,7 +20,7 @@ from tests.viewer.test_session import new_session, write_scene
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("browser")
-    folder.joinpath("box.json").write_text(json.dumps(write_scene(folder)[0]))
+    write_scene(folder)
     with_exif(folder / "photo.png", exif(1, 37))
     (folder / "broken.png").write_bytes((folder / "photo.png").read_bytes()[:3000])
     (folder / "hostile.obj").write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n")
@@ -27,9 +28,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def address(folder, request):
+def address(folder):
     """Address of a viewer that was started without a photograph."""
-    command = [sys.executable, "-m", "curvireg_torch", "view", *request.module.OPTIONS, "--no-browser"]
+    command = [sys.executable, "-m", "curvireg_torch", "view", "--no-browser"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     environment |= {"CURVIREG_CACHE": str(folder / "cache"), "PYTHONPATH": str(Path.cwd())}
     (folder / "temporary").mkdir()
@@ -80,3 +81,9 @@ def registered(tmp_path_factory):
         session.set_camera((260.0, 260.0, 119.5, 89.5))
         session.register()
         yield session, folder, T
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    (tmp_path / "uploads").mkdir()
+    return Workspace(RegisterOptions(), tmp_path / "uploads")

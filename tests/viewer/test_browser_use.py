@@ -11,14 +11,14 @@ from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import demo_scene, example_mesh
 from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
-from tests.viewer.test_browser import scroll
 
-OPTIONS = []  # of the command that starts the viewer
+pytestmark = [pytest.mark.browser, pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")]
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
-]
+
+def saved(browser):
+    """The result.json that the page saves now."""
+    browser.click("download-result.json")
+    return json.loads(browser.downloaded("result.json"))
 
 
 @pytest.fixture(autouse=True)
@@ -100,19 +100,61 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     browser.picture("viewer", "answer-1")
 
 
-def test_contours_follow_the_mesh_that_is_dragged(browser):
+def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser):
+    browser.unfold("command-line")
+    first = saved(browser)
+    assert first["viewer"]["command"] == browser.text("command")
+    browser.click("answer-2")
+    browser.wait(lambda: browser.part("answer-2").get_attribute("aria-pressed") == "true", "chosen")
+    assert browser.part("answer-1").get_attribute("aria-pressed") == "false"
+    second = saved(browser)
+    assert second["rotation"] == first["top"][1]["rotation"] != first["rotation"]
+    for name, start in (("pose.glb", b"glTF"), ("overlay.png", b"\x89PNG")):
+        browser.click(f"download-{name.replace('overlay.png', 'picture')}")
+        assert browser.downloaded(name).startswith(start)
+    browser.click("answer-1")
+    browser.wait(lambda: browser.part("answer-1").get_attribute("aria-pressed") == "true", "the first again")
+
+
+def test_the_pose_is_corrected_on_the_photograph(browser):
     browser.emulate(1440, 900)
-    before = browser.text("facts")
+    before, at_rest = saved(browser), browser.extent(600)
+    x0, y0, x1, y1 = at_rest
+    middle, right = ((x0 + x1) / 2, (y0 + y1) / 2), [x0 + 36, y0, x1 + 36, y1]
 
     def follows():
-        browser.wait(lambda: browser.driver.find_element("css selector", ".canvas path.outline"), "contours", 20)
+        browser.wait(lambda: browser.extent(600) == pytest.approx(right, abs=4), "the mesh follows", 20)
 
-    browser.drag((20, 20), (60, 45), 600, held=follows)
-    browser.wait(lambda: "moved: rotated" in browser.text("facts"), "turned")
+    browser.drag(middle, (middle[0] + 36, middle[1]), 600, held=follows)
+    browser.wait(lambda: "moved: rotated 0.0 degrees" in browser.text("facts"), "moved")
     assert browser.text("verdict") == "by hand"
+    moved = saved(browser)
+    pixels = (moved["translation"][0] - before["translation"][0]) * before["inputs"]["camera"][0]
+    assert pixels / before["translation"][2] == pytest.approx(36, abs=4)
+    browser.drag((20, 20), (60, 45), 600)  # beside the mesh
+    browser.wait(lambda: browser.text("facts").count("moved: ") == 2, "turned")
     browser.picture("viewer-hand")
     browser.click("undo")
-    browser.wait(lambda: browser.text("facts") == before, "as before")
+    browser.wait(lambda: browser.text("facts").count("moved: ") == 1, "undone")
+    assert saved(browser)["rotation"] == moved["rotation"]
+    scroll(browser, browser.part("photograph"), 200)
+    browser.wait(lambda: browser.text("facts").count("moved: ") == 2, "further away")
+    assert saved(browser)["translation"][2] > 1.05 * moved["translation"][2]
+    browser.click("fit")
+    browser.wait(lambda: "contours fitted" in browser.text("facts"), "contours")
+    browser.click("answer-1")
+    browser.wait(lambda: browser.extent(600) == at_rest, "as it was found")
+    layer = browser.part("photograph").find_elements("css selector", "img")[1]
+    assert layer.value_of_css_property("opacity") == "0.35"
+    browser.part("mesh").click()  # in the middle
+    browser.wait(lambda: 0.45 < float(layer.value_of_css_property("opacity")) < 0.55, "opacity", 20)
+
+
+def scroll(browser, element, amount):
+    from selenium.webdriver import ActionChains
+    from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
+
+    ActionChains(browser.driver).scroll_from_origin(ScrollOrigin.from_element(element), 0, amount).perform()
 
 
 def test_the_program_is_copied(browser):
@@ -207,6 +249,11 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     becomes(x0 - 9, y0, x1 - 9, y1)
     press("z", Keys.CONTROL)
     becomes(x0 + 1, y0, x1 + 1, y1)
+    browser.click("no-box")
+    browser.wait(lambda: browser.text("register") == "Find the object and its pose", "no box")
+    assert browser.text("progress") == "the inputs have changed since this answer"
+    browser.click("undo")
+    becomes(x0 + 1, y0, x1 + 1, y1)
     press(Keys.DELETE)
     browser.wait(lambda: browser.box() is None, "no box")
     browser.click("undo")
@@ -222,6 +269,8 @@ def test_keys_undo_and_zoom_change_the_box(browser):
     browser.wait(lambda: image.size["width"] == width, "as before")
     browser.drag((10, 250), (120, 350), 600)
     browser.wait(lambda: browser.box() == pytest.approx([10, 250, 120, 350], abs=2), "drawn box")
+    browser.drag((120, 300), (150, 300), 600)
+    browser.wait(lambda: browser.box() == pytest.approx([10, 250, 150, 350], abs=2), "moved edge")
 
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
@@ -233,6 +282,12 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         browser.upload("photograph", folder / name)
         browser.wait(lambda name=name: browser.text("photograph-facts").startswith(f"{name}: "), name)
     assert browser.messages() == []
+    browser.unfold("camera")
+    browser.click("exif")
+    caption = "guessed from the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
+    browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
+    browser.part("camera").send_keys("65")
+    browser.wait(lambda: "--fov 65" in browser.text("command"), "field of view")
     (folder / "notes.txt").write_text("nothing to see")
     browser.drop(folder / "broken.png", folder / "hostile.obj", folder / "notes.txt")
     browser.wait(lambda: len(browser.messages()) == 3, "three messages")
@@ -253,7 +308,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.wait(lambda: browser.messages() == [], "all gone")
 
 
-def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(browser, folder):
+def test_each_of_several_photographs_keeps_its_box(browser, folder):
     scenes = {f"table-{seed}.png": demo_scene(seed) for seed in (4, 5)}
     for name, scene in scenes.items():
         (folder / name).write_bytes(png(to_uint8(scene.image)))
@@ -281,16 +336,6 @@ def test_each_of_several_photographs_keeps_its_box_and_a_calibration_is_for_all(
     browser.click("photograph-2")
     browser.wait(lambda: browser.box() is not None, "the last one")
     browser.picture("viewer-box", "step-box")
-    (folder / "cam.yaml").write_text(
-        "%YAML:1.0\n---\nimage_width: 960\nimage_height: 720\n"
-        "camera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n"
-        "  data: [1000., 0., 479.5, 0., 1000., 359.5, 0., 0., 1.]\n"
-        "distortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n  dt: d\n  data: [-0.3, 0.1, 0., 0., 0.]\n"
-    )
-    browser.upload("camera", folder / "cam.yaml")
-    browser.wait(lambda: browser.text("photograph-facts").endswith("; undistorted"), "undistorted")
-    browser.unfold("camera")
-    browser.wait(lambda: browser.text("camera-facts") == "from a calibration file, without its distortion", "facts")
     browser.click("no-photo")
     browser.wait(lambda: not browser.part("strip").is_displayed(), "one photograph needs no strip")
 
@@ -311,21 +356,10 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     assert browser.text("register") == "Find the pose in 2 photographs"
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "one pose")
-    extent = """
-        const image = arguments[0], canvas = document.createElement('canvas');
-        [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
-        const context = canvas.getContext('2d');
-        context.drawImage(image, 0, 0);
-        const alpha = context.getImageData(0, 0, canvas.width, canvas.height).data.filter((_, k) => k % 4 === 3);
-        const drawn = [...alpha.keys()].filter(k => alpha[k]), x = drawn.map(k => k % canvas.width);
-        const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
-        const y = drawn.map(k => Math.floor(k / canvas.width));
-        return [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))]"""
     for number, scene in enumerate(scenes, start=1):
         browser.click(f"photograph-{number}")
-        solid = browser.part("photograph").find_elements("css selector", "img")[1]
         box = pytest.approx(scene.box.tolist(), abs=4)
-        browser.wait(lambda box=box, solid=solid: browser.driver.execute_script(extent, solid) == box, f"mesh {number}")
+        browser.wait(lambda box=box: browser.extent(960) == box, f"mesh {number}")
         assert browser.part("answers").is_displayed()
     browser.click("download-result.json")
     document = json.loads(browser.downloaded("result.json"))
@@ -334,13 +368,6 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
         ["table-4.png", "table-5.png"],
     )
     assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
-    browser.click("download-pose.glb")
-    assert browser.downloaded("pose.glb").count(b'"photograph ') == 2
     browser.picture("viewer-rig")
-    (folder / "rig.csv").write_text("\n".join([*lines[:2], lines[2].replace(",1040,", ",wide,")]))
-    browser.upload("photograph", folder / "rig.csv")
-    wrong = "rig.csv: row 2: table-5.png: fx: expected a number, got 'wide'"
-    browser.wait(lambda: browser.text("message-rig").startswith(wrong), "the row that is wrong")
-    assert browser.text("register") == "Find the object and its pose"
     browser.click("no-rig")
-    browser.wait(lambda: browser.messages() == [], "as without a rig")
+    browser.wait(lambda: browser.text("register") == "Find the object and its pose", "as without a rig")

@@ -146,20 +146,15 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     shot, answers = session.shot, Answers(shown)
     monkeypatch.setattr(shown, "start_search", lambda: started.append((shot.box, session.options.guess)))
     plain, before = {**session.document(), "corrected_box": None}, shot.box
-    assert answers._repairs(plain, "likely") == {}
+    assert answers._repairs(plain) == {}
     hint = {**plain, "prior": {"contradiction": "better outside"}, "corrected_box": [1.04, 2, 30, 40]}
     session.set_limits(elevation=(0.0, 10.0))
-    repairs = answers._repairs(hint, "no match")
-    assert list(repairs) == ["Search without the hint", "Search with that box", "Draw the box again"]
+    repairs = answers._repairs(hint)
+    assert list(repairs) == ["Search without the hint", "Search with that box"]
     for repair in repairs.values():
         repair()
     assert session.options.limits == {}
     assert started == [(before, None), ((1.0, 2, 30, 40), None)]
-    assert (shot.box, shot.box_before) == (None, (1.0, 2, 30, 40))
-    monkeypatch.setattr(type(session), "has_exif", True)
-    session.options = replace(session.options, camera=None)
-    answers._repairs(plain, "likely")["Search with the photograph's EXIF camera"]()
-    assert started[-1] == (None, "exif")
 
 
 def test_the_pose_is_dragged_on_the_photograph(shown):
@@ -186,10 +181,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert len(shot.answer.edits) == 2
     send(posed, "undo")
     assert len(shot.answer.edits) == 1
-    for kind, values in (
-        ("scale", {"factor": 1.1, "roll": 5.0}),
-        ("nudge", {"dx": 1, "dy": 0, "shift": True}),
-    ):
+    for kind, values in (("scale", {"factor": 1.1, "roll": 5.0}), ("nudge", {"dx": 1, "dy": 0, "shift": True})):
         send(posed, kind, **values)
     assert len(shot.answer.edits) == 1, "one change, when it rests"
     posed._last_gesture -= 10

@@ -51,12 +51,6 @@ def rig(tmp_path_factory):
     return folder, write_rig(folder)
 
 
-@pytest.fixture
-def workspace(tmp_path):
-    (tmp_path / "uploads").mkdir()
-    return Workspace(RegisterOptions(), tmp_path / "uploads")
-
-
 def send(workspace, folder, *names):
     async def work():
         for name in names:
@@ -177,7 +171,7 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
 def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
     session = send(workspace, rig[0], "0.png", "rig.csv", "1.png")
     assert len(session.together()) == 2
-    asyncio.run(workspace.remove_rig())
+    asyncio.run(workspace.open_rig(None))
     assert ([shot.view for shot in session.shots], len(session.together())) == ([None, None], 1)
     assert not list(workspace.folder.rglob("rig.csv"))
     session.shots[0].set_box((1.0, 2.0, 30.0, 40.0))
@@ -224,7 +218,7 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     assert session.options.camera is None
     search(workspace)
     assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0]
-    asyncio.run(workspace.remove_rig())
+    asyncio.run(workspace.open_rig(None))
     assert [shot.is_undistorted for shot in session.shots] == [False, False, False]
 
 

@@ -13,8 +13,6 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen
 
-OPTIONS = []  # of the command that starts the viewer
-
 
 async def page(scope, _, send):
     if scope["type"] == "websocket":
@@ -50,8 +48,7 @@ def status(site, host="127.0.0.1:8080", **headers):
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8080", "localhost:9000", "[::1]:8080", "LOCALHOST"])
 def test_local_names_reach_the_page(host):
-    assert status("127.0.0.1", host) == 200
-    assert status("127.0.0.1", host, origin=f"http://{host}") == 200
+    assert status("127.0.0.1", host) == status("127.0.0.1", host, origin=f"http://{host}") == 200
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8080", "192.168.1.7", "[::1", ""])
@@ -98,9 +95,9 @@ def test_listen_names_a_used_port_and_a_host_that_is_not_ours():
 def test_the_server_answers_plain_requests(address):
     parts = urlsplit(address)
 
-    def request(path, method="GET", **headers):
+    def request(path, method="GET", body=b"1", **headers):
         connection = HTTPConnection(parts.hostname, parts.port, timeout=60)
-        connection.request(method, path, headers=headers, body=b"1" if method == "POST" else None)
+        connection.request(method, path, headers=headers, body=body if method == "POST" else None)
         answer = connection.getresponse()
         body = answer.read()
         connection.close()
@@ -120,6 +117,8 @@ def test_the_server_answers_plain_requests(address):
     assert request(parts.path, host="evil.example")[0] == 400
     for method in ("GET", "POST"):
         assert request(parts.path + "upload", method, origin="http://evil.example")[0] == 403
+    assert request(parts.path + "upload", "POST", None, **{"content-length": str(1 << 40)})[0] == 413
+    assert request(parts.path + "upload", "POST", iter([b"of no length"]))[0] == 413
     with socket.create_connection((parts.hostname, parts.port), timeout=60) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n")
         assert plain.recv(100).startswith(b"HTTP/1.1 400 ")

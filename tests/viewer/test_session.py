@@ -22,7 +22,7 @@ from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
-from curvireg_torch.viewer.shot import Answer, dragged_box
+from curvireg_torch.viewer.shot import dragged_box
 from tests._support.exif import exif, with_exif
 from tests._support.scenes import scene
 
@@ -67,10 +67,11 @@ def folder(tmp_path, monkeypatch):
 def session(registered):
     """The session at its first hypothesis; its options and its result are restored afterwards."""
     session = registered[0]
-    session.shot.choose(0)
-    options, result = session.options, session.shot.result
+    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
+    shot.choose(0)
     yield session
-    session.options, session.shot.result = options, result
+    vars(shot).update(kept)
+    session.options = options
 
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
@@ -83,6 +84,18 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     assert document["inputs"]["box"] == written["inputs"]["box"]
     assert document["viewer"] == {"command": session.command(), "hypothesis": 0, "by_hand": []}
     assert float(rotation_error(torch.tensor(document["rotation"]).double(), truth[:3, :3])) < 10
+
+
+def test_without_a_box_the_answer_is_a_detection(session, registered):
+    session.shot.set_box(None)
+    assert "--box" not in session.command()
+    session.register()
+    for number in (1, 0):
+        session.shot.choose(number)
+        document = json.loads(to_json(session.document()))
+        assert document["detection"]["instances"][0]["rotation"] == document["rotation"]
+    assert document["rotation"] != document["top"][1]["rotation"]
+    assert document["rotation"] == run_command(registered[1], session.command())["rotation"]
 
 
 def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
@@ -102,7 +115,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     assert session.document()["none"] == pytest.approx(0.02)
     assert session.document()["covariance"] is None
     session.shot.choose(0)
-    assert Answer(found.hypotheses[0]).registration(calibrated) is calibrated
+    assert session.shot.result.chosen is calibrated
     session.shot.result = replace(session.shot.result, registration=found)
     # The file is a start for the command line, and picture and scene show the same pose.
     folder = registered[1]

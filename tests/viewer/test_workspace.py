@@ -17,7 +17,7 @@ import trimesh
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.viewer import workspace as module
-from curvireg_torch.viewer.workspace import Workspace, file_name, show_warning, unpack
+from curvireg_torch.viewer.workspace import file_name, show_warning, unpack
 from tests.viewer.test_session import write_scene
 
 
@@ -25,12 +25,6 @@ from tests.viewer.test_session import write_scene
 def scene(tmp_path):
     write_scene(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def workspace(tmp_path):
-    (tmp_path / "uploads").mkdir()
-    return Workspace(RegisterOptions(), tmp_path / "uploads")
 
 
 async def upload(workspace, path, name=None, content=None):
@@ -55,7 +49,7 @@ def test_uploads_find_their_place(workspace, scene):
     session = workspace.session
     for name in ("truck.ply", "part.PLY"):
         asyncio.run(upload(workspace, scene / "truck.ply", name))
-        assert "968 faces" in workspace.mesh_facts
+        assert "968 faces" in workspace.session.mesh_facts
     for name in ("a.png", "b.png"):
         asyncio.run(upload(workspace, scene / "photo.png", name))
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "b.png")
@@ -123,7 +117,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
         assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
     assert session.shot.photo.image.shape == (3, 400, 600)
     assert "CC0" in session.shot.photo.notes[0]
-    assert workspace.mesh_facts.endswith("mm, rendered in its colours")
+    assert workspace.session.mesh_facts.endswith("mm, rendered in its colours")
     assert workspace.messages == {}
     asyncio.run(upload(workspace, scene, "notes.pdf", b"x"))
     assert session.options.pose == "upright", "it replaces nothing"
@@ -132,7 +126,7 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
     assert (names(workspace), session.mesh_path, session.shot.box) == (["photo.png"], None, None)
     assert session.request().guess is None
     asyncio.run(upload(workspace, scene / "truck.ply"))
-    assert workspace.mesh_facts.endswith(" ft, rendered in grey")
+    assert workspace.session.mesh_facts.endswith(" ft, rendered in grey")
 
 
 def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
@@ -153,7 +147,7 @@ def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
     assert result.reliable
-    assert workspace.session.shot.found_box.tolist() == list(module.sample.BOX)
+    assert workspace.session.shot.found_box.tolist() == list(module.SAMPLE_BOX)
     T, K = workspace.session.shot.projection
     vertices = torch.tensor(workspace.session.mesh.vertices) @ T[:3, :3].mT + T[:3, 3]
     seen = (vertices @ K.mT)[:, :2] / vertices[:, 2:]
@@ -276,22 +270,6 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
     assert ended == [True, True]
     assert names(workspace) == []
     assert workspace.messages == {}
-
-
-def test_a_sample_that_fails_leaves_the_work_as_it_is(workspace, scene, monkeypatch):
-    def fail():
-        raise OSError("disk full")
-
-    monkeypatch.setattr(module.sample, "cup", fail)
-
-    async def work():
-        await upload(workspace, scene / "photo.png", "a.png")
-        await workspace.load_sample()
-        assert workspace.messages == {"file": "disk full"}
-        await upload(workspace, scene / "photo.png", "b.png")
-
-    asyncio.run(work())
-    assert names(workspace) == ["a.png", "b.png"]
 
 
 def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene, search, monkeypatch):

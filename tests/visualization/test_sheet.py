@@ -41,11 +41,10 @@ def test_thumbnail_draws_contours_on_the_object(scale):
         assert abs(drawn.max() - float(projected.max())) <= 3
 
 
-def test_write_sheet_shows_the_best_and_the_worst(tmp_path, monkeypatch):
-    monkeypatch.setattr(sheet, "MAX_ENTRIES", 2)
+def test_write_sheet_shows_the_best_and_the_worst(tmp_path):
     entry = sheet.SheetEntry(number=0, name="a.png", caption="", kind="doubtful", picture=tmp_path / "none.jpg")
     rows = [replace(entry, number=k) for k in range(7, 0, -1)]
-    sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv")
+    sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv", each=2)
     page = (tmp_path / "index.html").read_text()
     assert [int(n) for n in re.findall(r"<b>(\d+)</b>", page)] == [7, 6, 2, 1]
     assert "The 2 best, then the 2 worst; results.csv has them all" in page
