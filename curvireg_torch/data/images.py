@@ -161,17 +161,6 @@ def _seek_full_image(image: "Image") -> None:
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _is_one_of_several(image: "Image") -> bool:
-    if image.format != "TIFF":
-        return getattr(image, "n_frames", 1) > 1 and image.format != "MPO"  # to which phones add previews
-    page, more = image.tell(), False  # counting all pages of a TIFF may take minutes
-    with suppress(Exception):
-        image.seek(page + 1)
-        more = True
-    image.seek(page)
-    return more or page > 0
-
-
 def _exif(image: "Image") -> tuple[int, float | None]:
     """Orientation and focal length in mm of a 36 x 24 mm camera; what is damaged gives 1 and None."""
     orientation, focal = 1, 0.0
@@ -202,7 +191,7 @@ def _notes(image: "Image") -> tuple[str, ...]:
         "grey: three equal channels": image.mode in ("1", "L", "LA", "I") or image.mode.startswith("I;16"),
         "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
         "alpha channel dropped": image.has_transparency_data,
-        "one of several pictures": _is_one_of_several(image),
+        "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",  # previews of phones
     }
     return tuple(text for text, applies in notes.items() if applies)
 

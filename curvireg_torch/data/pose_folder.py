@@ -69,12 +69,8 @@ class PoseFolder(ObjectDataset):
         if not lines or lines[0] != _COLUMNS:
             return self._skip("corrupt_annotation", f"{folder.name}/views.csv")
         for index, line in enumerate(lines[1:]):
-            parsed = _parse(line, folder)
-            if isinstance(parsed, str):
-                self._skip(parsed, f"{folder.name}/views.csv #{index}")
-            else:
-                ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
-                self._items.append({**parsed, **ids})
+            ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
+            self._add(_parse(line, folder), f"{folder.name}/views.csv #{index}", **ids)
         return None
 
 

@@ -18,7 +18,8 @@ from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
-from .runner import Entry, OpenRegistrar, failed_row, run_entries, thumbnail_of
+from .photograph import Entry
+from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
 
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
@@ -34,9 +35,7 @@ RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 
 
-def _entry(
-    cells: Sequence[str], columns: Mapping[str, str], folder: Path, meshes: tuple[Path, ...], limits: Mapping[str, Any]
-) -> Entry:
+def _entry(cells: Sequence[str], columns: Mapping[str, str], folder: Path, options: RegisterOptions) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     cells, count = _without_empty_end(cells, len(columns)), len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
@@ -46,17 +45,17 @@ def _entry(
             raise InvalidInputError(f"{len(cells)} cells, the header has {count}; quote texts with commas")
         if not values["photo"]:
             raise InvalidInputError("photo: empty; name a file")
-        meshes = (folder / values["mesh"],) if values.get("mesh") else meshes
+        meshes = (folder / values["mesh"],) if values.get("mesh") else options.meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = numbers_of(values, BOX), camera_of(values, folder)
+        box, camera = numbers_of(values, BOX), camera_of(values, folder) or options.guess
         mask = folder / values["mask"] if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
-        prior = prior_from_limits({**limits, **own})
+        prior = prior_from_limits({**(options.limits or {}), **own})
     except (InvalidInputError, MissingFileError) as error:
         return Entry(shown, values["photo"], error=str(error))
     photo = folder / values["photo"]
-    return Entry(shown, values["photo"], photo, meshes, box, camera, mask, prior=prior)
+    return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
 def camera_of(values: Mapping[str, str], folder: Path) -> Camera | None:
@@ -114,20 +113,20 @@ def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
         yield path
 
 
-def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any] | None = None) -> list[Entry]:
+def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     """Read a list of photographs: a CSV file, whose paths are relative to its folder.
 
     Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
     ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
-    through. Empty cells mean: detect the object, no camera, ``meshes`` (of several the best is found), ``limits`` (on
-    the pose, arguments of :class:`PosePrior`). Blank lines, and empty cells beyond the last named column, as
-    spreadsheets write them, do not count. The ``error`` of a row that cannot be used is the reason.
+    through. Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options. Blank lines,
+    and empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
+    cannot be used is the reason.
 
     Example:
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp(), "list.csv")
         >>> _ = file.write_text("photo,x0,y0,x1,y1,mesh\\na.jpg,1,2,30,40.5,part.stl")
-        >>> read_list(file)[0].box
+        >>> read_list(file, RegisterOptions())[0].box
         (1.0, 2.0, 30.0, 40.5)
     """
     if not path.is_file():
@@ -150,7 +149,7 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
     if not rows:
         raise InvalidInputError(f"{path}: no photographs; give one row for each")
     columns = dict(zip(names, header, strict=True))
-    return [_entry(cells, columns, path.parent, tuple(meshes), limits or {}) for cells in rows]
+    return [_entry(cells, columns, path.parent, options) for cells in rows]
 
 
 def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
@@ -206,6 +205,8 @@ def register_list(
 
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:
     shown, failures = [], []
+    more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
+    lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
     for entry, row in zip(entries, _rows(entries, store), strict=True):
         number, message = row["row"], row["message"]
         reliable, confidence = row.get("reliable", False), row.get("confidence") or 0.0
@@ -216,14 +217,11 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
+        lines.append([*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
     counts = Counts(len(shown) - len(failures), sum(not key[1] for key, _ in shown), tuple(failures))
     shown.sort(key=lambda pair: pair[0])
     write_sheet(out / "index.html", str(counts), [on_page for _, on_page in shown], table="results.csv")
     store.rewrite(_rows(entries, store))
-    more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
-    lines = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
-    for row in _rows(entries, store):
-        lines.append([*row["columns"].values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
     write_csv(out / "results.csv", lines)
     return counts
 

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from ..matching import ViewBank
     from ..pipeline import Pipeline
     from ..registration import Registrar
-    from .runner import Entry
+    from .photograph import Entry
+
+CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
+"""How the command line takes a camera."""
 
 WITHIN = 45.0  # degrees of ``within`` beside ``near`` if none are given
 QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by themselves
@@ -171,7 +174,7 @@ class RegisterOptions:
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
         from ..geometry import Camera, camera_matrix
-        from .runner import Entry
+        from .photograph import Entry
 
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
@@ -231,16 +234,13 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
     from ..geometry.cameras import camera_matrix, camera_of_view
     from ..utils.checks import check_square_pixels
 
-    if isinstance(camera, Sequence):
-        try:
-            check_square_pixels(camera_matrix(*camera), "--camera")
-        except InvalidInputError as error:
-            raise InvalidInputError(f"--camera: {str(error).partition(': ')[2]}") from error
-    if isinstance(guess, float):
-        try:
+    try:
+        if isinstance(camera, Sequence):
+            check_square_pixels(camera_matrix(*camera), "camera")
+        if isinstance(guess, float):
             camera_of_view(guess, (1, 1))
-        except InvalidInputError as error:
-            raise InvalidInputError(f"--{error}") from error
+    except InvalidInputError as error:
+        raise InvalidInputError(f"--{error}") from error
 
 
 def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:

@@ -15,9 +15,9 @@ from torch import Tensor
 from ..data import read_photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import QUALIFIERS, RegisterOptions, check_camera, open_registrar
-from ..evaluation.result_files import RigPicture
+from ..evaluation.photograph import register_entry
+from ..evaluation.result_files import View
 from ..evaluation.rigs import read_rig, register_rig
-from ..evaluation.runner import View, register_entry
 from ..geometry import undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
@@ -25,7 +25,6 @@ from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
-from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
 from .shot import Numbers, Result, Shot, numbers
 
@@ -33,7 +32,7 @@ __all__ = ["Session"]
 
 HINT_WIDTH = 45.0  # degrees by which the pose may differ from a hint
 
-Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
+Found = tuple[Registration, dict[str, Any], Sequence[View]]
 
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
@@ -322,11 +321,11 @@ class Session:
         entry = request.entry(request.photos[0])
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-        registration, document = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
+        found = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
         if isinstance(camera, Camera):
-            document["camera"] = camera.at(shot.size).describe()
-            document["inputs"]["camera_source"] = "file"
-        return (registration, document, ()), [torch.tensor(used_box(document))]
+            found.document["camera"] = camera.at(shot.size).describe()
+            found.document["inputs"]["camera_source"] = "file"
+        return (found, found.document, ()), [found.box.float()]
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float

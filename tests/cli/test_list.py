@@ -7,7 +7,7 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation import runner
+from curvireg_torch.evaluation import photograph
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
@@ -29,13 +29,13 @@ def register_list(folder, register):
 
 
 def test_instances_are_those_of_each_row_without_a_box(register_list, monkeypatch):
-    asked, detect = [], runner.detect
+    asked, detect = [], photograph.detect
 
     def watched(*arguments, instances, **options):
         asked.append(instances)
         return detect(*arguments, instances=instances, **options)
 
-    monkeypatch.setattr(runner, "detect", watched)
+    monkeypatch.setattr(photograph, "detect", watched)
     assert register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
     assert asked == [2]
 

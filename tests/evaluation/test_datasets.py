@@ -123,7 +123,8 @@ def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
     assert main(words) == 0
     out = capsys.readouterr().out
     assert "4 objects, 0 failed" in out
-    assert "the true pose of 2 is known: their scores are\nacc_15_deg" in out
+    assert "acc_15_deg" in out
+    assert "the true pose of 2 is known" in out
     assert "pose=any" in out
     with open(tmp_path / "predictions.csv", newline="") as file:
         lines = list(csv.DictReader(file))
@@ -136,7 +137,7 @@ def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
             path.unlink()
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "the true pose of 0 is known: nothing to compare" in out
+    assert "the true pose of 0 is known" in out
     assert "acc_" not in out
 
 

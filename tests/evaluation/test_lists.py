@@ -13,10 +13,10 @@ import torch
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import lists, runner
+from curvireg_torch.evaluation import lists, photograph, runner
 from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.runner import Entry
+from curvireg_torch.evaluation.photograph import Entry
 from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
@@ -99,16 +99,16 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
 
 def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
-    path = tmp_path / "excel.csv"
+    path, options = tmp_path / "excel.csv", RegisterOptions(meshes=(tmp_path / "part.stl",))
     path.write_text(
         "Photo ,x0,Y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     )
-    found = read_list(path, [tmp_path / "part.stl"])
+    found = read_list(path, options)
     assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
     assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
     assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
-    assert read_list(path, [tmp_path / "part.stl"])[0].box == (1.0, 2.0, 30.0, 40.0)
+    assert read_list(path, options)[0].box == (1.0, 2.0, 30.0, 40.0)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,8 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
     photo = read_photo(entry.photo)
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
     one = replace(entry, camera=camera)
-    result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
+    result = photograph.register_entry(one, photo, Certain())
+    document = result.document
     assert document["inputs"]["camera_source"] == source
     known = source in ("given", "file")
     assert document["covariance"] == (torch.eye(6).tolist() if known else None)
