@@ -10,7 +10,7 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.opening import whole_number
 from ..evaluation.registry import DATASETS
-from ..utils.choices import DEFAULT, check_given
+from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
 
@@ -132,26 +132,17 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     from ..evaluation.benchmarks import Protocol
     from ..evaluation.datasets import evaluate
     from ..evaluation.store import run_processes
-    from ..pipeline import Pipeline
     from ..utils.threads import one_torch_thread
 
-    kind = DATASETS[arguments.dataset]
-    protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
-    preset = arguments.preset or DEFAULT if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
+    kind, out, options = DATASETS[arguments.dataset], arguments.out, register_options(arguments)
+    protocol, pipeline = Protocol.parse(arguments.protocol, pose=kind.pose), options.open_pipeline()
     if run_processes(arguments.jobs, arguments.argv):
         return
-    dataset = kind.open(arguments.root, **kind.chosen(arguments))
-    benchmark = kind.scored(dataset, protocol)
-    check_writable(arguments.out, "--out")
+    benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
+    check_writable(out, "--out")
+    how: dict[str, Any] = {"limit": arguments.limit, "renderer": options.renderer, "progress": options.progress}
     with one_torch_thread():
-        summary = evaluate(
-            benchmark,
-            arguments.out,
-            preset=preset,
-            limit=arguments.limit,
-            renderer=arguments.renderer or "auto",
-            progress=arguments.progress,
-        )
+        summary = evaluate(benchmark, out, pipeline=pipeline, **how)
     if summary is None:  # another process writes it
         return
     if summary["n"] == 0:
@@ -288,3 +279,6 @@ def demo(arguments: argparse.Namespace) -> None:
     print(
         f"error against the truth: rotation {degrees:.1f} degrees, translation {100 * fraction:.1f} % of the distance"
     )
+
+
+COMMANDS = (add_bank, add_cache, add_evaluate, add_view, add_plot, add_demo)

@@ -27,12 +27,6 @@ NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
 STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
 
-WEAK_CONTOURS = 0.35
-"""Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
-blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
-
-DOUBTFUL_SCORE = 0.5  # probability below which the object is more likely absent from a detected box than there
-
 
 def add_register(commands: Any) -> None:
     parser = add_command(
@@ -123,7 +117,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
-        return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth and the like out"
+        return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
     if limits == ["front"] and not listed:
@@ -284,7 +278,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     confidence = "not calibrated" if document["confidence"] is None else f"{document['confidence']:.2f}"
     print(f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}")
     if not document["reliable"]:
-        print(f"no reliable match: take the pose as a guess; {_advice(document)}")
+        advice = "check that the box is tight, and the mesh the object's, in its --unit and with its --up axis"
+        print(f"no reliable match: take the pose as a guess; {advice}")
     _print_rivals(document)
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
@@ -321,26 +316,6 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
     words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
     none = f"none of them: {document['none']:.2f}"
     print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
-
-
-def _advice(document: Mapping[str, Any]) -> str:
-    """What to try after a registration that is not reliable, by its likely reason."""
-    support, detection = document["edge_support"], document.get("detection")
-    upright = document["pipeline"]["views"]["pose"] == "upright"
-    mesh = "that the mesh is the object's" + (", standing as in its file (--pose upright, --up)" if upright else "")
-    if document["warnings"]:
-        return "correct what the warning names"
-    if document["ambiguous"] is not None:
-        return "more than one pose fits"
-    if "distance" in document.get("prior", {}):
-        return f"check --distance, --unit and --camera, and {mesh}"
-    if detection is not None:
-        if detection["score"] < DOUBTFUL_SCORE:
-            return f"the object may not be in the photograph: add --box, and check {mesh}"
-        return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
-    if support is not None and support < WEAK_CONTOURS:
-        return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
-    return f"check that the box is tight and {mesh}"
 
 
 @contextmanager

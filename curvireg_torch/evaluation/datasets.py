@@ -12,7 +12,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..matching import cached_bank
 from ..mesh import load_mesh
-from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
 from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
@@ -35,7 +35,7 @@ def evaluate(
     benchmark: Benchmark,
     out: Path,
     *,
-    preset: str | Pipeline = DEFAULT,
+    pipeline: Pipeline | None = None,
     limit: int | None = None,
     renderer: str = "auto",
     progress: bool = True,
@@ -48,7 +48,7 @@ def evaluate(
 
     Args:
         benchmark, out: the objects, and the folder for the results.
-        preset: name of a pipeline, or a pipeline.
+        pipeline: by default the preset "learned".
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
         progress: show a bar.
@@ -57,7 +57,7 @@ def evaluate(
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, a bad limit, or a folder that holds the results of a list.
+        InvalidInputError: a bad limit, or a folder that holds the results of a list.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -65,7 +65,7 @@ def evaluate(
         >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])            # doctest: +SKIP
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
-    pipeline = preset_named(preset) if isinstance(preset, str) else preset
+    pipeline = pipeline or PRESETS[DEFAULT]
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:

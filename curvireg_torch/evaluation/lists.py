@@ -1,8 +1,6 @@
 """Lists of photographs: CSV files, folders and videos; and their results."""
 
-import csv
 import glob
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -13,7 +11,7 @@ from ..data import Video, load_camera
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
-from ..utils.files import check_table_size, write_csv, write_file
+from ..utils.files import read_csv, write_csv, write_file
 from ..visualization.encoding import png
 from ..visualization.overlay import to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
@@ -77,12 +75,13 @@ def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, 
     if empty:
         present = f"{', '.join(filter(None, texts))} and nothing for {', '.join(empty)}"
         raise InvalidInputError(f"{', '.join(names)}: expected all or none, got {present}")
+    numbers = []
     for name, text in zip(names, texts, strict=True):
         try:
-            float(text)
+            numbers.append(float(text))
         except ValueError:
             raise InvalidInputError(f"{name}: expected a number, got {text[:40]!r}") from None
-    return tuple(map(float, texts))
+    return tuple(numbers)
 
 
 def list_photographs(options: RegisterOptions, *, every: int = 1, frames: Path) -> list[Entry]:
@@ -114,24 +113,15 @@ def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
 
 
 def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
-    """Read a list of photographs: a CSV file, whose paths are relative to its folder.
+    """Read a list of photographs: a CSV file with the columns that docs/results.md describes, in any order.
 
-    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
-    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
-    through. Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options. Blank lines,
-    and empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
+    Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options. Blank lines, and
+    empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
     cannot be used is the reason.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp(), "list.csv")
-        >>> _ = file.write_text("photo,x0,y0,x1,y1,mesh\\na.jpg,1,2,30,40.5,part.stl")
-        >>> read_list(file, RegisterOptions())[0].box
-        (1.0, 2.0, 30.0, 40.5)
     """
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
-    header, *rows = csv_cells(path) or [[]]
+    header, *rows = read_csv(path) or [[]]
     header = _without_empty_end(header, 0)
     names = [column.strip().lower() for column in header]
     if missing := [required for required in _REQUIRED if required not in names]:
@@ -158,16 +148,6 @@ def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
     while len(kept) > least and not kept[-1].strip():
         kept.pop()
     return kept
-
-
-def csv_cells(path: Path) -> list[list[str]]:
-    """The rows of a CSV file that are not blank."""
-    check_table_size(path)
-    try:
-        table = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
-        return [cells for cells in table if any(map(str.strip, cells))]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"{path}: not CSV in UTF-8 ({error}); save it as CSV in UTF-8") from error
 
 
 @dataclass(frozen=True)

@@ -185,12 +185,7 @@ class RegisterOptions:
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given.
-
-    Example:
-        >>> limits_from_options({"side": "front", "near": (10, 20)})
-        {'azimuth': (315.0, 45.0), 'viewpoint': (10, 20, 0.0), 'within': 45.0}
-    """
+    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given."""
     given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
     side, near, within = (given.pop(name, None) for name in ("side", "near", "within"))
     if side is not None:
@@ -207,12 +202,7 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def limits_from_cells(cells: Mapping[str, str]) -> dict[str, Any]:
-    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given.
-
-    Example:
-        >>> limits_from_cells({"azimuth": "300 60", "theta": "", "front": "-y"})
-        {'azimuth': (300.0, 60.0), 'front': '-y'}
-    """
+    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given."""
     values = {}
     for name, text in cells.items():
         try:
@@ -271,12 +261,9 @@ def open_registrar(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> "Registrar":
-    """The registrar of mesh files or banks.
+    """The registrar of mesh files or banks, with the network from :meth:`RegisterOptions.open_field`.
 
-    Args:
-        options: its settings; ``photos``, ``meshes`` and what belongs to a photograph are not used.
-        meshes, field: the files, and the network from :meth:`RegisterOptions.open_field`.
-        progress: called while banks are built, instead of showing a bar.
+    ``progress`` is called while banks are built, instead of showing a bar.
     """
     from ..registration import Registrar
 

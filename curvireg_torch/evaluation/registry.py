@@ -64,12 +64,7 @@ DATASETS: dict[str, DatasetSpec] = {
             "split": {"default": "val", "help": "name of the image lists (default: val)"},
             "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
             "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-            "pixel_origin": {
-                "type": int,
-                "choices": (0, 1),
-                "default": 1,
-                "help": "number of the first pixel (default: 1)",
-            },
+            "pixel_origin": {"type": int, "choices": (0, 1), "default": 1, "help": "of the first pixel (default: 1)"},
         },
         whole={"occluded": False, "truncated": False},
     ),

@@ -111,7 +111,7 @@ def test_protocol_and_pipeline_reach_the_registrar(two_cars, tmp_path, monkeypat
     registrars, init = [], Registrar.__init__
     monkeypatch.setattr(Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k))
     benchmark = Pascal3DBenchmark(two_cars, Protocol(cad="any"))
-    run(benchmark, tmp_path, preset=replace(SMALL, box_jitter=0.05), limit=1)
+    run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
     assert len(registrars[0].others or registrars[-1].others) == 1
     for registrar in registrars:
         assert registrar.pipeline.box_jitter == 0.05
