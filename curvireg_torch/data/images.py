@@ -29,16 +29,6 @@ _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262,
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
-    1: lambda x: x,
-    2: lambda x: x[:, ::-1],
-    3: lambda x: x[::-1, ::-1],
-    4: lambda x: x[::-1],
-    5: lambda x: x.swapaxes(0, 1),
-    6: lambda x: x[::-1].swapaxes(0, 1),
-    7: lambda x: x[::-1, ::-1].swapaxes(0, 1),
-    8: lambda x: x[:, ::-1].swapaxes(0, 1),
-}
 
 
 @dataclass(frozen=True)
@@ -101,7 +91,7 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
         orientation = 1
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
-    return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](rgb), dtype), orientation, focal, notes)
+    return Photo(_to_tensor(_oriented(rgb, orientation), dtype), orientation, focal, notes)
 
 
 def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -128,7 +118,7 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
             notes, (orientation, focal) = _notes(image), _exif(image)
             rgb = _rgb_pixels(image)
             if image.format == "TIFF":  # Pillow has applied the orientation: take it back
-                rgb = _APPLY_ORIENTATION[{6: 8, 8: 6}.get(orientation, orientation)](rgb)
+                rgb = _oriented(rgb, {6: 8, 8: 6}.get(orientation, orientation))
             return rgb, orientation, focal, notes
     except ImageError as error:
         raise error.with_subject(path) from None
@@ -168,7 +158,7 @@ def _exif(image: "Image") -> tuple[int, float | None]:
         exif = image.getexif()
         orientation = exif.get(_ORIENTATION, 1)
         focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM, 0))
-    valid = isinstance(orientation, int) and orientation in _APPLY_ORIENTATION
+    valid = isinstance(orientation, int) and orientation in range(1, 9)
     return orientation if valid else 1, focal if 0 < focal < math.inf else None
 
 
@@ -194,6 +184,12 @@ def _notes(image: "Image") -> tuple[str, ...]:
         "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",  # previews of phones
     }
     return tuple(text for text, applies in notes.items() if applies)
+
+
+def _oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
+    x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
+    return x.swapaxes(0, 1) if orientation > 4 else x
 
 
 def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:

@@ -144,10 +144,8 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
 
 def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
     """The cells without the empty ones at the end; the first ``least`` stay."""
-    kept = list(cells)
-    while len(kept) > least and not kept[-1].strip():
-        kept.pop()
-    return kept
+    filled = [number for number, cell in enumerate(cells, start=1) if cell.strip()]
+    return list(cells[: max([least, *filled])])
 
 
 @dataclass(frozen=True)
