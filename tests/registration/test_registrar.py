@@ -17,7 +17,6 @@ from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.inputs import ImageItem, check_crop
-from curvireg_torch.registration.result import result_document
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
 
