@@ -254,8 +254,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from ..geometry import Camera, rotation_error
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
-    from ..visualization.encoding import png
-    from ..visualization.overlay import to_uint8
+    from ..visualization.encoding import png, to_uint8
     from .register import opened_registrar, print_result
 
     with one_torch_thread():

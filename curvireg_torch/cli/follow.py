@@ -101,7 +101,7 @@ def _follow(
 
     frames, count, fps = _live(source) if live else _frames(options.photos[0])
     fps = fps if 0 < fps < 1000 else FOLDER_FPS
-    registrar = open_registrar(options, options.meshes, options.open_field())
+    registrar = open_registrar(options, options.meshes)
     poses: list[dict[str, Any]] = []
     seconds: list[float] = []
     start, video, page = time.monotonic(), None, None

@@ -140,18 +140,17 @@ def run(arguments: argparse.Namespace) -> int:
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
-    options.open_pipeline()  # errors in options come before any photograph is read
-    field = options.open_field()
+    _ = options.open_pipeline(), options.network  # errors in options come before any photograph is read
     if arguments.views is not None or (arguments.list is None and is_one_photograph(options.photos)):
         with one_torch_thread():
             register = _register_one if arguments.views is None else _register_rig
-            reliable = register(options, field, arguments)
+            reliable = register(options, arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if run_processes(arguments.jobs, arguments.argv):
         return 0
     with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
-        counts = _register_several(options, field, arguments, out)
+        counts = _register_several(options, arguments, out)
         if counts is None:  # another process writes the tables
             return 0
         if arguments.json:
@@ -171,7 +170,7 @@ def run(arguments: argparse.Namespace) -> int:
     return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
 
 
-def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
+def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
     from ..data import read_photo
     from ..evaluation.photograph import check_entry, register_entry
@@ -185,7 +184,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
         print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with opened_registrar(options, field) as (registrar, seconds):
+    with opened_registrar(options) as (registrar, seconds):
         try:
             found = register_entry(entry, photo, registrar, bank_seconds=seconds)
         except LostObjectError as error:
@@ -208,7 +207,7 @@ def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Na
     return found.reliable
 
 
-def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
+def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
     from ..evaluation.result_files import write_views
     from ..evaluation.rigs import read_rig, register_rig
@@ -217,7 +216,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
         check_writable(out, "--out")
-    with opened_registrar(options, field) as (registrar, seconds):
+    with opened_registrar(options) as (registrar, seconds):
         result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
     document["mesh"] = str(options.meshes[result.model])
     if out is not None:
@@ -243,9 +242,7 @@ def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
         print_result(document, arguments.out)
 
 
-def _register_several(
-    options: "RegisterOptions", field: Any, arguments: argparse.Namespace, out: Path
-) -> "Counts | None":
+def _register_several(options: "RegisterOptions", arguments: argparse.Namespace, out: Path) -> "Counts | None":
     """Register photographs that are named one by one, or by a list."""
     from ..evaluation.lists import list_photographs, read_list, register_list
     from ..evaluation.opening import open_registrar
@@ -264,11 +261,10 @@ def _register_several(
     names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
-        "field": None if field is None else field_digest(field),
+        "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    open_meshes = partial(open_registrar, options, field=field)
-    return register_list(photos, out, open_meshes, settings=settings, progress=options.progress)
+    return register_list(photos, out, partial(open_registrar, options), settings=settings, progress=options.progress)
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
@@ -319,7 +315,7 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
 
 
 @contextmanager
-def opened_registrar(options: "RegisterOptions", field: Any = None) -> "Iterator[tuple[Registrar, float]]":
+def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, float]]":
     """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows its stages."""
     from tqdm import tqdm
 
@@ -333,6 +329,6 @@ def opened_registrar(options: "RegisterOptions", field: Any = None) -> "Iterator
             bar.set_description_str(f"{name} {count} of {of}" if of > 1 else name)
 
         show("reading the mesh", 0, 1)
-        registrar = open_registrar(options, options.meshes, field, progress=show if options.progress else None)
+        registrar = open_registrar(options, options.meshes, progress=show if options.progress else None)
         registrar.progress = show if options.progress else False
         yield registrar, time.perf_counter() - start

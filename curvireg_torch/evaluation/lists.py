@@ -12,8 +12,7 @@ from ..errors import InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import read_csv, write_csv, write_file
-from ..visualization.encoding import png
-from ..visualization.overlay import to_uint8
+from ..visualization.encoding import png, to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .photograph import Entry

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,7 +166,8 @@ class RegisterOptions:
         chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
         return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
 
-    def open_field(self) -> "LearnedCurvilinearSaliency | None":
+    @cached_property
+    def network(self) -> "LearnedCurvilinearSaliency | None":
         """The network of ``field``, or None."""
         from ..features import LearnedCurvilinearSaliency
 
@@ -257,14 +259,10 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
 def open_registrar(
     options: RegisterOptions,
     meshes: Sequence[Path],
-    field: "LearnedCurvilinearSaliency | None" = None,
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> "Registrar":
-    """The registrar of mesh files or banks, with the network from :meth:`RegisterOptions.open_field`.
-
-    ``progress`` is called while banks are built, instead of showing a bar.
-    """
+    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead of showing a bar."""
     from ..registration import Registrar
 
     pipeline = options.open_pipeline()
@@ -279,7 +277,8 @@ def open_registrar(
         pipeline = replace(pipeline, contours=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
-    return Registrar(banks, pipeline=pipeline, field=field, renderer=options.renderer, mesh_is=options.mesh_is)
+    settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
+    return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
 
 
 def _open_bank(
