@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, InvalidInputError, MissingFileError
+from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, MissingFileError
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
 
@@ -36,7 +36,7 @@ class Photo:
     """A photograph as viewers show it, and the metadata of its file.
 
     Attributes:
-        image: (3, H, W) RGB.
+        image: (3, H, W) uint8 RGB.
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
         notes: changes to the pixels, in words.
@@ -65,12 +65,11 @@ class Photo:
         return {**facts, "notes": list(self.notes)}
 
 
-def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8, as_stored: bool = False) -> Photo:
+def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Photo:
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
         path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
-        dtype: ``torch.uint8``, 0 to 255, or ``torch.float32``, 0 to 1.
         as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
@@ -87,19 +86,19 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
     rgb, orientation, focal, notes = _decode(Path(path))
-    if as_stored:
-        orientation = 1
+    orientation = 1 if as_stored else orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
-    return Photo(_to_tensor(_oriented(rgb, orientation), dtype), orientation, focal, notes)
+    pixels = torch.from_numpy(np.array(_oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
+    return Photo(pixels, orientation, focal, notes)
 
 
-def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) RGB.
+def read_image(path: str | os.PathLike[str]) -> Tensor:
+    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) float32 RGB in [0, 1].
 
-    Grey images get three equal channels, an alpha channel is dropped. Arguments and errors as in :func:`read_photo`.
+    Grey images get three equal channels, an alpha channel is dropped. Errors as in :func:`read_photo`.
     """
-    return read_photo(path, dtype=dtype, as_stored=True).image
+    return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
@@ -111,7 +110,11 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(BytesIO(_checked_scans(path.read_bytes())), formats=_FORMATS) as image:
+        data = path.read_bytes()
+        scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
+        if scans > MAX_IMAGE_SCANS:  # of a progressive JPEG, which Pillow would decode for hours
+            raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
+        with Image.open(BytesIO(data), formats=_FORMATS) as image:
             _seek_full_image(image)
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise Image.DecompressionBombError
@@ -130,14 +133,6 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
     except Exception as error:  # Pillow raises errors of any kind for damaged files
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise ImageError(f"damaged or truncated ({reason}); fetch or save the file again", subject=path) from error
-
-
-def _checked_scans(data: bytes) -> bytes:
-    """Refuse a progressive JPEG of very many scans, which Pillow would decode for hours."""
-    scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
-    if scans > MAX_IMAGE_SCANS:
-        raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
-    return data
 
 
 def _seek_full_image(image: "Image") -> None:
@@ -190,13 +185,6 @@ def _oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
     x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
     return x.swapaxes(0, 1) if orientation > 4 else x
-
-
-def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
-    if dtype not in (torch.uint8, torch.float32):
-        raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
-    x = torch.from_numpy(np.array(rgb.transpose(2, 0, 1), order="C"))
-    return x if dtype == torch.uint8 else x.float().div_(255.0)
 
 
 _CONTAINERS = re.compile(

@@ -137,7 +137,16 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
     """The best and the worst objects: by error; then those of unknown pose, by confidence; then those that failed."""
     shown = []
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
-        kind, caption, order = _outcome(row, error)
+        number = row.get("confidence")
+        confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
+        if row["status"] == "failed":
+            kind, caption, order = "failed", row["message"], (2, 0.0)
+        elif math.isnan(error):
+            kind, caption = "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}"
+            order = 1, -(number or 0.0)
+        else:
+            kind, caption = "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}"
+            order = 0, error
         name, picture = benchmark.entries[i].key, thumbnail_of(out, row)
         shown.append((order, SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture)))
     shown.sort(key=lambda pair: pair[0])
@@ -145,14 +154,3 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
     right, failed = sum(error < RIGHT_DEG for error in known), sum(row["status"] == "failed" for row in rows)
     title = f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} failed"
     write_sheet(out / "index.html", title, [entry for _, entry in shown], table="predictions.csv", each=SHOWN_EACH)
-
-
-def _outcome(row: Row, error: float) -> tuple[str, str, tuple[int, float]]:
-    """Kind, caption and sort key of a result."""
-    if row["status"] == "failed":
-        return "failed", row["message"], (2, 0.0)
-    number = row["confidence"]
-    confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
-    if math.isnan(error):
-        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -(number or 0.0))
-    return "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}", (0, error)
