@@ -1,6 +1,5 @@
 """Evaluation of datasets, from files to files."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -13,7 +12,7 @@ from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.registration import Registrar
-from tests._support.lists import bop_poses
+from tests._support.lists import bop_poses, table
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 from .small import SMALL, rows_of, run, without_seconds
@@ -126,8 +125,7 @@ def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
     assert "acc_15_deg" in out
     assert "the true pose of 2 is known" in out
     assert "pose=any" in out
-    with open(tmp_path / "predictions.csv", newline="") as file:
-        lines = list(csv.DictReader(file))
+    lines = table(tmp_path, "predictions.csv")
     assert [line["category"] for line in lines] == ["cup"] * 3 + ["shoe"]
     assert [line["true_azimuth"] for line in lines] == ["30", "", "90", ""]
     assert [bool(line["error_deg"]) for line in lines] == [True, False, True, False]

@@ -1,6 +1,5 @@
 """Registration of lists: what is repeated, what the tables and the page show, and names that are no text."""
 
-import csv
 import json
 import os
 from dataclasses import replace
@@ -21,6 +20,7 @@ from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
+from tests._support.lists import lines, table
 from tests._support.scenes import SIZE, scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
@@ -70,8 +70,8 @@ def test_rows_follow_the_order_of_the_list(registrar, entry, tmp_path):
     rows = [replace(entry, cells={"id": "a"}), replace(entry, camera=50.0, cells={"id": "b"})]
     for some in (rows, rows[::-1]):
         register_rows(some, tmp_path / "out", registrar)
-        found = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
-        assert [(row["row"], row["columns"]) for row in found] == list(enumerate((one.cells for one in some), start=1))
+        found = [(row["row"], row["columns"]) for row in lines(tmp_path / "out")]
+        assert found == list(enumerate((one.cells for one in some), start=1))
 
 
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
@@ -87,11 +87,10 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
     photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box), frames=tmp_path)
-    counts = lists.register_list(photos, tmp_path / "out", lambda _: registrar, settings={}, progress=False)
+    counts = register_rows(photos, tmp_path / "out", registrar)
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
-    with (tmp_path / "out" / "results.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(tmp_path / "out")
     assert [os.path.basename(row["photo"]) for row in rows] == [r"caf\udce9.png", r"gar\udce7on.png"]
     assert [row["status"] for row in rows] == ["ok", "failed"]
     assert r"caf\udce9.png" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
