@@ -59,14 +59,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    register.add_register(subparsers)
-    follow.add_follow(subparsers)
-    commands.add_bank(subparsers)
-    commands.add_cache(subparsers)
-    commands.add_evaluate(subparsers)
-    commands.add_view(subparsers)
-    commands.add_plot(subparsers)
-    commands.add_demo(subparsers)
+    for add in (register.add_register, follow.add_follow, *commands.COMMANDS):
+        add(subparsers)
     return parser
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -11,18 +10,9 @@ from typing import Any
 from ..errors import InvalidInputError, MissingFileError
 from ..evaluation.opening import whole_number
 from ..evaluation.registry import DATASETS
-from ..utils.choices import DEFAULT, check_given
+from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from .options import (
-    MESH,
-    METHOD,
-    PHOTOGRAPH,
-    add_command,
-    add_limits,
-    add_options,
-    check_viewer,
-    register_options,
-)
+from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
 
 LOCAL = "127.0.0.1"
 PICTURES = {
@@ -142,48 +132,28 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     from ..evaluation.benchmarks import Protocol
     from ..evaluation.datasets import evaluate
     from ..evaluation.store import run_processes
-    from ..pipeline import Pipeline
     from ..utils.threads import one_torch_thread
 
-    kind = DATASETS[arguments.dataset]
-    protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
-    preset = arguments.preset or DEFAULT if arguments.pipeline is None else Pipeline.read(arguments.pipeline)
+    kind, out, options = DATASETS[arguments.dataset], arguments.out, register_options(arguments)
+    protocol, pipeline = Protocol.parse(arguments.protocol, pose=kind.pose), options.open_pipeline()
     if run_processes(arguments.jobs, arguments.argv):
         return
-    dataset = kind.open(arguments.root, **kind.chosen(arguments))
-    benchmark = kind.scored(dataset, protocol)
-    check_writable(arguments.out, "--out")
+    benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
+    check_writable(out, "--out")
+    how: dict[str, Any] = {"limit": arguments.limit, "renderer": options.renderer, "progress": options.progress}
     with one_torch_thread():
-        summary = evaluate(
-            benchmark,
-            arguments.out,
-            preset=preset,
-            limit=arguments.limit,
-            renderer=arguments.renderer or "auto",
-            progress=arguments.progress,
-        )
+        summary = evaluate(benchmark, out, pipeline=pipeline, **how)
     if summary is None:  # another process writes it
         return
     if summary["n"] == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
         raise InvalidInputError(f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json")
-    _print_summary(summary)
-    print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
-
-
-def _print_summary(summary: Mapping[str, Any]) -> None:
     print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
+    numbers = {**summary, **summary.get("detection", {})}.items()
+    print("   ".join(f"{name} {value:.3f}" for name, value in numbers if isinstance(value, float)))
     if "n_posed" in summary:
-        print(f"{summary['reliable']} reliable, mean confidence {summary['mean_confidence']:.2f}")
-        posed = summary["n_posed"]
-        print(f"the true pose of {posed} is known: " + ("their scores are" if posed else "nothing to compare"))
-    if summary["med_err_deg"] is not None:
-        prefixes = ("acc_", "add_", "mssd_", "mspd_")
-        numbers = [f"{name} {value:.3f}" for name, value in summary.items() if name.startswith(prefixes)]
-        print("   ".join([*numbers, f"med_err_deg {summary['med_err_deg']:.1f}"]))
-    if "detection" in summary:
-        (_, n), *recalls = summary["detection"].items()
-        print("   ".join(f"{name} {value:.3f}" for name, value in recalls) if n else "no box is annotated")
+        print(f"{summary['reliable']} reliable; the true pose of {summary['n_posed']} is known")
+    print(f"protocol: {summary['protocol']}; see {arguments.out}/summary.json")
 
 
 def add_view(commands: Any) -> None:
@@ -242,28 +212,23 @@ def draw(arguments: argparse.Namespace) -> None:
     if arguments.out.suffix.lower() not in FORMATS:
         raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
     check_writable(arguments.out.parent, "--out")
-    import torch
-
     from ..data import read_photo
     from ..evaluation.opening import open_registrar
-    from ..evaluation.runner import register_entry, seen_image
-    from ..registration.result import used_box
+    from ..evaluation.photograph import register_entry
     from ..utils.threads import one_torch_thread
-    from ..visualization import contour_overlay, plots
+    from ..visualization import plots
 
     options = register_options(arguments, [arguments.photo], [arguments.mesh])
-    photo = read_photo(options.photos[0], dtype=torch.uint8)
+    photo = read_photo(arguments.photo)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
-        entry = options.entry(options.photos[0])
-        result, document = register_entry(entry, photo, registrar, bank_seconds=0.0)
-        image, box = seen_image(entry, photo), torch.tensor(used_box(document))
+        found = register_entry(options.entry(arguments.photo), photo, registrar)
         if arguments.kind == "viewpoints":
-            figure = plots.viewpoints(registrar.bank, result)
+            figure = plots.viewpoints(registrar.bank, found)
         elif arguments.kind == "fields":
-            figure = plots.fields(registrar, result, image, box)
+            figure = plots.fields(registrar, found, found.image, found.box)
         else:
-            figure = plots.picture(contour_overlay(registrar, result, image, box))
+            figure = found.plot()
     content = BytesIO()
     figure.savefig(content, format=arguments.out.suffix[1:].lower(), dpi=150)
     write_file(arguments.out, content.getvalue())
@@ -285,9 +250,8 @@ def demo(arguments: argparse.Namespace) -> None:
     out = arguments.out
     check_writable(out, "--out")
     from ..data import read_photo
-    from ..evaluation.result_files import write_result
-    from ..evaluation.runner import register_entry
-    from ..geometry import rotation_error
+    from ..evaluation.photograph import register_entry
+    from ..geometry import Camera, rotation_error
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png, to_uint8
@@ -298,20 +262,22 @@ def demo(arguments: argparse.Namespace) -> None:
         write_file(out / "mesh.ply", scene.mesh.export(file_type="ply"))
         write_file(out / "photo.png", png(to_uint8(scene.image)))
         options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
-        K, photo = scene.camera_matrix, read_photo(out / "photo.png")
-        camera = tuple(float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        entry = replace(options, box=tuple(scene.box.tolist()), camera=camera).entry(out / "photo.png")
+        options = replace(options, box=tuple(scene.box.tolist()), camera=Camera(scene.camera_matrix))
         with opened_registrar(options) as (registrar, seconds):
-            result, document = register_entry(entry, photo, registrar, bank_seconds=seconds)
-        assert result.translation is not None
+            entry, photo = options.entry(out / "photo.png"), read_photo(out / "photo.png")
+            found = register_entry(entry, photo, registrar, bank_seconds=seconds)
+        assert found.translation is not None
         R, t = scene.truth[:3, :3], scene.truth[:3, 3]
-        document["rotation_error_deg"] = float(rotation_error(result.rotation, R))
-        document["translation_error"] = float((result.translation - t).norm() / t.norm())
-        document["truth"] = {"rotation": R.tolist(), "translation": t.tolist()}
-        document["inputs"]["seed"] = arguments.seed
-        write_result(out, document, registrar, result, photo.image, scene.box)
-    print_result(document, out)
+        degrees = float(rotation_error(found.rotation, R))
+        fraction = float((found.translation - t).norm() / t.norm())
+        truth = {"rotation": R.tolist(), "translation": t.tolist()}
+        found.document.update(rotation_error_deg=degrees, translation_error=fraction, truth=truth)
+        found.document["inputs"]["seed"] = arguments.seed
+        found.save(out)
+    print_result(found.document, out)
     print(
-        f"error against the truth: rotation {document['rotation_error_deg']:.1f} degrees, "
-        f"translation {100 * document['translation_error']:.1f} % of the distance"
+        f"error against the truth: rotation {degrees:.1f} degrees, translation {100 * fraction:.1f} % of the distance"
     )
+
+
+COMMANDS = (add_bank, add_cache, add_evaluate, add_view, add_plot, add_demo)

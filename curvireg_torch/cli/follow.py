@@ -1,16 +1,19 @@
 """``curvireg follow FRAMES MESH``."""
 
 import argparse
+import itertools
 import json
 import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
+from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
+from ..evaluation.opening import CAMERA_OPTIONS
 from ..utils.choices import VIDEOS, check_given
 from ..utils.files import check_writable
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
 
     from ..evaluation.opening import RegisterOptions
     from ..registration import FailedRegistration, Registrar, Registration
+
+    Frame = tuple[str, Tensor | ImageError]  # its name, and its pixels or why they cannot be read
 
 FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camera that does not tell
 
@@ -59,7 +64,6 @@ def run(arguments: argparse.Namespace) -> None:
     check_given([] if live else [Path(source)], [arguments.mesh])
     if not live and not Path(source).exists():
         raise MissingFileError("no such folder or video; or give the number of a camera, or rtsp://...", subject=source)
-    from ..evaluation.runner import CAMERA_OPTIONS
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
@@ -72,32 +76,33 @@ def run(arguments: argparse.Namespace) -> None:
     if out is not None:
         check_writable(out, "--out")
     with one_torch_thread():
-        rows, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
-    counts = {status: sum(row[1] == status for row in rows) for status in STATUSES}
-    summary = ", ".join([f"{counts['ok']} of {len(rows)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
+        poses, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
+    counts = {status: sum(pose["status"] == status for pose in poses) for status in STATUSES}
+    summary = ", ".join([f"{counts['ok']} of {len(poses)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
     after_first = seconds[1:]  # the first frame is registered
     rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
     files = "" if out is None else f"; see {out}/results.csv" + (f" and {video}" if video else "")
-    print(f"{len(rows)} frames: {summary}{rate}{files}", file=sys.stderr if arguments.json else sys.stdout)
+    print(f"{len(poses)} frames: {summary}{rate}{files}", file=sys.stderr if arguments.json else sys.stdout)
     if not counts["ok"] and not counts["unsure"]:
-        reason = f"; the first: {rows[0][-1]}" if rows else ""
+        reason = f"; the first: {poses[0]['message']}" if poses else ""
         message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
         raise InvalidInputError(message, subject=source)
 
 
 def _follow(
     options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool, show: bool
-) -> tuple[list[list[Any]], list[float], Path | None]:
-    """Rows of ``out / "results.csv"``, which is also written after an interruption, seconds that the pose of each frame
-    took, and path of the overlay, if there is one."""
+) -> tuple[list[dict[str, Any]], list[float], Path | None]:
+    """The poses in ``out / "results.csv"``, which is also written after an interruption, seconds that each took, and
+    path of the overlay, if there is one."""
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
     from ..visualization import OverlayVideo
 
     frames, count, fps = _live(source) if live else _frames(options.photos[0])
-    registrar = open_registrar(options, options.meshes, options.open_field())
-    rows: list[list[Any]] = []
+    fps = fps if 0 < fps < 1000 else FOLDER_FPS
+    registrar = open_registrar(options, options.meshes)
+    poses: list[dict[str, Any]] = []
     seconds: list[float] = []
     start, video, page = time.monotonic(), None, None
     try:
@@ -111,9 +116,9 @@ def _follow(
             bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
             for name, shown, result, took in _poses(options, registrar, bar):
                 seconds.append(took)
-                rows.append(_row(name, result))
+                poses.append({"frame": name, "seconds": round(time.monotonic() - start, 4), **_document(result)})
                 if as_json:
-                    print(_json_line(rows[-1], result, time.monotonic() - start), flush=True)
+                    print(json.dumps(poses[-1], allow_nan=False), flush=True)
                 if video is not None:
                     video.add(shown, result)
                 if page is not None:
@@ -122,13 +127,13 @@ def _follow(
         if not live:  # a file has an end
             raise
     finally:
-        if rows and out is not None:
-            _write_table(out, rows)
-    return rows, seconds, None if video is None or not video.path.is_file() else video.path
+        if poses and out is not None:
+            _write_table(out, poses)
+    return poses, seconds, None if video is None or not video.path.is_file() else video.path
 
 
 def _poses(
-    options: "RegisterOptions", registrar: "Registrar", frames: "Iterable[tuple[str, Tensor | ImageError]]"
+    options: "RegisterOptions", registrar: "Registrar", frames: "Iterable[Frame]"
 ) -> "Iterator[tuple[str, Tensor | None, Registration | FailedRegistration, float]]":
     """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
     import torch
@@ -164,7 +169,7 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
     from ..data import Photo, read_photo
     from ..evaluation.lists import find_photographs
-    from ..evaluation.runner import camera_of
+    from ..evaluation.photograph import camera_of
 
     source, photo = options.photos[0], Photo(image, 1, None, ())
     if source.is_dir():
@@ -175,18 +180,17 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     return camera.at((image.shape[-2], image.shape[-1])).matrix
 
 
-def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], int, float]:
-    """Names and pixels of the frames, with errors in place of unreadable ones; their number, and frames per second."""
+def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
+    """The frames of a video or a folder, their number, and frames per second."""
     from ..data import Video, read_photo
     from ..evaluation.lists import find_photographs
 
     if path.suffix.lower() in VIDEOS and path.is_file():
         video = Video(path)
-        fps = video.fps if 0 < video.fps < 1000 else FOLDER_FPS
-        return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, fps
+        return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, video.fps
     photos = list(find_photographs(path, 1, path))
 
-    def read() -> Iterator[tuple[str, "Tensor | ImageError"]]:
+    def read() -> Iterator["Frame"]:
         for photo in photos:
             try:
                 yield str(photo), read_photo(photo).image
@@ -196,7 +200,7 @@ def _frames(path: Path) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], in
     return read(), len(photos), FOLDER_FPS
 
 
-def _live(source: str) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], None, float]:
+def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
     """Frames of a camera or a stream: a thread reads them, and the latest one is taken, so that none is late."""
     import cv2
     import numpy as np
@@ -206,74 +210,56 @@ def _live(source: str) -> tuple[Iterator[tuple[str, "Tensor | ImageError"]], Non
     if not file.isOpened():
         kind = "no such camera, or another program uses it" if source.isdecimal() else "the stream cannot be opened"
         raise InvalidInputError(f"{kind}; check its number or address", subject=source)
-    latest: list[Any] = []
-    arrived, finished, ended = threading.Condition(), threading.Event(), threading.Event()
+    latest: Queue[tuple[int, Any]] = Queue(maxsize=1)
+    ended = threading.Event()
 
     def read() -> None:
-        number = 0
-        while not ended.is_set():
+        for number in itertools.count():
             known, pixels = file.read()
-            with arrived:
-                if known:
-                    latest[:] = [(number, pixels)]
-                else:
-                    finished.set()
-                arrived.notify()
-            if not known:
+            if not known or ended.is_set():
                 return
-            number += 1
+            with suppress(Empty):
+                latest.get_nowait()
+            latest.put((number, pixels))
 
-    def frames() -> Iterator[tuple[str, "Tensor | ImageError"]]:
+    def frames() -> Iterator["Frame"]:
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
         try:
-            while True:
-                with arrived:
-                    while not latest:
-                        if finished.is_set():
-                            return
-                        arrived.wait(0.2)  # Ctrl-C is heard between
-                    number, pixels = latest.pop()
-                rgb = np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))
-                yield f"frame-{number:06d}", torch.from_numpy(rgb)
+            while reader.is_alive() or not latest.empty():
+                with suppress(Empty):
+                    number, pixels = latest.get(timeout=0.2)
+                    rgb = np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))
+                    yield f"frame-{number:06d}", torch.from_numpy(rgb)
         finally:
             ended.set()
             reader.join(timeout=5.0)
             file.release()
 
-    fps = file.get(cv2.CAP_PROP_FPS)
-    return frames(), None, fps if 0 < fps < 1000 else FOLDER_FPS
+    return frames(), None, file.get(cv2.CAP_PROP_FPS)
 
 
-def _row(name: str, result: "Registration | FailedRegistration") -> list[Any]:
+def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:
+    """A pose, or why there is none, as JSON values."""
     from ..registration import FailedRegistration
     from ..registration.following import BELIEVED_CONFIDENCE
 
     if isinstance(result, FailedRegistration):
         status = "lost" if isinstance(result.error, LostObjectError) else "failed"
-        return [name, status, *[""] * 14, str(result.error)]
-    assert result.translation is not None  # there is a camera matrix
-    pose = [*result.rotation.flatten().tolist(), *result.translation.tolist()]
+        return {"status": status, "message": str(result.error)}
     believed = (result.confidence or 0.0) >= BELIEVED_CONFIDENCE
-    return [name, "ok" if believed else "unsure", *pose, result.confidence, result.edge_support, ""]
+    pose = {key: getattr(result, key).tolist() for key in ("rotation", "translation", "quaternion")}
+    scores = {"confidence": result.confidence, "edge_support": result.edge_support}
+    return {"status": "ok" if believed else "unsure", **pose, **scores}
 
 
-def _json_line(row: list[Any], result: "Registration | FailedRegistration", seconds: float) -> str:
-    from ..registration import Registration
-
-    line = {"frame": row[0], "seconds": round(seconds, 4), "status": row[1]}
-    if isinstance(result, Registration):
-        keys = ("rotation", "translation", "quaternion")
-        line |= {key: getattr(result, key).tolist() for key in keys}
-        line |= {"confidence": result.confidence, "edge_support": result.edge_support}
-    else:
-        line["message"] = row[-1]
-    return json.dumps(line, allow_nan=False)
-
-
-def _write_table(out: Path, rows: list[list[Any]]) -> None:
+def _write_table(out: Path, poses: list[dict[str, Any]]) -> None:
     from ..evaluation.lists import POSE_COLUMNS
     from ..utils.files import write_csv
 
-    header = ["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]
-    write_csv(out / "results.csv", [header, *rows])
+    rows: list[list[Any]] = [["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]]
+    for pose in poses:
+        numbers = [*itertools.chain(*pose["rotation"]), *pose["translation"]] if "rotation" in pose else [""] * 12
+        more = [pose.get(name, "") for name in ("confidence", "edge_support", "message")]
+        rows.append([pose["frame"], pose["status"], *numbers, *more])
+    write_csv(out / "results.csv", rows)

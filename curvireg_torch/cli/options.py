@@ -18,7 +18,8 @@ from ..evaluation.opening import (
     prior_from_limits,
 )
 
-DECLARED = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
+FIELDS = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
+DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
@@ -48,25 +49,21 @@ def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
 def add_options(parser: Any, *names: str, **help_texts: str) -> None:
     """Add options of a registration; ``help_texts`` replace those of their declarations."""
     for name in names:
-        how = _argument(DECLARED[name])
-        flag = how.pop("flag", f"--{name.replace('_', '-')}")
-        parser.add_argument(flag, dest=name, **{**how, "help": help_texts.get(name, how["help"])})
+        how = {**DECLARED[name], **({"help": help_texts[name]} if name in help_texts else {})}
+        kind, flag = how.get("type"), how.pop("flag", f"--{name.replace('_', '-')}")
+        if isinstance(kind, Numbers):
+            how["metavar"] = re.sub(r"[][]", "", kind.names)
+        elif kind is Path:
+            how["metavar"] = "FILE"
+        parser.add_argument(flag, dest=name, **how)
 
 
 def add_limits(parser: Any) -> None:
     """Add the options that limit the pose."""
     text = (
-        "limits, angles in degrees; all that are given must hold; the result stays within them. Lists have columns of "
+        "limits, angles in degrees; all that are given must hold; the result stays within them. Lists have columns of"
     )
-    group = parser.add_argument_group("what is known about the pose", text + "these names")
-    for name, how in PRIOR_OPTIONS.items():
-        group.add_argument(f"--{name}", **_argument(how))
-
-
-def _argument(how: dict[str, Any]) -> dict[str, Any]:
-    kind = how.get("type")
-    names = {"metavar": re.sub(r"[][]", "", kind.names)} if isinstance(kind, Numbers) else {}
-    return {**names, **({"metavar": "FILE"} if kind is Path else {}), **how}
+    add_options(parser.add_argument_group("what is known about the pose", f"{text} these names"), *PRIOR_OPTIONS)
 
 
 def register_options(
@@ -75,7 +72,7 @@ def register_options(
     """The options of a command; those that it lacks have their defaults."""
     from ..utils.checks import check_device
 
-    given = {name: value for name in DECLARED if (value := getattr(arguments, name, None)) is not None}
+    given = {name: value for name in FIELDS if (value := getattr(arguments, name, None)) is not None}
     if given.get("camera") == "exif":
         given["guess"] = given.pop("camera")
     elif isinstance(given.get("camera"), str):
@@ -101,16 +98,12 @@ def check_viewer(command: str) -> None:
         raise MissingDependencyError(f"{message}'.[viewer]'") from error
 
 
-def _counts() -> dict[str, int]:
-    """Numbers that an option takes at most."""
-    counts = {"--camera": 4}
-    for name, how in [*DECLARED.items(), *PRIOR_OPTIONS.items()]:
-        if isinstance(how.get("type"), Numbers):
-            counts[how.get("flag", f"--{name}")] = how["type"].most
-    return counts
-
-
-_COUNTS = _counts()
+_COUNTS = {"--camera": 4} | {
+    how.get("flag", f"--{name}"): how["type"].most
+    for name, how in DECLARED.items()
+    if isinstance(how.get("type"), Numbers)
+}
+"""Numbers that an option takes at most."""
 
 
 def join_numbers(words: Sequence[str]) -> list[str]:

@@ -4,15 +4,14 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
-from ..evaluation.opening import whole_number
+from ..evaluation.opening import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..utils.choices import check_given, is_one_photograph
 from ..utils.files import check_writable
 from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
@@ -20,7 +19,6 @@ from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_a
 if TYPE_CHECKING:
     from ..evaluation.lists import Counts
     from ..evaluation.opening import RegisterOptions
-    from ..evaluation.runner import Entry
     from ..registration import Registrar
 
 MAX_FAILURES = 10  # photographs of a list that could not be registered, of which the command prints the reason
@@ -28,12 +26,6 @@ NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
 
 STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
-
-WEAK_CONTOURS = 0.35
-"""Edge support of a right pose that hardly occurs: 24 generated scenes of the example mesh had 0.47 to 0.64, after a
-blur of 4 px 0.26 to 0.39, and with the meshes of a sphere and of a cuboid 0.14 to 0.43."""
-
-DOUBTFUL_SCORE = 0.5  # probability below which the object is more likely absent from a detected box than there
 
 
 def add_register(commands: Any) -> None:
@@ -99,6 +91,7 @@ def add_register(commands: Any) -> None:
 def complete(arguments: argparse.Namespace) -> str | None:
     """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options together, or None."""
     rig, listed = arguments.views, arguments.list is not None or arguments.views is not None
+    limits = [name for name in PRIOR_OPTIONS if getattr(arguments, name) is not None]
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
     if arguments.unit is None and rig is not None and (rig / "scene_camera.json").is_file():
@@ -123,47 +116,41 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
-    if rig is not None and arguments.guess is not None:
-        return "the rig holds the cameras; leave --fov out"
+    if rig is not None and (arguments.guess is not None or limits):
+        return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
+    if arguments.start is not None and limits:
+        return "--start: refines this pose alone; leave limits on the pose out"
+    if limits == ["front"] and not listed:
+        return "--front limits nothing by itself; give --azimuth, for instance"
+    if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
+        return f"--distance: needs a camera; give {CAMERA_OPTIONS}"
+    if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
+        return "--start and --mask are of one photograph; give several masks in a list, column mask"
     if arguments.format and (arguments.list or arguments.out is None):
         return "--format ros: of one result, in --out DIR"
+    if arguments.format and rig is None and arguments.camera is arguments.guess is None:
+        return f"--format ros: needs a camera; give {CAMERA_OPTIONS}"
     return None
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.opening import prior_from_limits
-    from ..evaluation.runner import CAMERA_OPTIONS
     from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
-    options.open_pipeline()  # errors in options come before any photograph is read
-    field, limits = options.open_field(), options.limits or {}
-    if limits and prior_from_limits(limits) is None and arguments.list is None:
-        raise InvalidInputError("--front limits nothing by itself; give --azimuth, for instance")
-    if "distance" in limits and arguments.list is None and not (options.camera or options.guess):
-        raise InvalidInputError(f"--distance: needs a camera; give {CAMERA_OPTIONS}")
-    if options.start is not None and limits:
-        raise InvalidInputError("--start: refines this pose alone; leave limits on the pose out")
-    if arguments.views is not None and limits:
-        raise InvalidInputError("--views: a rig takes no limits on the pose; leave them out")
+    _ = options.open_pipeline(), options.network  # errors in options come before any photograph is read
     if arguments.views is not None or (arguments.list is None and is_one_photograph(options.photos)):
         with one_torch_thread():
             register = _register_one if arguments.views is None else _register_rig
-            reliable = register(options, field, arguments)
+            reliable = register(options, arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0
-    if options.start is not None:
-        raise InvalidInputError("--start: refines one pose; give one photograph")
-    if options.mask is not None:
-        raise InvalidInputError("--mask: is of one photograph; give several in a list, column mask")
     if run_processes(arguments.jobs, arguments.argv):
         return 0
     with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
         out = Path(folder) if arguments.out is None else arguments.out
-        photos = _photographs(options, arguments.list, out, every=arguments.every)
-        counts = _register_several(options, field, photos, out)
+        counts = _register_several(options, arguments, out)
         if counts is None:  # another process writes the tables
             return 0
         if arguments.json:
@@ -183,51 +170,44 @@ def run(arguments: argparse.Namespace) -> int:
     return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
 
 
-def _register_one(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
+def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
-    import torch
-
     from ..data import read_photo
-    from ..evaluation.result_files import write_lost, write_result
-    from ..evaluation.runner import CAMERA_OPTIONS, check_entry, register_entry, seen_image
+    from ..evaluation.photograph import check_entry, register_entry
+    from ..evaluation.result_files import write_lost
     from ..geometry import Camera
-    from ..registration.result import used_box
 
     out, path = arguments.out, options.photos[0]
-    photo, entry = read_photo(path, dtype=torch.uint8), options.entry(path)
+    photo, entry = read_photo(path), options.entry(path)
     check_entry(entry, photo)
-    if arguments.format and options.camera is options.guess is None:
-        raise InvalidInputError(f"--format ros: needs a camera; give {CAMERA_OPTIONS}")
     if out is not None:
         check_writable(out, "--out")
     if options.progress and not (options.box or options.mask or options.start):
         print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with opened_registrar(options, field) as (registrar, seconds):
+    with opened_registrar(options) as (registrar, seconds):
         try:
-            result, document = register_entry(entry, photo, registrar, bank_seconds=seconds)
+            found = register_entry(entry, photo, registrar, bank_seconds=seconds)
         except LostObjectError as error:
             if out is not None:
                 write_lost(out, str(error))
             raise
-    notes = sys.stderr if arguments.json else sys.stdout  # with --json, standard output holds only the result
     if out is not None:
-        write_result(out, document, registrar, result, seen_image(entry, photo), used_box(document))
-    for warning in document["warnings"]:
+        found.save(out)
+    for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
-    if document["inputs"]["camera_source"] in ("exif", "fov"):
-        focal = document["inputs"]["camera"][0]
-        note = f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor"
-        print(f"{path}: {note}", file=notes)
-    remarks = list(photo.notes)
+    remarks, inputs = list(photo.notes), found.document["inputs"]
+    if inputs["camera_source"] in ("exif", "fov"):
+        focal = inputs["camera"][0]
+        remarks.append(f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor")
     if isinstance(options.camera, Camera) and options.camera.distorts:
         remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
-    if remarks:
-        print(f"{path}: {'; '.join(remarks)}", file=notes)
-    _finish(arguments, document)
-    return result.reliable
+    if remarks:  # with --json, standard output holds only the result
+        print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
+    _finish(arguments, found.document)
+    return found.reliable
 
 
-def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Namespace) -> bool:
+def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
     from ..evaluation.result_files import write_views
     from ..evaluation.rigs import read_rig, register_rig
@@ -236,7 +216,7 @@ def _register_rig(options: "RegisterOptions", field: Any, arguments: argparse.Na
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
     if out is not None:
         check_writable(out, "--out")
-    with opened_registrar(options, field) as (registrar, seconds):
+    with opened_registrar(options) as (registrar, seconds):
         result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
     document["mesh"] = str(options.meshes[result.model])
     if out is not None:
@@ -262,40 +242,29 @@ def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
         print_result(document, arguments.out)
 
 
-def _register_several(options: "RegisterOptions", field: Any, photos: "list[Entry]", out: Path) -> "Counts | None":
-    from ..evaluation.lists import register_list
+def _register_several(options: "RegisterOptions", arguments: argparse.Namespace, out: Path) -> "Counts | None":
+    """Register photographs that are named one by one, or by a list."""
+    from ..evaluation.lists import list_photographs, read_list, register_list
     from ..evaluation.opening import open_registrar
     from ..pipeline import field_digest
 
+    if arguments.list is None:
+        check_writable(out, "--out")
+        photos = list_photographs(options, every=arguments.every, frames=out / "frames")
+        if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
+            print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
+    else:
+        photos = read_list(arguments.list, options)
+        check_writable(out, "--out")
+    if options.guess is not None:
+        print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
     names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
-        "field": None if field is None else field_digest(field),
+        "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    open_meshes = partial(open_registrar, options, field=field)
-    return register_list(photos, out, open_meshes, settings=settings, progress=options.progress)
-
-
-def _photographs(options: "RegisterOptions", path: Path | None, out: Path, *, every: int) -> "list[Entry]":
-    """The photographs that are named one by one or by the list at ``path``."""
-    from ..evaluation.lists import list_photographs, read_list
-
-    if path is not None:
-        listed = read_list(path, options.meshes, options.limits)
-        photos = [
-            replace(entry, camera=options.guess if entry.camera is None else entry.camera, instances=options.instances)
-            for entry in listed
-        ]
-        check_writable(out, "--out")
-    else:
-        check_writable(out, "--out")
-        photos = list_photographs(options, every=every, frames=out / "frames")
-        if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
-            print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
-    if options.guess is not None:
-        print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    return photos
+    return register_list(photos, out, partial(open_registrar, options), settings=settings, progress=options.progress)
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
@@ -305,7 +274,8 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     confidence = "not calibrated" if document["confidence"] is None else f"{document['confidence']:.2f}"
     print(f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}")
     if not document["reliable"]:
-        print(f"no reliable match: take the pose as a guess; {_advice(document)}")
+        advice = "check that the box is tight, and the mesh the object's, in its --unit and with its --up axis"
+        print(f"no reliable match: take the pose as a guess; {advice}")
     _print_rivals(document)
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
@@ -344,61 +314,21 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
     print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
 
 
-def _advice(document: Mapping[str, Any]) -> str:
-    """What to try after a registration that is not reliable, by its likely reason."""
-    support, detection = document["edge_support"], document.get("detection")
-    upright = document["pipeline"]["views"]["pose"] == "upright"
-    mesh = "that the mesh is the object's" + (", standing as in its file (--pose upright, --up)" if upright else "")
-    if document["warnings"]:
-        return "correct what the warning names"
-    if document["ambiguous"] is not None:
-        return "more than one pose fits"
-    if "distance" in document.get("prior", {}):
-        return f"check --distance, --unit and --camera, and {mesh}"
-    if detection is not None:
-        if detection["score"] < DOUBTFUL_SCORE:
-            return f"the object may not be in the photograph: add --box, and check {mesh}"
-        return f"the object seems to be there, at an unsure pose: add --box, and check {mesh}"
-    if support is not None and support < WEAK_CONTOURS:
-        return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
-    return f"check that the box is tight and {mesh}"
-
-
 @contextmanager
-def opened_registrar(options: "RegisterOptions", field: Any = None) -> "Iterator[tuple[Registrar, float]]":
-    """The registrar of the options' meshes, which shows its stages, and the seconds that it took to open."""
+def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, float]]":
+    """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows its stages."""
+    from tqdm import tqdm
+
     from ..evaluation.opening import open_registrar
 
-    start = time.perf_counter()
-    with show_stages(enabled=options.progress) as progress:
-        if progress is not None:
-            progress("reading the mesh", 0, 1)
-        registrar = open_registrar(options, options.meshes, field, progress=progress)
-        registrar.progress = progress or False
+    start, disable = time.perf_counter(), None if options.progress else True  # None: where there is no terminal
+    with tqdm(bar_format="{desc}", leave=False, disable=disable) as bar:
+
+        def show(stage: str, count: int, of: int) -> None:
+            name = STAGES.get(stage, stage)
+            bar.set_description_str(f"{name} {count} of {of}" if of > 1 else name)
+
+        show("reading the mesh", 0, 1)
+        registrar = open_registrar(options, options.meshes, progress=show if options.progress else None)
+        registrar.progress = show if options.progress else False
         yield registrar, time.perf_counter() - start
-
-
-@contextmanager
-def show_stages(*, enabled: bool) -> Iterator[Callable[[str, int, int], None] | None]:
-    """A progress callback that shows the stage on standard error; None if not enabled.
-
-    On a terminal, one line has the stage and its count, and is removed at the end; elsewhere each stage is a line.
-    """
-    if not enabled:
-        yield None
-        return
-    terminal, shown = sys.stderr.isatty(), ""
-
-    def report(stage: str, count: int, of: int) -> None:
-        nonlocal shown
-        name = STAGES.get(stage, stage)
-        line = f"{name} {count} of {of}" if terminal and of > 1 else name
-        if line != shown:
-            print(f"\r\033[K{line}" if terminal else line, end="" if terminal else "\n", file=sys.stderr, flush=True)
-            shown = line
-
-    try:
-        yield report
-    finally:
-        if terminal:
-            print("\r\033[K", end="", file=sys.stderr, flush=True)

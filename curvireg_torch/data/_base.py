@@ -35,6 +35,13 @@ class ObjectDataset(Dataset[Sample]):
     def _skip(self, reason: str, item: str) -> None:
         self.skipped_items.setdefault(reason, []).append(item)
 
+    def _add(self, parsed: Sample | str, item: str, **ids: Any) -> None:
+        """Add a sample, or skip ``item`` for a reason."""
+        if isinstance(parsed, str):
+            self._skip(parsed, item)
+        else:
+            self._items.append({**parsed, **ids})
+
     def __len__(self) -> int:
         return len(self._items)
 

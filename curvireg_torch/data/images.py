@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, InvalidInputError, MissingFileError
+from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, MissingFileError
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
 
@@ -29,16 +29,6 @@ _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262,
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_APPLY_ORIENTATION = {  # stored (H, W, C) pixels to viewed ones, for each EXIF orientation
-    1: lambda x: x,
-    2: lambda x: x[:, ::-1],
-    3: lambda x: x[::-1, ::-1],
-    4: lambda x: x[::-1],
-    5: lambda x: x.swapaxes(0, 1),
-    6: lambda x: x[::-1].swapaxes(0, 1),
-    7: lambda x: x[::-1, ::-1].swapaxes(0, 1),
-    8: lambda x: x[:, ::-1].swapaxes(0, 1),
-}
 
 
 @dataclass(frozen=True)
@@ -46,7 +36,7 @@ class Photo:
     """A photograph as viewers show it, and the metadata of its file.
 
     Attributes:
-        image: (3, H, W) RGB.
+        image: (3, H, W) uint8 RGB.
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
         notes: changes to the pixels, in words.
@@ -75,12 +65,11 @@ class Photo:
         return {**facts, "notes": list(self.notes)}
 
 
-def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8, as_stored: bool = False) -> Photo:
+def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Photo:
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
         path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
-        dtype: ``torch.uint8``, 0 to 255, or ``torch.float32``, 0 to 1.
         as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
@@ -97,19 +86,19 @@ def read_photo(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.uint8
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
     rgb, orientation, focal, notes = _decode(Path(path))
-    if as_stored:
-        orientation = 1
+    orientation = 1 if as_stored else orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
-    return Photo(_to_tensor(_APPLY_ORIENTATION[orientation](rgb), dtype), orientation, focal, notes)
+    pixels = torch.from_numpy(np.array(_oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
+    return Photo(pixels, orientation, focal, notes)
 
 
-def read_image(path: str | os.PathLike[str], *, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) RGB.
+def read_image(path: str | os.PathLike[str]) -> Tensor:
+    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) float32 RGB in [0, 1].
 
-    Grey images get three equal channels, an alpha channel is dropped. Arguments and errors as in :func:`read_photo`.
+    Grey images get three equal channels, an alpha channel is dropped. Errors as in :func:`read_photo`.
     """
-    return read_photo(path, dtype=dtype, as_stored=True).image
+    return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
@@ -121,14 +110,18 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(BytesIO(_checked_scans(path.read_bytes())), formats=_FORMATS) as image:
+        data = path.read_bytes()
+        scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
+        if scans > MAX_IMAGE_SCANS:  # of a progressive JPEG, which Pillow would decode for hours
+            raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
+        with Image.open(BytesIO(data), formats=_FORMATS) as image:
             _seek_full_image(image)
             if image.width * image.height > MAX_IMAGE_PIXELS:
                 raise Image.DecompressionBombError
             notes, (orientation, focal) = _notes(image), _exif(image)
             rgb = _rgb_pixels(image)
             if image.format == "TIFF":  # Pillow has applied the orientation: take it back
-                rgb = _APPLY_ORIENTATION[{6: 8, 8: 6}.get(orientation, orientation)](rgb)
+                rgb = _oriented(rgb, {6: 8, 8: 6}.get(orientation, orientation))
             return rgb, orientation, focal, notes
     except ImageError as error:
         raise error.with_subject(path) from None
@@ -142,14 +135,6 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
         raise ImageError(f"damaged or truncated ({reason}); fetch or save the file again", subject=path) from error
 
 
-def _checked_scans(data: bytes) -> bytes:
-    """Refuse a progressive JPEG of very many scans, which Pillow would decode for hours."""
-    scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
-    if scans > MAX_IMAGE_SCANS:
-        raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
-    return data
-
-
 def _seek_full_image(image: "Image") -> None:
     """Go to the first picture of a TIFF that is not marked as a reduced copy of another."""
     if image.format == "TIFF":
@@ -161,17 +146,6 @@ def _seek_full_image(image: "Image") -> None:
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _is_one_of_several(image: "Image") -> bool:
-    if image.format != "TIFF":
-        return getattr(image, "n_frames", 1) > 1 and image.format != "MPO"  # to which phones add previews
-    page, more = image.tell(), False  # counting all pages of a TIFF may take minutes
-    with suppress(Exception):
-        image.seek(page + 1)
-        more = True
-    image.seek(page)
-    return more or page > 0
-
-
 def _exif(image: "Image") -> tuple[int, float | None]:
     """Orientation and focal length in mm of a 36 x 24 mm camera; what is damaged gives 1 and None."""
     orientation, focal = 1, 0.0
@@ -179,7 +153,7 @@ def _exif(image: "Image") -> tuple[int, float | None]:
         exif = image.getexif()
         orientation = exif.get(_ORIENTATION, 1)
         focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM, 0))
-    valid = isinstance(orientation, int) and orientation in _APPLY_ORIENTATION
+    valid = isinstance(orientation, int) and orientation in range(1, 9)
     return orientation if valid else 1, focal if 0 < focal < math.inf else None
 
 
@@ -202,16 +176,15 @@ def _notes(image: "Image") -> tuple[str, ...]:
         "grey: three equal channels": image.mode in ("1", "L", "LA", "I") or image.mode.startswith("I;16"),
         "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
         "alpha channel dropped": image.has_transparency_data,
-        "one of several pictures": _is_one_of_several(image),
+        "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",  # previews of phones
     }
     return tuple(text for text, applies in notes.items() if applies)
 
 
-def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
-    if dtype not in (torch.uint8, torch.float32):
-        raise InvalidInputError(f"dtype: expected torch.uint8 or torch.float32, got {dtype}")
-    x = torch.from_numpy(np.array(rgb.transpose(2, 0, 1), order="C"))
-    return x if dtype == torch.uint8 else x.float().div_(255.0)
+def _oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+    """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
+    x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
+    return x.swapaxes(0, 1) if orientation > 4 else x
 
 
 _CONTAINERS = re.compile(

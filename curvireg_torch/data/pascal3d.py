@@ -123,12 +123,8 @@ class Pascal3DPlus(ObjectDataset):
                 self._skip("corrupt_annotation", item)
                 continue
             for index, entry in enumerate(objects):
-                parsed = self._parse(entry, category)
-                if isinstance(parsed, str):
-                    self._skip(parsed, f"{item} #{index}")
-                else:
-                    ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
-                    self._items.append({**ids, **parsed})
+                ids = {"image_path": str(image), "image_id": image_id, "object_index": index}
+                self._add(self._parse(entry, category), f"{item} #{index}", **ids)
 
     def _parse(self, entry: MatStruct, category: str) -> Sample | str:
         """The sample of one object, or the reason to skip it."""

@@ -1,13 +1,12 @@
 """Folders of the user: objects, each with a mesh and photographs of known or unknown pose."""
 
-import csv
 import math
 import os
 from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
-from ..utils.files import check_table_size
+from ..utils.files import read_csv
 from ._base import ObjectDataset, Sample, existing_root, is_plain_name, pose_fields
 
 _README = "datasets/web/README.md"
@@ -60,21 +59,15 @@ class PoseFolder(ObjectDataset):
         table = folder / "views.csv"
         if not table.is_file():
             return self._skip("missing_annotation", f"{folder.name}/views.csv")
-        check_table_size(table)
         try:
-            with open(table, newline="", encoding="utf-8-sig") as file:
-                lines = [[cell.strip() for cell in line] for line in csv.reader(file) if line]
-        except (UnicodeDecodeError, csv.Error):
-            lines = []
-        if not lines or lines[0] != _COLUMNS:
+            header, *lines = ([cell.strip() for cell in line] for line in read_csv(table))
+        except ValueError:  # damaged, or empty
+            header, lines = [], []
+        if header != _COLUMNS:
             return self._skip("corrupt_annotation", f"{folder.name}/views.csv")
-        for index, line in enumerate(lines[1:]):
-            parsed = _parse(line, folder)
-            if isinstance(parsed, str):
-                self._skip(parsed, f"{folder.name}/views.csv #{index}")
-            else:
-                ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
-                self._items.append({**parsed, **ids})
+        for index, line in enumerate(lines):
+            ids = {"category": folder.name, "mesh_path": str(meshes[0]), "object_index": index}
+            self._add(_parse(line, folder), f"{folder.name}/views.csv #{index}", **ids)
         return None
 
 

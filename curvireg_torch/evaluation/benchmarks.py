@@ -15,13 +15,7 @@ from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, PoseFolder
 from ..errors import InvalidInputError
-from ..geometry import (
-    Camera,
-    rotation_error,
-    rotation_from_axis_angle,
-    symmetry_transforms,
-    viewpoint_from_rotation,
-)
+from ..geometry import Camera, rotation_from_axis_angle, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
 from ..geometry.crops import box_iou
 from ..geometry.pose_prior import PosePrior, object_frame
@@ -29,19 +23,10 @@ from ..mesh import load_mesh
 from ..mesh.mesh import format_up
 from ..utils.checks import check_integer, check_option
 from ..utils.files import write_csv
-from .metrics import (
-    ADD_THRESHOLDS,
-    MSPD_THRESHOLDS,
-    MSSD_THRESHOLDS,
-    add_error,
-    adds_error,
-    average_recall,
-    median_error,
-    mspd_error,
-    mssd_error,
-    symmetric_rotation_error,
-)
-from .runner import Entry, View
+from . import metrics
+from .metrics import symmetric_rotation_error
+from .photograph import Entry
+from .result_files import View
 from .store import Row
 
 MIN_IOU = 0.5  # intersection over union from which a box is right
@@ -49,8 +34,6 @@ UNOCCLUDED = 0.95  # visible fraction above which an object of a BOP set counts 
 SAME_PLACE = 0.1  # diameters within which the positions in the world of one instance agree, in different photographs
 
 Errors = Mapping[str, Tensor]
-
-CHOICES = {"cad": ("annotated", "any"), "pose": ("upright", "any")}
 
 
 @dataclass(frozen=True)
@@ -85,8 +68,8 @@ class Protocol:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, options in CHOICES.items():
-            check_option(getattr(self, name), options, name)
+        check_option(self.cad, ("annotated", "any"), "cad")
+        check_option(self.pose, ("upright", "any"), "pose")
         if self.box is not None and not 0.0 <= self.box <= 0.45:
             raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
         if self.hint != "none":
@@ -133,14 +116,7 @@ class Protocol:
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:
-    """The box (4,) in px that the method gets for the object ``label``: edges move by up to ``protocol.box`` of a side.
-
-    Example:
-        >>> box = torch.tensor([0.0, 0.0, 100.0, 50.0])
-        >>> moved = perturbed_box(box, Protocol(box=0.1), "car 1")
-        >>> bool(((moved - box).abs() <= torch.tensor([10.0, 5.0, 10.0, 5.0])).all() and (moved != box).all())
-        True
-    """
+    """The box (4,) in px that the method gets for ``label``: edges move by up to ``protocol.box`` of a side."""
     if not protocol.box:
         return box
     offset = 2.0 * torch.rand(4, generator=random_numbers(protocol, label), dtype=torch.float64) - 1.0
@@ -153,12 +129,6 @@ def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: st
 
     ``rotation`` (3, 3) is the true one, NaN where it is unknown, ``frame`` that of the mesh, see
     :func:`curvireg_torch.geometry.pose_prior.object_frame`.
-
-    Example:
-        >>> R = torch.eye(3, dtype=torch.float64)
-        >>> hint = hint_of_truth(R, R, Protocol(hint="pose:30"), "car 1")
-        >>> hint.within, float(hint.excess(R)) <= 0.0
-        (30.0, True)
     """
     if protocol.hint == "none" or not bool(rotation.isfinite().all()):
         return None
@@ -189,6 +159,8 @@ class Benchmark(ABC):
         mesh: key of the mesh in a sample.
         gives_camera: whether the method gets the camera matrix.
         thresholds: degrees of the accuracies in the summary.
+        groups: name of the groups that are scored by themselves, and key of the group in a sample.
+        columns: of the table of predictions.
         dataset, protocol: as given.
         samples, entries: annotations without photographs, and what is registered, in the order of the dataset.
 
@@ -202,6 +174,8 @@ class Benchmark(ABC):
     mesh: ClassVar[str] = "mesh_path"
     gives_camera: ClassVar[bool] = False
     thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
+    groups: ClassVar[tuple[str, str]] = ("per_object", "category")
+    columns: ClassVar[Sequence[str]] = ()
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
         if protocol.views > 1 and not self.gives_camera:
@@ -250,26 +224,35 @@ class Benchmark(ABC):
         """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown. The first one orders."""
 
     @abstractmethod
+    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+        """Scores of the chosen results."""
+
+    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+        """Which objects belong to each subset that is scored by itself."""
+        return {}
+
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
-        """Scores of the results ``rows``, none of them skipped."""
+        """Scores of the results ``rows``, none of them skipped: of all, of subsets, and of each group."""
+        numbers, (name, key), groups = range(len(rows)), self.groups, defaultdict[Any, list[int]](list)
+        for i, sample in enumerate(samples):
+            groups[sample[key]].append(i)
+        subsets = {
+            subset: self.scores(rows, errors, [i for i in numbers if members[i]])
+            for subset, members in self.subsets(samples).items()
+        }
+        return {
+            **self.scores(rows, errors, list(numbers)),
+            **({"subsets": subsets} if subsets else {}),
+            name: {str(group): self.scores(rows, errors, groups[group]) for group in sorted(groups)},
+        }
 
-    @abstractmethod
-    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
-        """Write the results as one table; ``path`` appears when it is complete."""
-
-    def _rotation_scores(self, errors: Tensor) -> Row:
+    def rotation_scores(self, errors: Tensor) -> Row:
         """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
-        accuracies = {name: average_recall(errors, (degrees,)) for name, degrees in self.thresholds.items()}
-        return {"n": len(errors), **accuracies, "med_err_deg": median_error(errors)}
-
-
-class _ViewpointBenchmark(Benchmark):
-    """Datasets of viewpoints: rotations, without a camera."""
-
-    columns: ClassVar[Sequence[str]]
+        accuracies = {name: metrics.average_recall(errors, (degrees,)) for name, degrees in self.thresholds.items()}
+        return {"n": len(errors), **accuracies, "med_err_deg": metrics.median_error(errors)}
 
     def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
-        """One line for each object: its annotation, the estimate, errors, and the true angles as ``true_azimuth``..."""
+        """Write one line for each object: its annotation, the estimate, errors, the true angles, ``true_azimuth``..."""
         names, R = ("azimuth", "elevation", "theta"), estimated_rotations(rows)
         lines: list[Sequence[object]] = [self.columns]
         for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
@@ -291,7 +274,7 @@ def _cell(value: object) -> object:
     return value
 
 
-_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+_HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))[None]
 
 
 def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
@@ -305,16 +288,17 @@ def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
 
 SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
     "bottle": ("any rotation about z", _axis_error),
-    "diningtable": ("half a rotation about z", lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN[None])),
+    "diningtable": ("half a rotation about z", lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN)),
 }
 """Classes of PASCAL3D+ whose objects have the same, or nearly the same, appearance from several azimuths."""
 
 
-class Pascal3DBenchmark(_ViewpointBenchmark):
+class Pascal3DBenchmark(Benchmark):
     """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box."""
 
     name, label, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
     thresholds: ClassVar = {"acc_pi_6": 30.0, "acc_pi_18": 10.0}
+    groups = ("per_class", "category")
     flags = ("truncated", "occluded", "difficult")
     columns = (
         *("image_id", "object_index", "category", "cad_index", "mesh", "azimuth", "elevation", "theta"),
@@ -332,37 +316,29 @@ class Pascal3DBenchmark(_ViewpointBenchmark):
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset.pixel_origin}
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
-        R = estimated_rotations(rows)
-        truth = _stacked(samples, "rotation", (3, 3))
-        plain = symmetric = rotation_error(R, truth)
+        R, truth = estimated_rotations(rows), true_rotations(samples)
+        plain = symmetric = symmetric_rotation_error(R, truth, _HALF_TURN[:0])
         for category, (_, error) in SYMMETRIES.items():
             mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
-            symmetric = torch.where(mask, error(R, truth), symmetric)
-        return {"error_deg": _or_inf(plain, R), "symmetric_error_deg": _or_inf(symmetric, R)}
+            symmetric = torch.where(mask & plain.isfinite(), error(R, truth), symmetric)
+        return {"error_deg": plain, "symmetric_error_deg": symmetric}
+
+    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+        """Acc(pi/6), Acc(pi/18) and MedErr, also up to the symmetries of the classes."""
+        plain, aware = (self.rotation_scores(each[chosen]) for each in errors.values())
+        del aware["n"]
+        return {**plain, "symmetry_aware": aware}
+
+    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+        easy = [not any(s[flag] for flag in self.flags) for s in samples]
+        return {"easy": easy, **{flag: [s[flag] for s in samples] for flag in self.flags}}
 
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
-        """Acc(pi/6), Acc(pi/18), MedErr: of all, of subsets, of each class, and up to the symmetries of the classes."""
-
-        def scores_of(chosen: list[bool]) -> Row:
-            plain, aware = (self._rotation_scores(e[torch.tensor(chosen, dtype=torch.bool)]) for e in errors.values())
-            del aware["n"]
-            return {**plain, "symmetry_aware": aware}
-
-        return {
-            **scores_of([True] * len(samples)),
-            "subsets": {
-                "easy": scores_of([not any(s[flag] for flag in self.flags) for s in samples]),
-                **{flag: scores_of([s[flag] for s in samples]) for flag in self.flags},
-            },
-            "per_class": {
-                name: scores_of([s["category"] == name for s in samples])
-                for name in sorted({s["category"] for s in samples})
-            },
-            "symmetries": {name: text for name, (text, _) in SYMMETRIES.items()},
-        }
+        symmetries = {name: text for name, (text, _) in SYMMETRIES.items()}
+        return {**super().summary(samples, rows, errors), "symmetries": symmetries}
 
 
-class PoseFolderBenchmark(_ViewpointBenchmark):
+class PoseFolderBenchmark(Benchmark):
     """Viewpoints in folders of the user. The method is given the box and the object's mesh, and no camera.
 
     Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and ``mean_confidence``; accuracy
@@ -377,34 +353,24 @@ class PoseFolderBenchmark(_ViewpointBenchmark):
     dataset: PoseFolder
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
-        R, truth = estimated_rotations(rows), _stacked(samples, "rotation", (3, 3))
+        R, truth = estimated_rotations(rows), true_rotations(samples)
         known = truth.isfinite().flatten(1).all(1)
         errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
-        errors[known] = _or_inf(rotation_error(R[known], truth[known]), R[known])
+        errors[known] = symmetric_rotation_error(R[known], truth[known], _HALF_TURN[:0])
         return {"error_deg": errors}
 
-    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
         """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of all."""
-
-        def scores_of(chosen: list[int]) -> Row:
-            posed = errors["error_deg"][chosen]
-            posed = posed[~posed.isnan()]
-            scores = self._rotation_scores(posed) if len(posed) else dict.fromkeys((*self.thresholds, "med_err_deg"))
-            confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
-            return {
-                **scores,
-                "n": len(chosen),
-                "n_posed": len(posed),
-                "reliable": sum(bool(rows[i].get("reliable")) for i in chosen),
-                "mean_confidence": sum(confidences) / len(chosen) if chosen else None,
-            }
-
-        groups: dict[str, list[int]] = defaultdict(list)
-        for i, sample in enumerate(samples):
-            groups[sample["category"]].append(i)
+        posed = errors["error_deg"][chosen]
+        posed = posed[~posed.isnan()]
+        scores = self.rotation_scores(posed) if len(posed) else dict.fromkeys((*self.thresholds, "med_err_deg"))
+        confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
         return {
-            **scores_of(list(range(len(rows)))),
-            "per_object": {name: scores_of(chosen) for name, chosen in sorted(groups.items())},
+            **scores,
+            "n": len(chosen),
+            "n_posed": len(posed),
+            "reliable": sum(bool(rows[i].get("reliable")) for i in chosen),
+            "mean_confidence": sum(confidences) / len(chosen) if chosen else None,
         }
 
 
@@ -412,6 +378,7 @@ class BOPBenchmark(Benchmark):
     """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera matrix."""
 
     name, unit, mesh, gives_camera = "bop", "mm", "model_path", True
+    groups = ("per_object", "obj_id")
     label = "{scene_id}/{image_id}/{instance_index}"
     dataset: BOPDataset
 
@@ -456,34 +423,28 @@ class BOPBenchmark(Benchmark):
         info = samples[0]["model_info"]
         points = torch.from_numpy(load_mesh(samples[0]["model_path"], unit=self.unit).vertices.copy())
         symmetries = symmetry_transforms(info)
-        R, t = estimated_rotations(rows), torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
-        R_true, t_true = _stacked(samples, "rotation", (3, 3)), _stacked(samples, "translation", (3,))
-        T, T_true, K = transform(R, t), transform(R_true, t_true), _stacked(samples, "camera_matrix", (3, 3))
+        t = torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
+        t_true, K = (torch.stack([s[name].double() for s in samples]) for name in ("translation", "camera_matrix"))
+        R, R_true = estimated_rotations(rows), true_rotations(samples)
+        T, T_true = transform(R, t), transform(R_true, t_true)
         rotation = symmetric_rotation_error(R, R_true, symmetries[:, :3, :3])
-        add = (adds_error if len(symmetries) > 1 else add_error)(T, T_true, points)
-        mssd = mssd_error(T, T_true, points, symmetries=symmetries)
-        mspd = mspd_error(T, T_true, points, K, symmetries=symmetries)
+        add = (metrics.adds_error if len(symmetries) > 1 else metrics.add_error)(T, T_true, points)
+        mssd = metrics.mssd_error(T, T_true, points, symmetries=symmetries)
+        mspd = metrics.mspd_error(T, T_true, points, K, symmetries=symmetries)
         width = torch.tensor([row["inputs"]["picture"]["width"] for row in rows], dtype=torch.float64)
         return torch.stack([rotation, add / info["diameter"], mssd / info["diameter"], mspd / width])
 
-    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
         """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD."""
-
-        def scores_of(chosen: Tensor) -> Row:
-            return {
-                **self._rotation_scores(errors["rotation"][chosen]),
-                "add_recall_0.1d": average_recall(errors["add"][chosen], ADD_THRESHOLDS),
-                "mssd_ar": average_recall(errors["mssd"][chosen], MSSD_THRESHOLDS),
-                "mspd_ar": average_recall(errors["mspd"][chosen], MSPD_THRESHOLDS),
-            }
-
-        objects = torch.tensor([s["obj_id"] for s in samples], dtype=torch.long)
-        whole = torch.tensor([float(s["visib_fract"]) > UNOCCLUDED for s in samples], dtype=torch.bool)
         return {
-            **scores_of(torch.ones(len(samples), dtype=torch.bool)),
-            "subsets": {"unoccluded": scores_of(whole)},
-            "per_object": {str(o): scores_of(objects == o) for o in objects.unique().tolist()},
+            **self.rotation_scores(errors["rotation"][chosen]),
+            "add_recall_0.1d": metrics.average_recall(errors["add"][chosen], metrics.ADD_THRESHOLDS),
+            "mssd_ar": metrics.average_recall(errors["mssd"][chosen], metrics.MSSD_THRESHOLDS),
+            "mspd_ar": metrics.average_recall(errors["mspd"][chosen], metrics.MSPD_THRESHOLDS),
         }
+
+    def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
+        return {"unoccluded": [s["visib_fract"] > UNOCCLUDED for s in samples]}
 
     def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
         """The results file of the BOP challenge, with all digits; it omits objects without an estimate."""
@@ -554,12 +515,6 @@ def estimated_rotations(rows: Sequence[Row]) -> Tensor:
     return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(-1, 3, 3)
 
 
-def _stacked(samples: Sequence[Row], name: str, shape: tuple[int, ...]) -> Tensor:
-    """(N, *shape) float64 values of the samples."""
-    values: list[Any] = [sample[name].double() for sample in samples]
-    return torch.stack(values) if values else torch.empty(0, *shape, dtype=torch.float64)
-
-
-def _or_inf(errors: Tensor, R: Tensor) -> Tensor:
-    """``errors`` (N,), ``inf`` where the estimate ``R`` (N, 3, 3) is missing (NaN)."""
-    return torch.where(R.isfinite().flatten(1).all(1), errors, torch.full_like(errors, torch.inf))
+def true_rotations(samples: Sequence[Row]) -> Tensor:
+    """(N, 3, 3) float64; NaN where the pose is unknown."""
+    return torch.cat([_HALF_TURN[:0], *(sample["rotation"].double()[None] for sample in samples)])

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..matching import cached_bank
 from ..mesh import load_mesh
-from ..pipeline import DEFAULT, PRESETS, Pipeline, preset_named
+from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
 from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
@@ -35,7 +35,7 @@ def evaluate(
     benchmark: Benchmark,
     out: Path,
     *,
-    preset: str | Pipeline = DEFAULT,
+    pipeline: Pipeline | None = None,
     limit: int | None = None,
     renderer: str = "auto",
     progress: bool = True,
@@ -48,7 +48,7 @@ def evaluate(
 
     Args:
         benchmark, out: the objects, and the folder for the results.
-        preset: name of a pipeline, or a pipeline.
+        pipeline: by default the preset "learned".
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
         progress: show a bar.
@@ -57,7 +57,7 @@ def evaluate(
         The summary, as written to ``summary.json``; None in processes that do not write it.
 
     Raises:
-        InvalidInputError: an unknown preset, a bad limit, or a folder that holds the results of a list.
+        InvalidInputError: a bad limit, or a folder that holds the results of a list.
 
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
@@ -65,7 +65,7 @@ def evaluate(
         >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])            # doctest: +SKIP
         >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
     """
-    pipeline = preset_named(preset) if isinstance(preset, str) else preset
+    pipeline = pipeline or PRESETS[DEFAULT]
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
     pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
@@ -137,7 +137,16 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
     """The best and the worst objects: by error; then those of unknown pose, by confidence; then those that failed."""
     shown = []
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
-        kind, caption, order = _outcome(row, error)
+        number = row.get("confidence")
+        confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
+        if row["status"] == "failed":
+            kind, caption, order = "failed", row["message"], (2, 0.0)
+        elif math.isnan(error):
+            kind, caption = "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}"
+            order = 1, -(number or 0.0)
+        else:
+            kind, caption = "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}"
+            order = 0, error
         name, picture = benchmark.entries[i].key, thumbnail_of(out, row)
         shown.append((order, SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture)))
     shown.sort(key=lambda pair: pair[0])
@@ -145,14 +154,3 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
     right, failed = sum(error < RIGHT_DEG for error in known), sum(row["status"] == "failed" for row in rows)
     title = f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} failed"
     write_sheet(out / "index.html", title, [entry for _, entry in shown], table="predictions.csv", each=SHOWN_EACH)
-
-
-def _outcome(row: Row, error: float) -> tuple[str, str, tuple[int, float]]:
-    """Kind, caption and sort key of a result."""
-    if row["status"] == "failed":
-        return "failed", row["message"], (2, 0.0)
-    number = row["confidence"]
-    confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
-    if math.isnan(error):
-        return "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}", (1, -(number or 0.0))
-    return "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}", (0, error)

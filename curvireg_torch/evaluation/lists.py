@@ -1,8 +1,6 @@
 """Lists of photographs: CSV files, folders and videos; and their results."""
 
-import csv
 import glob
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -13,11 +11,12 @@ from ..data import Video, load_camera
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
-from ..utils.files import check_table_size, write_csv, write_file
+from ..utils.files import read_csv, write_csv, write_file
 from ..visualization.encoding import png, to_uint8
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
-from .runner import Entry, OpenRegistrar, failed_row, run_entries, thumbnail_of
+from .photograph import Entry
+from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
 
 BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
@@ -33,9 +32,7 @@ RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 
 
-def _entry(
-    cells: Sequence[str], columns: Mapping[str, str], folder: Path, meshes: tuple[Path, ...], limits: Mapping[str, Any]
-) -> Entry:
+def _entry(cells: Sequence[str], columns: Mapping[str, str], folder: Path, options: RegisterOptions) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     cells, count = _without_empty_end(cells, len(columns)), len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
@@ -45,17 +42,17 @@ def _entry(
             raise InvalidInputError(f"{len(cells)} cells, the header has {count}; quote texts with commas")
         if not values["photo"]:
             raise InvalidInputError("photo: empty; name a file")
-        meshes = (folder / values["mesh"],) if values.get("mesh") else meshes
+        meshes = (folder / values["mesh"],) if values.get("mesh") else options.meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = numbers_of(values, BOX), camera_of(values, folder)
+        box, camera = numbers_of(values, BOX), camera_of(values, folder) or options.guess
         mask = folder / values["mask"] if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
-        prior = prior_from_limits({**limits, **own})
+        prior = prior_from_limits({**(options.limits or {}), **own})
     except (InvalidInputError, MissingFileError) as error:
         return Entry(shown, values["photo"], error=str(error))
     photo = folder / values["photo"]
-    return Entry(shown, values["photo"], photo, meshes, box, camera, mask, prior=prior)
+    return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
 def camera_of(values: Mapping[str, str], folder: Path) -> Camera | None:
@@ -77,12 +74,13 @@ def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, 
     if empty:
         present = f"{', '.join(filter(None, texts))} and nothing for {', '.join(empty)}"
         raise InvalidInputError(f"{', '.join(names)}: expected all or none, got {present}")
+    numbers = []
     for name, text in zip(names, texts, strict=True):
         try:
-            float(text)
+            numbers.append(float(text))
         except ValueError:
             raise InvalidInputError(f"{name}: expected a number, got {text[:40]!r}") from None
-    return tuple(map(float, texts))
+    return tuple(numbers)
 
 
 def list_photographs(options: RegisterOptions, *, every: int = 1, frames: Path) -> list[Entry]:
@@ -113,25 +111,16 @@ def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
         yield path
 
 
-def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any] | None = None) -> list[Entry]:
-    """Read a list of photographs: a CSV file, whose paths are relative to its folder.
+def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
+    """Read a list of photographs: a CSV file with the columns that docs/results.md describes, in any order.
 
-    Columns, in any order: ``photo``, ``x0``, ``y0``, ``x1``, ``y1``; optional ``fx``, ``fy``, ``cx``, ``cy`` or
-    ``camera`` (a calibration file), ``mask`` (a file), ``mesh`` and those of :data:`.PRIOR_OPTIONS`; others are passed
-    through. Empty cells mean: detect the object, no camera, ``meshes`` (of several the best is found), ``limits`` (on
-    the pose, arguments of :class:`PosePrior`). Blank lines, and empty cells beyond the last named column, as
-    spreadsheets write them, do not count. The ``error`` of a row that cannot be used is the reason.
-
-    Example:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp(), "list.csv")
-        >>> _ = file.write_text("photo,x0,y0,x1,y1,mesh\\na.jpg,1,2,30,40.5,part.stl")
-        >>> read_list(file)[0].box
-        (1.0, 2.0, 30.0, 40.5)
+    Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options. Blank lines, and
+    empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
+    cannot be used is the reason.
     """
     if not path.is_file():
         raise MissingFileError(f"{path}: no such file; check the path of the list")
-    header, *rows = csv_cells(path) or [[]]
+    header, *rows = read_csv(path) or [[]]
     header = _without_empty_end(header, 0)
     names = [column.strip().lower() for column in header]
     if missing := [required for required in _REQUIRED if required not in names]:
@@ -149,25 +138,13 @@ def read_list(path: Path, meshes: Sequence[Path] = (), limits: Mapping[str, Any]
     if not rows:
         raise InvalidInputError(f"{path}: no photographs; give one row for each")
     columns = dict(zip(names, header, strict=True))
-    return [_entry(cells, columns, path.parent, tuple(meshes), limits or {}) for cells in rows]
+    return [_entry(cells, columns, path.parent, options) for cells in rows]
 
 
 def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
     """The cells without the empty ones at the end; the first ``least`` stay."""
-    kept = list(cells)
-    while len(kept) > least and not kept[-1].strip():
-        kept.pop()
-    return kept
-
-
-def csv_cells(path: Path) -> list[list[str]]:
-    """The rows of a CSV file that are not blank."""
-    check_table_size(path)
-    try:
-        table = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
-        return [cells for cells in table if any(map(str.strip, cells))]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"{path}: not CSV in UTF-8 ({error}); save it as CSV in UTF-8") from error
+    filled = [number for number, cell in enumerate(cells, start=1) if cell.strip()]
+    return list(cells[: max([least, *filled])])
 
 
 @dataclass(frozen=True)
@@ -205,6 +182,8 @@ def register_list(
 
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:
     shown, failures = [], []
+    more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
+    lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
     for entry, row in zip(entries, _rows(entries, store), strict=True):
         number, message = row["row"], row["message"]
         reliable, confidence = row.get("reliable", False), row.get("confidence") or 0.0
@@ -215,14 +194,11 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
+        lines.append([*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
     counts = Counts(len(shown) - len(failures), sum(not key[1] for key, _ in shown), tuple(failures))
     shown.sort(key=lambda pair: pair[0])
     write_sheet(out / "index.html", str(counts), [on_page for _, on_page in shown], table="results.csv")
     store.rewrite(_rows(entries, store))
-    more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
-    lines = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
-    for row in _rows(entries, store):
-        lines.append([*row["columns"].values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
     write_csv(out / "results.csv", lines)
     return counts
 

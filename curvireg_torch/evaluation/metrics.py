@@ -1,13 +1,7 @@
 """Errors and recalls of 6D poses (ADD, ADD-S, MSSD, MSPD) and of viewpoints, as functions of a whole set.
 
 An average over no items is NaN. A missing estimate, a pose of NaN, has the error ``inf`` and counts as a miss.
-Thresholds are strict: an error equal to the threshold is a miss. Poses take points on the surface of the model, all in
-one unit:
-
-- ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``;
-- ADD-S: mean over x of the distance of ``T_gt x`` to the nearest ``T_est y``;
-- MSSD, MSPD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``, in
-  space or after projection into the image.
+Thresholds are strict: an error equal to the threshold is a miss.
 """
 
 import math
@@ -44,7 +38,7 @@ MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
 
 
 def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
-    """ADD: mean distance of the points under the two poses.
+    """ADD (Hinterstoisser et al. 2012): mean over the points x of ``|T_est x - T_gt x|``.
 
     Args:
         T_est, T_gt: (B, 4, 4) rigid model -> camera; NaN in ``T_est`` for a missing estimate.
@@ -65,7 +59,7 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 
 
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
-    """ADD-S: mean distance of each point under the true pose to the nearest point under the estimate.
+    """ADD-S: mean over the points x of the distance of ``T_gt x`` to the nearest ``T_est y``.
 
     Arguments and result are those of :func:`add_error`. Computed in float64 on the CPU with one k-d tree in the model
     frame, since rigid poses preserve distances.
@@ -85,7 +79,7 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 
 
 def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
-    """MSSD: maximum distance of the model points in space, minimum over the symmetries of the object.
+    """MSSD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``.
 
     Args:
         T_est, T_gt, points: as in :func:`add_error`.
@@ -112,7 +106,7 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
 def mspd_error(
     T_est: Tensor, T_gt: Tensor, points: Tensor, camera_matrix: Tensor, *, symmetries: Tensor | None = None
 ) -> Tensor:
-    """MSPD: maximum distance of the model points in the image, minimum over the symmetries of the object.
+    """MSPD (Hodan et al. 2020): as MSSD, of the points projected into the image.
 
     Args:
         T_est, T_gt, points, symmetries: as in :func:`mssd_error`.

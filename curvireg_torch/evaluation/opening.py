@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,10 @@ if TYPE_CHECKING:
     from ..matching import ViewBank
     from ..pipeline import Pipeline
     from ..registration import Registrar
-    from .runner import Entry
+    from .photograph import Entry
+
+CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
+"""How the command line takes a camera."""
 
 WITHIN = 45.0  # degrees of ``within`` beside ``near`` if none are given
 QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by themselves
@@ -162,7 +166,8 @@ class RegisterOptions:
         chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
         return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
 
-    def open_field(self) -> "LearnedCurvilinearSaliency | None":
+    @cached_property
+    def network(self) -> "LearnedCurvilinearSaliency | None":
         """The network of ``field``, or None."""
         from ..features import LearnedCurvilinearSaliency
 
@@ -171,7 +176,7 @@ class RegisterOptions:
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
         from ..geometry import Camera, camera_matrix
-        from .runner import Entry
+        from .photograph import Entry
 
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
@@ -182,12 +187,7 @@ class RegisterOptions:
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given.
-
-    Example:
-        >>> limits_from_options({"side": "front", "near": (10, 20)})
-        {'azimuth': (315.0, 45.0), 'viewpoint': (10, 20, 0.0), 'within': 45.0}
-    """
+    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given."""
     given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
     side, near, within = (given.pop(name, None) for name in ("side", "near", "within"))
     if side is not None:
@@ -204,12 +204,7 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def limits_from_cells(cells: Mapping[str, str]) -> dict[str, Any]:
-    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given.
-
-    Example:
-        >>> limits_from_cells({"azimuth": "300 60", "theta": "", "front": "-y"})
-        {'azimuth': (300.0, 60.0), 'front': '-y'}
-    """
+    """:func:`limits_from_options` of texts such as "300 60"; empty ones are not given."""
     values = {}
     for name, text in cells.items():
         try:
@@ -231,16 +226,13 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
     from ..geometry.cameras import camera_matrix, camera_of_view
     from ..utils.checks import check_square_pixels
 
-    if isinstance(camera, Sequence):
-        try:
-            check_square_pixels(camera_matrix(*camera), "--camera")
-        except InvalidInputError as error:
-            raise InvalidInputError(f"--camera: {str(error).partition(': ')[2]}") from error
-    if isinstance(guess, float):
-        try:
+    try:
+        if isinstance(camera, Sequence):
+            check_square_pixels(camera_matrix(*camera), "camera")
+        if isinstance(guess, float):
             camera_of_view(guess, (1, 1))
-        except InvalidInputError as error:
-            raise InvalidInputError(f"--{error}") from error
+    except InvalidInputError as error:
+        raise InvalidInputError(f"--{error}") from error
 
 
 def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
@@ -267,17 +259,10 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
 def open_registrar(
     options: RegisterOptions,
     meshes: Sequence[Path],
-    field: "LearnedCurvilinearSaliency | None" = None,
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> "Registrar":
-    """The registrar of mesh files or banks.
-
-    Args:
-        options: its settings; ``photos``, ``meshes`` and what belongs to a photograph are not used.
-        meshes, field: the files, and the network from :meth:`RegisterOptions.open_field`.
-        progress: called while banks are built, instead of showing a bar.
-    """
+    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead of showing a bar."""
     from ..registration import Registrar
 
     pipeline = options.open_pipeline()
@@ -292,7 +277,8 @@ def open_registrar(
         pipeline = replace(pipeline, contours=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
-    return Registrar(banks, pipeline=pipeline, field=field, renderer=options.renderer, mesh_is=options.mesh_is)
+    settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
+    return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
 
 
 def _open_bank(

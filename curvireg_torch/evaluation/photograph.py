@@ -1,33 +1,76 @@
-"""One photograph in one line: :func:`register`."""
+"""One photograph, or several of one pose: what is known about it, and its registration."""
 
 import base64
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+import re
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 from torch import Tensor
 
-from ..data import load_camera, read_photo
-from ..errors import InvalidInputError
-from ..geometry import camera_matrix
+from ..data import Photo, load_camera, read_photo
+from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..geometry import Camera, camera_matrix, undistorted
+from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..pipeline import Pipeline
-from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.result import result_document
+from ..registration import FailedRegistration, Registrar, Registration, detect, refine
+from ..registration.inputs import ImageItem, image_item, image_items
+from ..registration.poses import projected_box
+from ..registration.result import detection_document, result_document
+from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .result_files import write_result
-from .runner import box_of_result, image_item_of, register_image
+from .opening import CAMERA_OPTIONS
+from .result_files import View, write_result
 
 __all__ = ["RegisteredPhotograph", "register"]
 
 THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One object in one photograph, to register."""
+
+    cells: Mapping[str, str] = field(default_factory=dict)  # of a list: the texts of the row by column
+    name: str = ""  # as the user calls the photograph
+    photo: Path = Path()
+    meshes: tuple[Path, ...] = ()  # of several the best is found
+    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
+    camera: Camera | str | float | None = None  # "exif" and a horizontal field of view in degrees are guesses
+    mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
+    instances: int = 1  # without a box, see registration.detect
+    prior: PosePrior | None = None
+    start: tuple[tuple[float, ...], ...] | None = None  # (4, 4) pose that is refined; nothing is searched for
+    start_confidence: float | None = None
+    views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
+    as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    label: str = ""  # of a dataset's object: a name that no other object has
+    error: str = ""  # why the object cannot be registered
+
+    def request(self) -> list[Any]:
+        """All that the result depends on besides the content of files."""
+        prior = None if self.prior is None else self.prior.to_dict()
+        camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
+        given = [self.name, self.box, camera, self.instances, prior]
+        views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
+        mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
+        return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
+
+    @property
+    def key(self) -> str:
+        """The label, or a digest of the request and the mesh files: equal rows of a list are registered once."""
+        return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,11 +80,13 @@ class RegisteredPhotograph(Registration):
     Attributes:
         registrar: of the mesh.
         image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the object was found.
+        document: the content of ``result.json``.
     """
 
     registrar: Registrar = None  # type: ignore[assignment]  # fields of the base class have defaults
     image: Tensor = None  # type: ignore[assignment]
     box: Tensor = None  # type: ignore[assignment]
+    document: dict[str, Any] = field(default_factory=dict)
 
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the box."""
@@ -53,9 +98,7 @@ class RegisteredPhotograph(Registration):
 
     def save(self, folder: str | PathLike[str]) -> None:
         """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does."""
-        document = result_document(self, self.registrar, {"bank": 0.0, "register": 0.0})
-        document["inputs"] = {"box": self.box.tolist()}
-        write_result(Path(folder), document, self.registrar, self, self.image, self.box)
+        write_result(Path(folder), self.document, self.registrar, self, self.image, self.box)
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""
@@ -103,30 +146,136 @@ def register(
         >>> result.quaternion.shape, result.overlay().shape
         (torch.Size([4]), (720, 960, 3))
     """
-    if isinstance(image, Image.Image):
-        image = np.array(image.convert("RGB"))
-    photo = read_photo(image) if isinstance(image, str | PathLike) else None
-    image = image if photo is None else photo.image
+    name = ""
+    meshes: tuple[Path, ...] = ()
+    if isinstance(image, str | PathLike):
+        name, photo = str(image), read_photo(image)
+    else:
+        pixels = np.array(image.convert("RGB")) if isinstance(image, Image.Image) else image
+        photo = Photo(image_item(pixels, None).image, 1, None, ())
     if isinstance(camera, str | PathLike):
-        if camera == "exif":
-            camera = None if photo is None else photo.guessed_camera_matrix()
-            if camera is None:
-                raise InvalidInputError("camera: no focal length in EXIF; give fx, fy, cx, cy, or a calibration file")
-        else:
-            camera = load_camera(camera)
-    elif isinstance(camera, Sequence) and len(camera) == 4:
-        camera = camera_matrix(*camera)
-    registrar = mesh
-    if not isinstance(mesh, Registrar):
-        if isinstance(mesh, str | PathLike):
-            path = Path(mesh)
-            mesh = ViewBank.load(path) if path.suffix == ".safetensors" else load_mesh(path, unit=unit, up=up)
-        registrar = Registrar(mesh, pipeline=pipeline, progress=progress)
-    item = image_item_of(image, box, camera, prior, mask, name="")
-    result = register_image(registrar, image, box, camera, prior, mask)[0]
+        camera = camera if camera == "exif" else load_camera(camera)
+    elif camera is not None and not isinstance(camera, Camera):
+        camera = Camera(camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera)
+    if isinstance(mesh, str | PathLike):
+        meshes = (Path(mesh),)
+        mesh = ViewBank.load(mesh) if meshes[0].suffix == ".safetensors" else load_mesh(mesh, unit=unit, up=up)
+    registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
+    entry = Entry(name=name, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
+    return register_entry(entry, photo, registrar)
+
+
+def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
+    """The photograph and what is known about it; refuses what cannot be used, as before meshes are opened."""
+    if isinstance(entry.mask, str | PathLike) and not Path(entry.mask).is_file():
+        raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
+    boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
+    item = image_items([photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks)[0]
+    if isinstance(item, CurviregError):
+        raise item.with_subject(entry.name)
+    return item
+
+
+def register_entry(
+    entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float = 0.0
+) -> RegisteredPhotograph:
+    """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to open.
+
+    The ``document`` of the result is the content of ``result.json``, and of a line of ``results.jsonl``.
+    """
+    start = time.perf_counter()
+    camera, source = camera_of(entry, photo)
+    item = check_entry(entry, photo, camera)
+    results: Sequence[Registration | FailedRegistration]
+    if entry.start is not None:
+        results = refine(registrar, [photo.image], camera, [entry.start], start_confidences=[entry.start_confidence])
+    elif entry.views:
+        assert camera is not None  # of datasets with cameras only
+        first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))
+        together, _ = register_views([first, *entry.views], registrar, as_stored=entry.as_stored)
+        best, *others = together.hypotheses
+        best = replace(best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix))
+        results = [replace(together, hypotheses=(best, *others))]
+    elif entry.box is None and entry.mask is None:
+        results = detect(registrar, [photo.image], camera, instances=entry.instances, prior=entry.prior)[0]
+    else:
+        boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
+        results = registrar([photo.image], boxes, camera, prior=entry.prior, masks=masks)
+    result = results[0]
     if isinstance(result, FailedRegistration):
-        raise result.error.with_subject("")
-    found = box_of_result(result, registrar, item, given=box is not None or mask is not None).double()
-    values = {field.name: getattr(result, field.name) for field in fields(Registration)}
-    box = found if result.corrected_box is None else result.corrected_box
-    return RegisteredPhotograph(**values, registrar=registrar, image=item.image, box=box)
+        raise result.error.with_subject(entry.name)
+    box, K = item.box, item.camera_matrix
+    if result.detection is not None:
+        box = result.detection.box
+    elif entry.box is None and entry.mask is None:
+        box = projected_box(registrar.of_model(result.model).describer, result.projection)
+    document = {
+        **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
+        "mesh": str(entry.meshes[result.model]) if entry.meshes else None,
+        "inputs": {
+            "photo": entry.name,
+            "mesh": ", ".join(map(str, entry.meshes)),
+            "box": box.tolist(),
+            "camera": None if K is None else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "camera_source": source,
+            "picture": photo.facts(),
+        },
+        "camera": None if camera is None else camera.at(item.size).describe(),
+    }
+    if result.detection is not None:
+        document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
+    if source in ("exif", "fov"):  # the error of a guessed camera is unknown
+        document["covariance"] = document["standard_deviations"] = None
+    box = box.double() if result.corrected_box is None else result.corrected_box
+    return RegisteredPhotograph(**vars(result), registrar=registrar, image=item.image, box=box, document=document)
+
+
+def register_views(
+    views: Sequence[View], registrar: Registrar, *, as_stored: bool = False
+) -> tuple[Registration, list[View]]:
+    """Register several photographs together, see :meth:`.Registrar.register_views`, without their distortion.
+
+    Returns:
+        The registration; and the photographs with their pixels without distortion, cameras and boxes of these. One
+        that could not be read has no pixels.
+    """
+    seen = []
+    for view in views:
+        image = view.image
+        with suppress(CurviregError, OSError):  # the registrar reports what cannot be read, and goes on without it
+            image = read_photo(view.photo, as_stored=as_stored).image if image is None else image
+        if image is not None:
+            try:
+                camera = view.camera.at((image.shape[-2], image.shape[-1]))
+                straight = undistorted(image, camera, None if view.box is None else torch.tensor(view.box))
+            except CurviregError as error:
+                raise error.with_subject(view.name) from error
+            box = None if straight.box is None else straight.box.tolist()
+            view = replace(view, image=straight.image, box=box, camera=camera)
+        seen.append(view)
+    images = [view.photo if view.image is None else view.image for view in seen]
+    boxes = [None if view.image is None else view.box for view in seen]
+    matrices, poses = torch.stack([v.camera.matrix for v in seen]), torch.stack([v.T_cam_from_world for v in seen])
+    try:
+        return registrar.register_views(images, boxes, matrices, poses), seen
+    except CurviregError as error:
+        named = re.sub(r"\bimage (\d+)\b", lambda number: views[int(number[1])].name, f"{error}")
+        raise InvalidInputError(named) from error
+
+
+def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
+    """The camera, and its source; that of a calibration has a size or distortion."""
+    given = entry.camera
+    if isinstance(given, Camera):
+        return given, "file" if given.size or given.distorts else "given"
+    if given is None:
+        if entry.start is not None:
+            raise InvalidInputError(f"--start: needs the camera; give {CAMERA_OPTIONS}", subject=entry.name)
+        return None, None
+    if given != "exif":
+        H, W = photo.image.shape[-2:]
+        return Camera(camera_of_view(float(given), (H, W))), "fov"
+    K = photo.guessed_camera_matrix()
+    if K is None:
+        raise InvalidInputError(f"no focal length in its EXIF; give {CAMERA_OPTIONS}", subject=entry.name)
+    return Camera(K), "exif"

@@ -5,8 +5,8 @@ Nothing heavy is imported before a dataset is opened, so that the command line's
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import import_module
 from os import PathLike
+from pkgutil import resolve_name
 from typing import Any
 
 __all__ = ["DATASETS", "DatasetSpec"]
@@ -38,18 +38,12 @@ class DatasetSpec:
 
     def open(self, root: str | PathLike[str], **options: Any) -> Any:
         """Open the dataset; :class:`CurviregError` if it does not exist, or an option is out of range."""
-        return _imported(self.dataset)(root, **options)
+        return resolve_name(self.dataset)(root, **options)
 
     @property
     def scored(self) -> Any:
         """The benchmark's class."""
-        return _imported(self.benchmark)
-
-
-def _imported(name: str) -> Any:
-    """The object that "package.module:attribute" names."""
-    module, _, attribute = name.partition(":")
-    return getattr(import_module(module), attribute)
+        return resolve_name(self.benchmark)
 
 
 DATASETS: dict[str, DatasetSpec] = {
@@ -64,12 +58,7 @@ DATASETS: dict[str, DatasetSpec] = {
             "split": {"default": "val", "help": "name of the image lists (default: val)"},
             "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
             "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-            "pixel_origin": {
-                "type": int,
-                "choices": (0, 1),
-                "default": 1,
-                "help": "number of the first pixel (default: 1)",
-            },
+            "pixel_origin": {"type": int, "choices": (0, 1), "default": 1, "help": "of the first pixel (default: 1)"},
         },
         whole={"occluded": False, "truncated": False},
     ),

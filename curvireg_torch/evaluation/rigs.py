@@ -17,10 +17,10 @@ from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.result import result_document
 from ..utils.checks import check_pose
-from ..utils.files import check_table_size, finite_numbers, read_json
-from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, csv_cells, numbers_of
-from .result_files import RigPicture
-from .runner import View, register_views
+from ..utils.files import check_table_size, finite_numbers, read_csv, read_json
+from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
+from .photograph import register_views
+from .result_files import View
 
 ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
 COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
@@ -29,10 +29,8 @@ COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or 
 def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
     """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a scene of a BOP set.
 
-    Columns of the CSV are ``photo``, ``x0`` to ``y1`` (may be empty), ``fx fy cx cy`` or ``camera`` (a calibration
-    file), ``r11`` to ``r33`` or ``qw qx qy qz``, and ``tx ty tz``: the camera from the world, in the mesh's unit. Paths
-    are relative to the file. Of a BOP scene, boxes are those of the object that the name of ``mesh`` numbers, if each
-    photograph shows it once at most.
+    docs/results.md describes the columns of the CSV. Of a BOP scene, boxes are those of the object that the name of
+    ``mesh`` numbers, if each photograph shows it once at most.
     """
     if path.is_dir():
         for name, read in (("images.txt", _colmap), ("scene_camera.json", lambda folder: _bop(folder, mesh))):
@@ -41,7 +39,7 @@ def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
         raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
-    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path, csv_cells(path)))
+    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path, read_csv(path)))
 
 
 def _checked(path: Path, rows: Iterator[View]) -> list[View]:
@@ -147,23 +145,19 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
 
 def register_rig(
     path: Path, rig: Sequence[View], registrar: Registrar, *, bank_seconds: float
-) -> tuple[Registration, dict[str, Any], list[RigPicture]]:
-    """Register the photographs of a rig together, see :func:`.runner.register_views`.
+) -> tuple[Registration, dict[str, Any], list[View]]:
+    """Register the photographs of a rig together, see :func:`.photograph.register_views`.
 
-    Returns the registration, its document, and pixels, camera matrix, ``T_cam_from_world`` and name of each photograph,
-    or None for one that could not be read.
+    Returns the registration, its document, and the photographs as they were read.
     """
     start = time.perf_counter()
     try:
-        result, seen, cameras = register_views(rig, registrar)
+        result, seen = register_views(rig, registrar)
     except CurviregError as error:
         raise InvalidInputError(f"{error}", subject=path) from error
     document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
-    document["frame"] = "world"
-    document["inputs"] = {"rig": str(path), "box": None}
-    found: list[RigPicture] = []
-    for row, view, one, camera in zip(document["views"], rig, seen, cameras, strict=True):
-        row |= {"name": view.name, "photo": str(view.photo), "camera": camera.describe()}
+    document |= {"frame": "world", "inputs": {"rig": str(path), "box": None}}
+    for row, view in zip(document["views"], seen, strict=True):
+        row |= {"name": view.name, "photo": str(view.photo), "camera": view.camera.describe()}
         row["T_cam_from_world"] = view.T_cam_from_world.tolist()
-        found.append(one and (one.image, camera.matrix, view.T_cam_from_world, view.name))
-    return result, document, found
+    return result, document, seen

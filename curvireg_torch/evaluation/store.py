@@ -41,13 +41,7 @@ class Workers:
 
 @contextmanager
 def workers() -> Iterator[Workers]:
-    """The processes that ``torchrun`` started, or this one alone.
-
-    Example:
-        >>> with workers() as group:
-        ...     group.rank, group.size
-        (0, 1)
-    """
+    """The processes that ``torchrun`` started, or this one alone."""
     if not (dist.is_available() and dist.is_torchelastic_launched()):
         yield Workers()
         return
@@ -95,25 +89,18 @@ class ResultStore:
     Args:
         folder: created with the first row.
         workers: the processes that share the store.
-
-    Example:
-        >>> import tempfile
-        >>> store = ResultStore(Path(tempfile.mkdtemp()))
-        >>> store.append({"key": "car/1", "digests": {"request": "a", "photo": "b"}, "score": 0.5})
-        >>> store.is_current("car/1", {"request": "a", "photo": "b"}), store.read("car/1")["score"]
-        (True, 0.5)
     """
 
     def __init__(self, folder: Path, workers: Workers | None = None) -> None:
         workers = workers or Workers()
         self.folder, self.path = folder, folder / "results.jsonl"
-        part = folder / f"results.{workers.rank}-of-{workers.size}.jsonl"
-        self._output = part if workers.size > 1 else self.path
+        part = f"results.{workers.rank}-of-{workers.size}.jsonl"
+        self._output = self.path if workers.size == 1 else folder / part
         self._repaired = False
-        self.refresh()
+        self._read_files()
 
-    def refresh(self) -> None:
-        """Read again what is on disk, rows of other processes included."""
+    def _read_files(self) -> None:
+        """Read what is on disk, rows of other processes included."""
         self._rows: dict[str, list[tuple[Row, bytes]]] = {}
         for path in self._files():
             for line in path.read_bytes().splitlines(keepends=True):
@@ -127,9 +114,8 @@ class ResultStore:
 
     def is_complete(self, wanted: Mapping[str, Mapping[str, str]]) -> bool:
         """Whether all processes together have written a row of each key with these digests; :meth:`read` returns it."""
-        self.refresh()
-        found = [self._choose(key, digests) for key, digests in wanted.items()]
-        return all(found)
+        self._read_files()
+        return all(self._choose(key, digests) for key, digests in wanted.items())
 
     def _choose(self, key: str, digests: Mapping[str, str]) -> bool:
         """Make a row with these digests the last one of its key."""
@@ -177,12 +163,10 @@ class ResultStore:
     def _add(self, path: Path, line: bytes) -> None:
         try:
             row = json.loads(line)
-            if not (isinstance(row["key"], str) and isinstance(row["digests"], dict)):
-                raise ValueError
+            self._rows.setdefault(str(row["key"]), []).append((dict(row["digests"]), line))
         except (ValueError, KeyError, TypeError, RecursionError):
             message = f"{path}: not results of this command; choose another --out, or move it away"
             raise InvalidInputError(message) from None
-        self._rows.setdefault(row["key"], []).append((row["digests"], line))
 
 
 def _line(row: Row) -> bytes:

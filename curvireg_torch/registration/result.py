@@ -391,12 +391,6 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     return {"score": first.score, "proposals": proposals, "instances": instances}
 
 
-def used_box(document: Mapping[str, Any]) -> list[float]:
-    """The box that a document's pose was computed with: the given one, or the one that replaced it."""
-    box: list[float] = document["corrected_box"] or document["inputs"]["box"]
-    return box
-
-
 def corners(box: Sequence[float]) -> str:
     """A box in whole px, as ``--box`` takes it."""
     return " ".join(f"{v:.0f}" for v in box)

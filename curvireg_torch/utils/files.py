@@ -117,6 +117,16 @@ def read_json(path: Path, kind: type[Any], readme: str) -> Any:
     return content
 
 
+def read_csv(path: Path) -> list[list[str]]:
+    """The rows of a CSV file in UTF-8 that are not blank."""
+    check_table_size(path)
+    try:
+        table = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
+        return [cells for cells in table if any(map(str.strip, cells))]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path) from error
+
+
 def check_table_size(path: Path) -> None:
     """Refuse a table that is too large to be read as a whole."""
     if path.stat().st_size > MAX_TABLE_BYTES:

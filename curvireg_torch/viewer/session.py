@@ -15,9 +15,9 @@ from torch import Tensor
 from ..data import read_photo
 from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
 from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
-from ..evaluation.result_files import RigPicture
+from ..evaluation.photograph import register_entry
+from ..evaluation.result_files import View
 from ..evaluation.rigs import read_rig, register_rig
-from ..evaluation.runner import View, register_entry
 from ..geometry import undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
@@ -25,12 +25,11 @@ from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
-from ..registration.result import used_box
 from ..visualization.pose_glb import mesh_glb
 from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
-Found = tuple[Registration, dict[str, Any], Sequence[RigPicture]]
+Found = tuple[Registration, dict[str, Any], Sequence[View]]
 _OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
@@ -301,7 +300,7 @@ class Session:
             registrar = self._open_registrar(request)
             registrar.progress = self._report_progress
             register = self._register_alone if shot.view is None else self._register_rig
-            found = register(shots, request, registrar, time.perf_counter() - start)
+            found, boxes = register(shots, request, registrar, time.perf_counter() - start)
             self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
@@ -309,28 +308,27 @@ class Session:
             self.cancelled, self.searched = False, ()
         result = Result(registrar, *found, inputs, Answer(found[0].hypotheses[0]))
         result.document["viewer"] = {"command": command}
-        boxes = [view.box for view in result.registration.views] or [torch.tensor(used_box(result.document))]
         for each, box in zip(shots, boxes, strict=True):
             each.result, each.found_box = result, box
         return result.registration
 
     def _register_alone(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> Found:
+    ) -> tuple[Found, list[Tensor | None]]:
         ((shot,), camera) = shots, self.options.camera
         assert shot.photo is not None
         entry = request.entry(request.photos[0])
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-        registration, document = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
+        found = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
         if isinstance(camera, Camera):
-            document["camera"] = camera.at(shot.size).describe()
-            document["inputs"]["camera_source"] = "file"
-        return registration, document, ()
+            found.document["camera"] = camera.at(shot.size).describe()
+            found.document["inputs"]["camera_source"] = "file"
+        return (found, found.document, ()), [found.box.float()]
 
     def _register_rig(
         self, shots: Sequence[Shot], request: RegisterOptions, registrar: Registrar, seconds: float
-    ) -> Found:
+    ) -> tuple[Found, list[Tensor | None]]:
         views = []
         for shot in shots:
             assert shot.view is not None
@@ -342,7 +340,8 @@ class Session:
         for row, shot in zip(document["views"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
             row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
-        return registration, document, photographs
+        boxes = [view.box for view in registration.views]
+        return (registration, document, photographs), boxes
 
     def document(self) -> dict[str, Any]:
         """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""

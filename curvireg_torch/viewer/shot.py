@@ -12,8 +12,7 @@ from torch import Tensor
 from ..data.images import Photo
 from ..errors import InvalidInputError
 from ..evaluation.opening import RegisterOptions
-from ..evaluation.result_files import RigPicture, views_glb, views_picture
-from ..evaluation.runner import View
+from ..evaluation.result_files import View, views_glb, views_picture
 from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import rotation_towards
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
@@ -46,7 +45,7 @@ class Result:
     registrar: Registrar
     registration: Registration
     document: dict[str, Any]  # the content of result.json, if the first answer is chosen
-    photographs: Sequence[RigPicture]  # of a rig
+    photographs: Sequence[View]  # of a rig
     inputs: tuple[RegisterOptions, tuple[Numbers | None, ...]]  # what was asked for, in which boxes
     answer: Answer
     answer_before: Answer | None = None

@@ -5,11 +5,13 @@ import json
 
 import cv2
 import numpy as np
+import torch
 
+from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import learned_registrar, scene, truck_bank
 
-__all__ = ["CAMERA", "RESULTS", "bop_poses", "box_of", "lines", "table", "write_files", "written"]
+__all__ = ["CAMERA", "RESULTS", "bop_poses", "box_of", "check_pose", "lines", "table", "write_files", "written"]
 
 CAMERA = ["260", "260", "119.5", "89.5"]
 RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
@@ -40,20 +42,30 @@ def written(path, header, *rows):
     return path
 
 
-def table(folder):
-    with (folder / "results.csv").open(newline="", encoding="utf-8") as file:
+def table(folder, name="results.csv"):
+    with (folder / name).open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def bop_poses(path):
     """The lines of a results file of the BOP challenge, as numbers and arrays."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(path.parent, path.name)
     for row in rows:
         row |= {name: int(row[name]) for name in ("scene_id", "im_id", "obj_id")}
         row |= {name: float(row[name]) for name in ("score", "time")}
         row |= {"R": np.array(row["R"].split(), float).reshape(3, 3), "t": np.array(row["t"].split(), float)}
     return rows
+
+
+def check_pose(document, T, degrees, share):
+    """Check the pose of a result, or of a row of results.csv: its rotation error, and that of the translation, as a
+    share of the distance."""
+    if "r11" in document:
+        R = [[float(document[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)]
+        document = {"rotation": R, "translation": [float(document[name]) for name in ("tx", "ty", "tz")]}
+    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
+    assert float(rotation_error(R, T[:3, :3])) < degrees
+    assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < share
 
 
 def lines(folder):

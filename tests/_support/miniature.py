@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import scipy.io
+import trimesh
 
 __all__ = ["pascal_object", "write_bop", "write_image", "write_mesh", "write_pascal3d", "write_web"]
 
@@ -20,48 +21,18 @@ def write_image(path: Path, size: tuple[int, int] = (60, 80), seed: int = 0) -> 
 
 
 def write_mesh(path: Path, half: float = HALF) -> None:
-    """A cube about the origin: OFF or ASCII PLY, by suffix."""
+    """A cube about the origin, in the format of the suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    lines = [" ".join(map(str, c)) for c in corners] + ["3 " + " ".join(map(str, f)) for f in faces]
-    if path.suffix == ".ply":
-        axes = "".join(f"property float {axis}\n" for axis in "xyz")
-        header = f"ply\nformat ascii 1.0\nelement vertex 8\n{axes}element face 12\n"
-        header += "property list uchar int vertex_indices\nend_header\n"
-        path.write_text(header + "\n".join(lines) + "\n")
-    else:
-        path.write_text("OFF\n8 12 0\n" + "\n".join(lines) + "\n")
+    trimesh.creation.box((2 * half,) * 3).export(path)
 
 
 def pascal_object(category: str, **changes: Any) -> dict[str, Any]:
     """One entry of ``record.objects``; ``viewpoint`` is merged, other changes replace."""
-    view = {
-        "azimuth_coarse": 45.0,
-        "elevation_coarse": 15.0,
-        "azimuth": 30.0,
-        "elevation": 10.0,
-        "distance": 40.0,
-        "focal": 1.0,
-        "px": 41.0,
-        "py": 31.0,
-        "theta": -5.0,
-        "error": np.nan,
-        "interval_azimuth": 4.0,
-        "num_anchor": 6.0,
-        "viewport": 3000.0,
-    }
-    entry: dict[str, Any] = {
-        "class": category,
-        "view": "",
-        "truncated": 0,
-        "occluded": 0,
-        "difficult": 0,
-        "bbox": np.array([[11.0, 6.0, 71.0, 56.0]]),
-        "cad_index": 1,
-        "anchors": {"left_front": {"location": np.empty((0, 0)), "status": 1}},
-    }
+    view = {"azimuth_coarse": 45.0, "elevation_coarse": 15.0, "azimuth": 30.0, "elevation": 10.0, "distance": 40.0}
+    view |= {"focal": 1.0, "px": 41.0, "py": 31.0, "theta": -5.0, "error": np.nan, "viewport": 3000.0}
+    entry: dict[str, Any] = {"class": category, "view": "", "truncated": 0, "occluded": 0, "difficult": 0}
+    entry |= {"bbox": np.array([[11.0, 6.0, 71.0, 56.0]]), "cad_index": 1}
+    entry["anchors"] = {"left_front": {"location": np.empty((0, 0)), "status": 1}}
     viewpoint = changes.pop("viewpoint", {})
     entry["viewpoint"] = {**view, **viewpoint} if isinstance(viewpoint, dict) else viewpoint
     return {**entry, **changes}
@@ -137,16 +108,8 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
         lists.mkdir(parents=True, exist_ok=True)
         lists.joinpath("car_imagenet_val.txt").write_text("\n".join(cars) + "\n")
         lists.joinpath("sofa_imagenet_val.txt").write_text("2008_000002\n")
-    return {
-        "other_class": 3,
-        "coarse_viewpoint": 2,
-        "no_viewpoint": 1,
-        "bad_box": 3,
-        "missing_mesh": 2,
-        "corrupt_annotation": 3,
-        "missing_annotation": 1,
-        "missing_image": 1,
-    }
+    reasons = {"other_class": 3, "coarse_viewpoint": 2, "no_viewpoint": 1, "bad_box": 3}
+    return reasons | {"missing_mesh": 2, "corrupt_annotation": 3, "missing_annotation": 1, "missing_image": 1}
 
 
 def write_bop(root: Path) -> dict[str, int]:
@@ -157,21 +120,10 @@ def write_bop(root: Path) -> dict[str, int]:
     K = {"cam_K": [300.0, 0.0, 40.0, 0.0, 310.0, 30.0, 0.0, 0.0, 1.0], "depth_scale": 1.0}
     hidden = {**info, "bbox_visib": [-1, -1, -1, -1], "visib_fract": 0.0}
     one = root / "test" / "000001"
-    ground_truth = {
-        "0": [pose, {**pose, "obj_id": 2}, {**pose, "cam_t_m2c": [9.0, 2.0, 400.0]}],
-        "3": [
-            {**pose, "cam_R_m2c": [2.0] * 9},
-            {**pose, "cam_t_m2c": [0, 0, None]},
-            {"obj_id": 1},
-            {**pose, "obj_id": 8},
-            {**pose, "obj_id": 9},
-            pose,
-            "no pose",
-        ],
-        "4": [pose],
-        "5": [pose],
-        "x": [pose],
-    }
+    bad = [{**pose, "cam_R_m2c": [2.0] * 9}, {**pose, "cam_t_m2c": [0, 0, None]}, {"obj_id": 1}]
+    bad += [{**pose, "obj_id": 8}, {**pose, "obj_id": 9}, pose, "no pose"]
+    three = [pose, {**pose, "obj_id": 2}, {**pose, "cam_t_m2c": [9.0, 2.0, 400.0]}]
+    ground_truth = {"0": three, "3": bad, **{key: [pose] for key in "45x"}}
     outside = {**info, "bbox_obj": [-1, -1, -1, -1]}
     infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}], "3": [info] * 5 + [outside, info], "4": [info]}
     cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
@@ -198,14 +150,8 @@ def write_bop(root: Path) -> dict[str, int]:
         root / "test_targets_bop19.json",
         [{"scene_id": s, "im_id": i, "obj_id": o, "inst_count": 1} for s, i, o in targets],
     )
-    return {
-        "corrupt_annotation": 6,
-        "missing_mesh": 1,
-        "missing_model_info": 1,
-        "bad_box": 1,
-        "missing_image": 1,
-        "missing_annotation": 2,
-    }
+    reasons = {"corrupt_annotation": 6, "missing_mesh": 1, "missing_model_info": 1}
+    return reasons | {"bad_box": 1, "missing_image": 1, "missing_annotation": 2}
 
 
 def write_web(root: Path) -> dict[str, int]:

@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
-from curvireg_torch.geometry import rotation_error
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
-from tests._support.lists import CAMERA, box_of, lines, written
+from tests._support.lists import CAMERA, box_of, check_pose, lines, written
 from tests._support.scenes import scene
 
 
@@ -51,8 +50,7 @@ def test_exif_camera_gives_a_translation_without_covariance(register):
     assert guessed["inputs"]["camera_source"] == "exif"
     assert guessed["covariance"] is guessed["standard_deviations"] is None
     assert f"camera guessed, focal length {focal:.0f} px" in printed
-    t, truth = torch.tensor(guessed["translation"], dtype=torch.float64), scene(0)[2][:3, 3]
-    assert float((t - truth).norm() / truth.norm()) < 0.1
+    check_pose(guessed, scene(0)[2], 15.0, 0.1)
 
 
 def test_fov_is_the_horizontal_field_of_view(register):
@@ -113,13 +111,6 @@ def distorted(folder):
     return [str(v) for v in (columns.min(), rows.min(), columns.max(), rows.max())]
 
 
-def check_truth(document):
-    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
-    truth = scene(0)[2]
-    assert float(rotation_error(R, truth[:3, :3])) < 3.0
-    assert float((t - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.03
-
-
 def test_calibration_file_removes_the_distortion(folder, distorted, tmp_path, capsys):
     out, camera = tmp_path / "out", str(folder / "cam.yaml")
     files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", camera]
@@ -127,7 +118,7 @@ def test_calibration_file_removes_the_distortion(folder, distorted, tmp_path, ca
     assert main(["register", *files, *words]) == 0
     assert "distortion of the lens removed" in capsys.readouterr().out
     document = json.loads((out / "result.json").read_text())
-    check_truth(document)
+    check_pose(document, scene(0)[2], 3.0, 0.03)
     camera = document["camera"]
     assert (camera["distortion"][0], camera["size"], document["inputs"]["camera_source"]) == (-0.25, [180, 240], "file")
     assert document["inputs"]["box"] != [float(v) for v in distorted]
@@ -148,8 +139,8 @@ def test_lists_take_calibration_files_and_masks(folder, distorted, tmp_path):
     words = ["register", "--list", str(path), str(folder / "learned.safetensors"), "--quiet", "--out", str(tmp_path)]
     assert main([*words, "--strict"]) == SOME_FAILED
     boxed, masked, *failed = lines(tmp_path)
-    check_truth(boxed)
-    check_truth(masked)
+    for row in (boxed, masked):
+        check_pose(row, scene(0)[2], 3.0, 0.03)
     assert masked["inputs"]["box"] == pytest.approx(boxed["inputs"]["box"], abs=3.0)
     assert "none.yaml: no such file" in failed[0]["message"]
     assert "none.png" in failed[1]["message"]

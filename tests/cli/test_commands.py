@@ -1,4 +1,4 @@
-"""``curvireg demo``, ``bank``, ``cache`` and ``--help``."""
+"""``curvireg demo``, ``bank``, ``cache`` and ``plot``."""
 
 import json
 import subprocess
@@ -19,6 +19,7 @@ from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
 from tests._support.scenes import truck_bank
+from tests.viewer.test_session import write_scene
 
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
@@ -85,3 +86,14 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert f"rotation {result['rotation_error_deg']:.1f} degrees" in printed
     assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in printed
+
+
+@pytest.mark.parametrize("kind", ["overlay", "fields", "viewpoints"])
+def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    box, _ = write_scene(tmp_path)
+    words = ["--pipeline", str(tmp_path / "small.json"), "--quiet", "--box", *map(str, box)]
+    out = tmp_path / f"{kind}.png"
+    files = [str(tmp_path / "photo.png"), str(tmp_path / "truck.ply")]
+    assert main(["plot", kind, *files, "--out", str(out), *words]) == 0
+    assert cv2.imread(str(out)).std() > 10

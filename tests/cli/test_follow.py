@@ -1,20 +1,17 @@
 """``curvireg follow``: poses and a video."""
 
-import csv
 import json
 import re
 
 import cv2
 import pytest
-import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.data import Video
-from curvireg_torch.geometry import rotation_error
 from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif
-from tests._support.lists import CAMERA
+from tests._support.lists import CAMERA, check_pose, table
 from tests._support.scenes import learned_registrar, sequence
 
 
@@ -49,17 +46,9 @@ def follow(frames):
     return run
 
 
-def table(out):
-    with (out / "results.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 def check_poses(rows, scenes):
     for row, (_, _, T) in zip(rows, scenes, strict=False):
-        R = torch.tensor([float(row[f"r{i}{j}"]) for i in (1, 2, 3) for j in (1, 2, 3)], dtype=torch.float64)
-        t = torch.tensor([float(row[name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
-        assert float(rotation_error(R.view(3, 3), T[:3, :3])) < 4.0
-        assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.04
+        check_pose(row, T, 4.0, 0.04)
 
 
 def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):

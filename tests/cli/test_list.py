@@ -7,10 +7,10 @@ import torch
 
 from curvireg_torch import Pipeline, ViewBank, sample_views
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation import runner
+from curvireg_torch.evaluation import photograph
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
-from tests._support.lists import CAMERA, RESULTS, box_of, lines, table, written
+from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
 from tests._support.scenes import scene
 
 HEADER = "photo,x0,y0,x1,y1"
@@ -29,19 +29,15 @@ def register_list(folder, register):
 
 
 def test_instances_are_those_of_each_row_without_a_box(register_list, monkeypatch):
-    asked, detect = [], runner.detect
+    asked, detect = [], photograph.detect
 
     def watched(*arguments, instances, **options):
         asked.append(instances)
         return detect(*arguments, instances=instances, **options)
 
-    monkeypatch.setattr(runner, "detect", watched)
+    monkeypatch.setattr(photograph, "detect", watched)
     assert register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
     assert asked == [2]
-
-
-def rotation(row):
-    return torch.tensor([[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)], dtype=torch.float64)
 
 
 ROWS = [
@@ -82,12 +78,11 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
         else:
             assert (row["status"], row["message"]) == ("ok", "")
             assert (row["confidence"], row["reliable"]) == ("", "false"), "not calibrated"
-            assert expected is None or float(rotation_error(rotation(row), scene(expected)[2][:3, :3])) < 15
-    t = torch.tensor([float(rows[0][name]) for name in ("tx", "ty", "tz")], dtype=torch.float64)
-    truth = scene(0)[2][:3, 3]
-    assert float((t - truth).norm() / truth.norm()) < 0.1
+            R = torch.tensor(document["rotation"], dtype=torch.float64)
+            assert expected is None or float(rotation_error(R, scene(expected)[2][:3, :3])) < 15
+            assert [[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)] == R.tolist()
+    check_pose(rows[0], scene(0)[2], 15.0, 0.1)
     assert [rows[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
-    assert documents[0]["rotation"] == rotation(rows[0]).tolist()
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()

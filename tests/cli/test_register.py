@@ -13,7 +13,7 @@ from curvireg_torch.cli import main
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
-from tests._support.lists import CAMERA, box_of
+from tests._support.lists import CAMERA, box_of, check_pose
 from tests._support.scenes import scene
 
 BOX = [float(v) for v in box_of(0)]
@@ -25,11 +25,8 @@ def rotation(document):
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
-    result, truth = document(), scene(0)[2]
-    assert float(rotation_error(rotation(result), truth[:3, :3])) < 15
-    # Swapped CX and CY would move the object by 30 px of 260: 0.16 of its distance.
-    t = torch.tensor(result["translation"], dtype=torch.float64)
-    assert float((t - truth[:3, 3]).norm() / truth[:3, 3].norm()) < 0.05
+    result = document()
+    check_pose(result, scene(0)[2], 15.0, 0.05)  # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     assert len(result["top"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert np.shape(result["covariance"]) == (6, 6)

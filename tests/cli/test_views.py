@@ -1,6 +1,5 @@
 """``curvireg register --views``: rigs as CSV, COLMAP models and BOP scenes, and the files of one pose."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -12,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
 from curvireg_torch.evaluation.rigs import read_rig
-from curvireg_torch.geometry import rotation_error
-from tests._support.lists import CAMERA
+from tests._support.lists import CAMERA, check_pose, written
 from tests.registration.test_several import EASY, WORLD, rig_of
 
+SHARE = 0.1 / float(WORLD[:3, 3].norm())
 COLUMNS = [*("photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy")]
 POSE = [*(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz"]
 
@@ -33,29 +32,17 @@ def rig(tmp_path_factory):
     return folder, rows
 
 
-def write(path, header, rows):
-    with path.open("w", newline="") as file:
-        csv.writer(file).writerows([header, *rows])
-    return path
-
-
 def register(folder, rig, out, *words):
     command = ["register", "--views", str(rig), str(folder / "learned.safetensors"), "--quiet", "--out", str(out)]
     return main([*command, *words])
 
 
-def check(document):
-    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
-    assert float(rotation_error(R, WORLD[:3, :3])) < 1.5
-    assert float((t - WORLD[:3, 3]).norm()) < 0.1
-
-
 def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     place, rows = rig
-    path = write(place / "rig.csv", [*COLUMNS, *POSE], [*rows, ["none.png", *rows[0][1:]]])
+    path = written(place / "rig.csv", ",".join([*COLUMNS, *POSE]), *rows, ["none.png", *rows[0][1:]])
     assert register(folder, path, tmp_path, "--format", "ros") == 0
     document = json.loads((tmp_path / "result.json").read_text())
-    check(document)
+    check_pose(document, WORLD, 1.5, SHARE)
     assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
     assert [view["photo"] for view in document["views"]] == [str(place / row[0]) for row in [*rows, ["none.png"]]]
     assert [view["failure"] is None for view in document["views"]] == [True, True, True, False]
@@ -82,9 +69,9 @@ def test_views_of_quaternions_and_calibration_files(rig, folder, tmp_path):
         x, y, z, w = Rotation.from_matrix(torch.tensor(row[9:18]).view(3, 3).numpy()).as_quat()
         some.append([*row[:5], "cameras.txt", w, x, y, z, *row[18:]])
     some[1][1:5] = [""] * 4  # the others say where the object is
-    path = write(place / "q.csv", [*COLUMNS[:5], "camera", "qw", "qx", "qy", "qz", "tx", "ty", "tz"], some)
+    path = written(place / "q.csv", "photo,x0,y0,x1,y1,camera,qw,qx,qy,qz,tx,ty,tz", *some)
     assert register(folder, path, tmp_path) == 0
-    check(json.loads((tmp_path / "result.json").read_text()))
+    check_pose(json.loads((tmp_path / "result.json").read_text()), WORLD, 1.5, SHARE)
 
 
 def test_read_rig_reads_colmap_and_bop(rig, tmp_path):

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from curvireg_torch.data import images, read_image, read_photo
-from curvireg_torch.errors import ImageError, InvalidInputError, MissingFileError
+from curvireg_torch.errors import ImageError, MissingFileError
 from tests._support.exif import exif, with_exif
 from tests._support.miniature import write_image
 
@@ -88,8 +88,8 @@ def test_read_image_applies_the_orientation_of_tiff_on_request(tmp_path, dtype, 
         Image.fromarray(pixels).save(tmp_path / name, tiffinfo=tags)
     stored = read_image(tmp_path / "plain.tif")
     assert torch.equal(read_image(tmp_path / "rotated.tif"), stored)
-    viewed = read_photo(tmp_path / "rotated.tif", dtype=torch.float32)
-    assert torch.equal(viewed.image, stored.flip(1).transpose(1, 2))
+    viewed = read_photo(tmp_path / "rotated.tif")
+    assert torch.equal(viewed.image / 255, stored.flip(1).transpose(1, 2))
 
 
 def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
@@ -105,13 +105,9 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
-def test_read_image_returns_uint8_on_request(tmp_path):
-    write_image(tmp_path / "a.png")
-    assert torch.equal(read_image(tmp_path / "a.png", dtype=torch.uint8).float() / 255, read_image(tmp_path / "a.png"))
+def test_read_photo_rounds_16_bits(tmp_path):
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
-    assert read_image(tmp_path / "b.png", dtype=torch.uint8)[0].tolist() == [[0, 0, 1, 255]]
-    with pytest.raises(InvalidInputError, match="float16"):
-        read_image(tmp_path / "a.png", dtype=torch.float16)
+    assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]
 
 
 def test_read_photo_notes_changes_of_channels(tmp_path):

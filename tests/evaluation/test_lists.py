@@ -1,6 +1,5 @@
 """Registration of lists: what is repeated, what the tables and the page show, and names that are no text."""
 
-import csv
 import json
 import os
 from dataclasses import replace
@@ -13,14 +12,15 @@ import torch
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import lists, runner
+from curvireg_torch.evaluation import lists, photograph, runner
 from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.runner import Entry
+from curvireg_torch.evaluation.photograph import Entry
 from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
+from tests._support.lists import lines, table
 from tests._support.scenes import SIZE, scene, unrefined
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
@@ -70,8 +70,8 @@ def test_rows_follow_the_order_of_the_list(registrar, entry, tmp_path):
     rows = [replace(entry, cells={"id": "a"}), replace(entry, camera=50.0, cells={"id": "b"})]
     for some in (rows, rows[::-1]):
         register_rows(some, tmp_path / "out", registrar)
-        found = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
-        assert [(row["row"], row["columns"]) for row in found] == list(enumerate((one.cells for one in some), start=1))
+        found = [(row["row"], row["columns"]) for row in lines(tmp_path / "out")]
+        assert found == list(enumerate((one.cells for one in some), start=1))
 
 
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):
@@ -87,11 +87,10 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
     photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box), frames=tmp_path)
-    counts = lists.register_list(photos, tmp_path / "out", lambda _: registrar, settings={}, progress=False)
+    counts = register_rows(photos, tmp_path / "out", registrar)
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
-    with (tmp_path / "out" / "results.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(tmp_path / "out")
     assert [os.path.basename(row["photo"]) for row in rows] == [r"caf\udce9.png", r"gar\udce7on.png"]
     assert [row["status"] for row in rows] == ["ok", "failed"]
     assert r"caf\udce9.png" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
@@ -99,16 +98,16 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
 
 def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
-    path = tmp_path / "excel.csv"
+    path, options = tmp_path / "excel.csv", RegisterOptions(meshes=(tmp_path / "part.stl",))
     path.write_text(
         "Photo ,x0,Y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     )
-    found = read_list(path, [tmp_path / "part.stl"])
+    found = read_list(path, options)
     assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
     assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
     assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
     path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
-    assert read_list(path, [tmp_path / "part.stl"])[0].box == (1.0, 2.0, 30.0, 40.0)
+    assert read_list(path, options)[0].box == (1.0, 2.0, 30.0, 40.0)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +138,8 @@ def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entr
     photo = read_photo(entry.photo)
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
     one = replace(entry, camera=camera)
-    result, document = runner.register_entry(one, photo, Certain(), bank_seconds=0.0)
+    result = photograph.register_entry(one, photo, Certain())
+    document = result.document
     assert document["inputs"]["camera_source"] == source
     known = source in ("given", "file")
     assert document["covariance"] == (torch.eye(6).tolist() if known else None)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import curvireg_torch as cr
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation import photograph
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 from tests._support.scenes import learned_registrar, scene
@@ -67,8 +66,8 @@ def test_register_takes_the_camera_from_exif(folder):
 
 
 def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
-    fits, original = torch.tensor([1.0, 2.0, 30.0, 40.0]).double(), photograph.register_image
-    monkeypatch.setattr(photograph, "register_image", lambda *a: [replace(original(*a)[0], corrected_box=fits)])
+    fits, original = torch.tensor([1.0, 2.0, 30.0, 40.0]).double(), cr.Registrar.__call__
+    monkeypatch.setattr(cr.Registrar, "__call__", lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)])
     found = cr.register(folder / "photos" / "0.png", learned_registrar(), box=[float(v) for v in box_of(0)])
     assert found.box.equal(fits)
 

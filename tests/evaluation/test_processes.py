@@ -1,6 +1,5 @@
 """Evaluations and lists in several processes, and in processes that are killed."""
 
-import csv
 import json
 import os
 import signal
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from curvireg_torch.cli import main
-from tests._support.lists import box_of, lines, write_files, written
+from tests._support.lists import box_of, lines, table, write_files, written
 
 REPOSITORY = Path(__file__).parents[2]
 PYTHON = (sys.executable, "-m")
@@ -33,8 +32,7 @@ def evaluation(out):
     """Everything that an evaluation wrote, without times."""
     summary = json.loads((out / "summary.json").read_text())
     del summary["seconds"]
-    with open(out / "predictions.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(out, "predictions.csv")
     for row in rows:
         del row[{"seconds", "time"}.intersection(row).pop()]
     return summary, rows

@@ -11,7 +11,8 @@ import torch
 from curvireg_torch import Camera, PosePrior
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
-from curvireg_torch.evaluation.runner import Entry, View, run_entries
+from curvireg_torch.evaluation.photograph import Entry, View
+from curvireg_torch.evaluation.runner import run_entries
 from curvireg_torch.evaluation.store import Workers, run_processes
 
 

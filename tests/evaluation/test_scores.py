@@ -1,6 +1,5 @@
 """Scores of results that are written by hand, so that every number is known."""
 
-import csv
 import json
 import math
 
@@ -15,7 +14,7 @@ from curvireg_torch.evaluation.benchmarks import detection_recall
 from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
-from tests._support.lists import bop_poses
+from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
 
 SECONDS = {"bank": 2.0, "register": 0.5}
@@ -94,8 +93,7 @@ def test_pascal3d_summary(furniture, tmp_path):
 def test_pascal3d_table(furniture, tmp_path):
     R = rotation_from_viewpoint(*torch.tensor([200.0, 10, -5]).double()).tolist()
     scores_of(furniture, tmp_path, [{"rotation": R}, FAILED] + [{"skipped": "x"}] * 7)
-    with open(tmp_path / "predictions.csv", newline="") as file:
-        first, second = csv.DictReader(file)
+    first, second = table(tmp_path, "predictions.csv")
     assert (first["category"], first["image_id"], first["truncated"]) == ("bottle", "1", "0")
     angles = ("azimuth", "elevation", "theta")
     assert [float(first[name]) for name in angles] == pytest.approx([200, 10, -5], abs=1e-3)

@@ -17,7 +17,6 @@ from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.inputs import ImageItem, check_crop
-from curvireg_torch.registration.result import result_document, used_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
 
@@ -245,9 +244,7 @@ def test_wrong_box_is_corrected():
     assert result.score > before.score
     overlap = box_iou(torch.stack([result.corrected_box, WRONG.double()]), BOX[None].double())[:, 0]
     assert overlap[0] > overlap[1] + 0.1
-    document = {**result_document(result, registrar, {}), "inputs": {"box": [1.0, 2.0, 3.0, 4.0]}}
-    assert used_box(document) == document["corrected_box"] == result.corrected_box.tolist()
-    assert used_box({**document, "corrected_box": None}) == [1.0, 2.0, 3.0, 4.0]
+    assert result.to_dict()["corrected_box"] == result.corrected_box.tolist()
 
 
 @pytest.mark.parametrize("better", [True, False])
