@@ -65,7 +65,7 @@ class MissingFileError(CurviregError, FileNotFoundError):
 
 
 class LostObjectError(CurviregError, ValueError):
-    """The object is not near the pose that a refinement started from."""
+    """The object is not found in a photograph without a box, or not near the pose that a refinement started from."""
 
 
 class OutputError(InvalidInputError, OSError):

@@ -144,18 +144,16 @@ class DetectionSettings:
     Attributes:
         views: number of views that represent all of a bank.
         min_size: longer side of the smallest object that is searched for, as a fraction of the photograph's.
-        proposals: number of boxes that are proposed.
-        candidates: number of the best proposals, which are ranked against all views.
+        proposals: number of boxes that are compared with all views of the bank.
     """
 
     views: int = 96
     min_size: float = 0.08
     proposals: int = 20
-    candidates: int = 5
 
     def __post_init__(self) -> None:
-        if min(self.views, self.proposals, self.candidates) < 1:
-            raise InvalidInputError(f"detection: expected views, proposals and candidates >= 1, got {self}")
+        if min(self.views, self.proposals) < 1:
+            raise InvalidInputError(f"detection: expected views and proposals >= 1, got {self}")
         if not 0.02 <= self.min_size <= 1.0:
             raise InvalidInputError(f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}")
 

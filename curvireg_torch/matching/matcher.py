@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from ..features import field_points
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..terms import Appearance, QueryFeatures, crop_regions, jittered_boxes, photograph_field, whole_box_shapes
+from ..terms import (
+    Appearance,
+    Correlation,
+    QueryFeatures,
+    crop_regions,
+    jittered_boxes,
+    photograph_field,
+    whole_box_shapes,
+)
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
@@ -182,9 +190,7 @@ class ViewMatcher(nn.Module):
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
         """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
         views out, whose score is 0."""
-        check_pixels(query.crops, "of the box")
-        terms = {term.name: compare(query) for term, compare in self._terms}
-        first = torch.stack([term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]).sum(dim=0)
+        terms, first = self._first_terms(query)
         log, compared = self._with_appearance(query, first)
         if allowed is not None:
             allowed, without_limits = allowed.to(log.device), log
@@ -196,6 +202,22 @@ class ViewMatcher(nn.Module):
             best, outside = without_limits.masked_fill(allowed | near, -torch.inf).max(dim=1)
             outside = outside.masked_fill(best == -torch.inf, -1)
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
+
+    def similarity(self, query: QueryFeatures, allowed: Tensor | None = None) -> Tensor:
+        """(B,) normalised correlation of the view that is best without the appearance term, at a fraction of the cost
+        of :meth:`rank`."""
+        terms, log = self._first_terms(query)
+        if allowed is not None:
+            log = log.masked_fill(~allowed.to(log.device), -torch.inf)
+        return terms[Correlation.name].gather(1, log.argmax(dim=1, keepdim=True))[:, 0]
+
+    def _first_terms(self, query: QueryFeatures) -> tuple[dict[str, Tensor], Tensor]:
+        """Scores of all terms but appearance, and their product's logarithm (B, N)."""
+        check_pixels(query.crops, "of the box")
+        terms = {term.name: compare(query) for term, compare in self._terms}
+        return terms, torch.stack([term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]).sum(
+            dim=0
+        )
 
     def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""

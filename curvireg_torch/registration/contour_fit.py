@@ -35,6 +35,9 @@ FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 
 SMALL_CROP_DENSITY = 0.5
 """Contour points in smaller crops, as a fraction of those at full size."""
 
+KEPT_STARTS = 3
+"""Starts of a pose that continue after the first round, those with the most support."""
+
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
@@ -48,7 +51,7 @@ SUPPORTED, GAINED = 0.5, 0.2
 STEPS_PER_ROUND, SELECTIONS_PER_STEP = 2, 3
 """Least-squares steps per round, and selections of edges per step."""
 
-STALE_SHIFT = 0.3
+STALE_SHIFT = 0.6
 """Mean shift of the contour points in px after which the mesh's contours are found again."""
 
 EDGE_DAMPING = 1e-2
@@ -258,9 +261,9 @@ def fit_contours(
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search radius shrinks from round to round, and the contours are found again where
-    they have moved. The fit begins at half size from each start and from six poses rotated away from it; the best, by
-    edge support, and the next best that differs from it continue, and end at full size. If no fit improves the edge
-    support, the start is kept.
+    they have moved. The fit begins at half size from each start and from six poses rotated away from it; the three with
+    the most edge support after the first round go on. The best of them and the next best that differs from it end at
+    full size. If no fit improves the edge support, the start is kept.
 
     Prints and clutter have edges too. With an ``object_mask`` they are weighted (``ObjectMask``) in the least squares
     and in the choice among the fits, not in the reported support.
@@ -338,7 +341,12 @@ def fit_to_edges(
     around = torch.cat([_turned(T0, half.centre, (START_ANGLE,), roll=START_ROLL), wide], dim=1)
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST_RADII)
+    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST_RADII[:1])
+    kept = half[every].supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+    fits = fits[(kept + M * torch.arange(N)[:, None]).flatten()]
+    M = kept.shape[1]
+    every = torch.arange(N).repeat_interleave(M)
+    fits = half[every].descend(fits, FIRST_RADII[1:])
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
     first = fits[torch.arange(N) * M + best]

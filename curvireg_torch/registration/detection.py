@@ -13,18 +13,18 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ..errors import CurviregError, InvalidInputError
+from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..features.backbone import STRIDES, Backbone
 from ..geometry.crops import box_iou, crop_transforms, non_maximum_suppression, square_boxes
 from ..geometry.pose_prior import PosePrior, check_distance
-from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher
+from ..matching import ViewBank, ViewDescriber, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
 from .confidence import detection_probability
 from .inputs import ImageItem, check_crop, image_items
 from .poses import projected_box
 from .priors import Limits
-from .result import Detection, FailedRegistration, Registration
+from .result import Detection, FailedRegistration, Registration, corners
 from .tracker import boxes_at
 
 if TYPE_CHECKING:
@@ -34,8 +34,7 @@ TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
 MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
-FOUND_CONFIDENCE = 0.1  # Confidence below which a result warns that the object is hardly there
-NOT_FOUND = "the object is hardly at this place; give a box"
+FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
 MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
 MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
@@ -63,7 +62,8 @@ def detect(
         instances: largest number of objects in each photograph.
 
     Returns:
-        For each photograph one to ``instances`` registrations with their ``detection``; or one that failed.
+        For each photograph one to ``instances`` registrations with their ``detection``; or one that failed, with
+        :class:`LostObjectError` where no place is convincing.
 
     Raises:
         InvalidInputError: not as many cameras or priors as images, a distance limited without cameras, or
@@ -71,24 +71,49 @@ def detect(
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    detector = registrar.detector  # created once, before threads use it
 
-    def detect_in(item: ImageItem, _: int) -> list[Registration]:
+    _ = registrar.detector  # created once, before threads use it
+
+    def detect_in(item: ImageItem, index: int) -> Results:
         registrar.report_progress("detection")
-        extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
-        check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
-        limits: dict[str, Any] = {}
-        if item.prior is not None:
-            limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
-        focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
-        proposals = detector(item.image, focal=focal, **limits)
-        proposals = _with_landmarks(proposals, registrar, item)
-        if not len(proposals.boxes):
-            raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
-        return _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
+        proposals = propose(registrar, item)
+        found = _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
+        convincing = [one for one in found if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE]
+        return [*convincing] or [_lost(found, f"image {index}")]
 
     found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
+
+
+def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
+    """Boxes in which a photograph may show the object: those around poses on which landmarks of its print agree, their
+    number being the response, and those of the detector."""
+    extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
+    check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
+    limits: dict[str, Any] = {}
+    if item.prior is not None:
+        limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
+    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+    others = registrar.detector(item.image, focal=focal, **limits)
+    poses, count = registrar.landmark_poses(item)
+    boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
+    first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
+    pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)
+    proposals = Proposals(*(torch.cat(pair) for pair in pairs))
+    if not len(proposals.boxes):
+        raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
+    return proposals
+
+
+def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
+    """The answer where no place is convincing: the most likely one, without its pose."""
+    best = max(found, key=lambda one: one.confidence or 0.0)
+    assert best.detection is not None
+    message = (
+        f"not found: at the most likely place, box {corners(best.detection.box.tolist())}, the object is seen with a "
+    )
+    error = LostObjectError(f"{message}probability of {best.confidence:.2f}; give a box", subject=subject)
+    return FailedRegistration(error, best.detection)
 
 
 def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
@@ -117,42 +142,28 @@ class Proposals:
     views: Tensor
 
 
-def _with_landmarks(proposals: Proposals, registrar: "Registrar", item: ImageItem) -> Proposals:
-    """Proposals after the boxes around poses on which landmarks agree; their number is the response."""
-    poses, count = registrar.landmark_poses(item)
-    boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
-    first = boxes[visible].to(proposals.boxes), count[visible], poses.view[visible]
-    return Proposals(
-        torch.cat([first[0], proposals.boxes]),
-        torch.cat([first[1], proposals.responses]),
-        torch.cat([first[2], proposals.views]),
-    )
-
-
 @dataclass(frozen=True)
 class Candidate:
-    """A box (4,) of a photograph, ranked, with the detector's ``response``, and as ``score`` the probability that it
+    """A described box (4,) of a photograph, with the detector's ``response``, and as ``score`` the probability that it
     shows the object."""
 
     box: Tensor
     response: float
     query: QueryFeatures
-    ranking: Ranking
     score: float
 
     @classmethod
-    def ranked(cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float) -> "Candidate":
-        """Rank a box (4,) with the detector's response."""
+    def compared(cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float) -> "Candidate":
+        """Compare a box (4,) with all views."""
         query = registrar.matcher.query([item.image], box[None].float())
         allowed = None
         if item.prior is not None:
             allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
-        ranking = registrar.matcher.rank(query, allowed)
-        similarity = float(ranking.hog[0, ranking.order[0, 0]])
-        return cls(box, response, query, ranking, detection_probability(response, similarity))
+        similarity = float(registrar.matcher.similarity(query, allowed))
+        return cls(box, response, query, detection_probability(response, similarity))
 
     def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
-        result = registrar.register(replace(item, box=self.box.float()), self.query, self.ranking)
+        result = registrar.register(replace(item, box=self.box.float()), self.query)
         return Found(result, projected_box(registrar.describer, result.projection), self.response, self.score)
 
 
@@ -169,11 +180,10 @@ class Found:
 def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int) -> list[Found]:
     """The most certain objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
     none."""
-    count = max(registrar.pipeline.detection.candidates, instances + 1)
     candidates, failed = [], None
-    for box, response in zip(proposals.boxes[:count], proposals.responses[:count].tolist(), strict=True):
+    for box, response in zip(proposals.boxes, proposals.responses.tolist(), strict=True):
         try:
-            candidates.append(Candidate.ranked(registrar, item, box, response))
+            candidates.append(Candidate.compared(registrar, item, box, response))
         except CurviregError as error:  # such as limits on the pose that leave no view here
             failed = failed or error
     if not candidates and failed is not None:
@@ -189,7 +199,7 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
 def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
-        candidate = Candidate.ranked(registrar, item, found.box, found.response)
+        candidate = Candidate.compared(registrar, item, found.box, found.response)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
         return replace(found, score=0.0)
     return found if candidate.score <= found.score else candidate.register(registrar, item)
@@ -212,12 +222,8 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
     results = []
     for one in found:
         probabilities = tuple(p * one.score for p in one.registration.probabilities)
-        warnings = one.registration.warnings
-        if probabilities and probabilities[0] < FOUND_CONFIDENCE:
-            warnings += (NOT_FOUND,)
         detection = Detection(one.box, one.score, one.response, boxes[kept], responses[kept])
-        changes: dict[str, Any] = {"detection": detection, "probabilities": probabilities, "warnings": warnings}
-        results.append(replace(one.registration, **changes))
+        results.append(replace(one.registration, detection=detection, probabilities=probabilities))
     return results
 
 

@@ -118,11 +118,13 @@ class Landmarks:
             if not len(votes) or votes.max() < MIN_LANDMARKS:
                 break
             cluster = near[votes.argmax()] & left
-            error = REPROJECTION_ERROR * float(np.median(radius[cluster]))
-            pose = _pose(self._points[landmark[cluster]], found.uv[cluster], K.double().cpu().numpy(), error)
-            if pose is not None:
-                poses.append(pose)
+            size = float(np.median(radius[cluster]))
+            points, uv = self._points[landmark[cluster]], found.uv[cluster]
+            pose = _pose(points, uv, K.double().cpu().numpy(), REPROJECTION_ERROR * size)
             left &= ~cluster
+            if pose is not None:  # what is left at its place has no other one
+                poses.append(pose)
+                left &= np.abs(centre - centre[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:

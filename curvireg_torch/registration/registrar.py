@@ -214,7 +214,8 @@ class Registrar:
 
         Returns:
             A :class:`Registration` for each photograph; a :class:`FailedRegistration` for one that cannot be registered
-            (unreadable, box empty or outside, one colour, NaN), which raises its error on access to a pose.
+            (unreadable, box empty or outside, one colour, NaN) or, without a box, that does not show the object
+            convincingly; it raises its error on access to a pose.
 
         Raises:
             InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without
@@ -346,15 +347,14 @@ class Registrar:
         return self.register(item, query)
 
     @torch.no_grad()
-    def register(self, item: ImageItem, query: QueryFeatures, ranking: Ranking | None = None) -> Registration:
+    def register(self, item: ImageItem, query: QueryFeatures) -> Registration:
         """Register a photograph: rank, fit, judge, report.
 
         Args:
             item: the photograph.
             query: the same, cropped and described by the matcher.
-            ranking: of the same; default :meth:`ViewMatcher.rank`.
         """
-        work = self._rank(item, query, ranking)
+        work = self._rank(item, query)
         starts, outside = self._starts(work)
         poses = starts
         if self.pipeline.search:
@@ -384,11 +384,10 @@ class Registrar:
             features = features.index_copy(0, back, self._features(work, restored))
         return self._result(work, poses, features, distinct, outside)
 
-    def _rank(self, item: ImageItem, query: QueryFeatures, ranking: Ranking | None) -> _Work:
+    def _rank(self, item: ImageItem, query: QueryFeatures) -> _Work:
         self.report_progress("ranking")
         limits = None if item.prior is None else Limits(item, self.bank)
-        if ranking is None:
-            ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
+        ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
         exact = self.is_exact(with_camera=item.camera_matrix is not None)
         symmetries = self.symmetries_of(exact=exact)
         crops = None

@@ -327,9 +327,11 @@ def _finite(deviations: Tensor) -> list[float | None]:
 
 @dataclass(frozen=True)
 class FailedRegistration:
-    """A photograph that could not be registered because of its ``error``, which access to a pose raises."""
+    """A photograph that could not be registered because of its ``error``, which access to a pose raises; where the
+    object was searched for and not found, with its likely places as ``detection``."""
 
     error: CurviregError
+    detection: Detection | None = None
 
     ok = False
 

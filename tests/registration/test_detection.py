@@ -10,13 +10,14 @@ import torch
 import torch.nn.functional as F
 
 import curvireg_torch as cr
-from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views, _medoids
 from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.result import corners
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, unrefined
 
@@ -130,10 +131,9 @@ def test_detect_reports_an_object_once(registrar, monkeypatch):
     assert torch.equal(results[0].detection.box, box.double())
 
 
-def test_detect_follows_one_proposal_more_than_instances():
-    """The detector prefers a box of the background; the more certain one is reported, even if one is to be followed."""
-    pipeline = unrefined(bank(), detection=replace(bank().pipeline.detection, candidates=1))
-    registrar = cr.Registrar(bank(), pipeline=pipeline)
+def test_the_most_certain_of_all_proposals_is_reported():
+    """The detector prefers a box of the background."""
+    registrar = cr.Registrar(bank(), pipeline=unrefined(bank()))
     image, box = pasted_scene(5, (90, 40), 0.9)
     background = torch.tensor([2.0, 2.0, 60.0, 40.0])
     registrar.__dict__["detector"] = fixed(torch.stack([background, box]), [6.2, 6.0])
@@ -153,12 +153,20 @@ def test_probabilities_are_those_of_a_right_box_times_its_score(found):
     assert found_there.probabilities == pytest.approx((0.8 * one.score, 0.1 * one.score))
 
 
-@pytest.mark.parametrize(("probability", "warned"), [(0.099, True), (0.101, False)])
-def test_a_place_that_is_hardly_likely_asks_for_a_box(found, probability, warned):
-    one = replace(as_found(replace(found[2], probabilities=(probability,), warnings=())), score=1.0)
-    none = Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
-    (result,) = detection_module._with_proposals([one], none)
-    assert any("give a box" in text for text in result.warnings) == warned
+@pytest.mark.parametrize(("score", "lost"), [(0.099, True), (0.101, False)])
+def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch, score, lost):
+    """Instead of a pose the answer says where it may be, and asks for a box."""
+    certain = replace(found[2], probabilities=(1.0,))
+    one = replace(as_found(certain), score=score)
+    monkeypatch.setattr(detection_module, "_register_candidates", lambda *_: [one])
+    result = registrar([found[0]])[0]
+    assert result.ok != lost
+    assert torch.equal(result.detection.box, one.box)
+    if lost:
+        assert isinstance(result.error, LostObjectError)
+        place = corners(one.box.tolist())
+        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.10; give a box"
+        assert str(result.error) == f"image 0: not found: {message}"
 
 
 def test_bad_distances_raise(registrar, found):
@@ -245,7 +253,7 @@ def test_detector_rejects_bad_distances_images_and_settings():
         detector()(torch.rand(3, 60, 80), distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="images: expected"):
         detector()(torch.rand(2, 60, 80))
-    for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views, proposals")):
+    for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views and proposals")):
         with pytest.raises(InvalidInputError, match=message):
             cr.pipeline.DetectionSettings(**settings)
 
@@ -300,7 +308,7 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
 def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
     one, other = as_found(found[2]), as_found(found[2])
     again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
-    monkeypatch.setattr(Candidate, "ranked", lambda *_: again)
+    monkeypatch.setattr(Candidate, "compared", lambda *_: again)
     best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
     assert best is (one if kept else other)
 

@@ -1,0 +1,169 @@
+"""Poses and boxes from landmarks of a mesh's print."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.geometry import box_iou, camera_matrix, projected_boxes, rotation_error
+from curvireg_torch.geometry.cameras import transform
+from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
+from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.mesh.mesh import as_mesh, extreme_points
+from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.registration import landmarks as landmarks_module
+from curvireg_torch.registration.detection import propose
+from curvireg_torch.registration.inputs import image_items
+from curvireg_torch.registration.landmarks import Landmarks, _pose
+from curvireg_torch.rendering import render_colour
+from curvireg_torch.synthetic import procedural_background
+
+SIZE = (360, 480)
+K = camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
+
+
+def carton(seed: int = 0) -> trimesh.Trimesh:
+    """A box with coloured bars and dots on every side, which are all different."""
+    random = np.random.default_rng(seed)
+    picture = np.full((384, 384, 3), 225, np.uint8)
+    for _ in range(900):
+        (x, y), (w, h) = random.integers(0, 384, 2), random.integers(3, 18, 2)
+        picture[y : y + h, x : x + w] = random.integers(0, 230, 3)
+    box = trimesh.creation.box((1.0, 0.7, 1.4))
+    corners = box.vertices[box.faces].reshape(-1, 3)
+    uv = np.zeros((len(corners), 2))
+    for face, normal in enumerate(box.face_normals):
+        axis = int(np.abs(normal).argmax())
+        side = 2 * axis + (normal[axis] > 0)
+        at = np.delete(corners[3 * face : 3 * face + 3], axis, axis=1) / 1.5 + 0.5  # in [0, 1]
+        uv[3 * face : 3 * face + 3] = (at + np.array([side % 3, side // 3])) / np.array([3, 2])
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), visual=visual, process=False)
+
+
+@cache
+def mesh() -> trimesh.Trimesh:
+    return as_mesh(carton())
+
+
+@cache
+def landmarks() -> Landmarks:
+    return Landmarks(ViewDescriber(mesh(), BankSettings()))
+
+
+def pose(azimuth: float, x: float, z: float) -> torch.Tensor:
+    R = rotation_from_viewpoint(azimuth, 25.0, 10.0).double()
+    return transform(R, torch.tensor([x, 0.1, z], dtype=torch.float64))
+
+
+def photograph(*poses: torch.Tensor, shown: trimesh.Trimesh | None = None) -> torch.Tensor:
+    """(3, H, W) meshes in dim light, in front of clutter."""
+    image = procedural_background(SIZE, torch.Generator().manual_seed(3))
+    for T in poses:
+        picture = render_colour(shown or mesh(), T[None], K[None], SIZE)[0]
+        image = torch.where(picture.amin(dim=0) < 0.999, 0.7 * picture + 0.05, image)
+    noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
+    return (image + 0.02 * noise).clamp(0, 1)
+
+
+def box_of(T: torch.Tensor) -> torch.Tensor:
+    return projected_boxes(extreme_points(mesh()), T[None], K)[0].float()
+
+
+@pytest.mark.parametrize("azimuth", [20.0, 130.0, 250.0])
+@pytest.mark.parametrize("with_box", [True, False])
+def test_pose_is_that_of_the_print(azimuth, with_box):
+    T = pose(azimuth, 0.4, 4.0)
+    best, *others = landmarks().poses(photograph(T), K, box_of(T) if with_box else None)
+    assert not others
+    assert best.count >= 15
+    assert float(rotation_error(best.T[:3, :3], T[:3, :3])) < 2.0
+    assert float((best.T - T)[:3, 3].norm()) < 0.02 * 4.0
+
+
+def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
+    """Features are those of a smaller copy, in px of the photograph."""
+    T = pose(20.0, 0.4, 4.0)
+    image = (255.0 * photograph(T)).round().to(torch.uint8)
+    monkeypatch.setattr(landmarks_module, "MAX_SIDE", 400)
+    (found,) = landmarks().poses(image, K)
+    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
+    assert float((found.T - T)[:3, 3].norm()) < 0.02 * 4.0
+
+
+def test_each_copy_has_a_pose():
+    there = [pose(20.0, -0.9, 4.5), pose(150.0, 0.9, 4.5)]
+    found = landmarks().poses(photograph(*there), K)
+    assert len(found) == 2
+    assert found[0].count >= found[1].count
+    errors = torch.stack([rotation_error(one.T[:3, :3], torch.stack(there)[:, :3, :3]) for one in found])
+    assert sorted(errors.argmin(dim=1).tolist()) == [0, 1]
+    assert float(errors.amin(dim=1).max()) < 3.0
+
+
+def test_nothing_is_found_where_the_print_is_not():
+    T = pose(20.0, 0.4, 4.0)
+    assert landmarks().poses(photograph(), K) == []
+    assert landmarks().poses(photograph(T, shown=as_mesh(carton(seed=1))), K, box_of(T)) == []
+    assert landmarks().poses(torch.full((1, 40, 40), 0.5), K) == []
+    assert landmarks().poses(torch.full((3, 40, 40), torch.nan), K) == []
+
+
+def test_a_pose_needs_enough_landmarks_at_different_places():
+    points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
+    camera = K.numpy()
+    seen = (points + np.array([0, 0, 6])) @ camera.T
+    uv = seen[:, :2] / seen[:, 2:]
+    assert _pose(points, uv, camera, 2.0).count == 12
+    assert _pose(points[:9], uv[:9], camera, 2.0) is None
+    twice = np.repeat(np.arange(8), 2)
+    assert _pose(points[twice], uv[twice], camera, 2.0) is None
+    assert _pose(points[[0] * 12], uv[[0] * 12], camera, 2.0) is None
+
+
+@cache
+def registrar() -> cr.Registrar:
+    """Of views from far away directions."""
+    return cr.Registrar(mesh(), views=cr.sample_views(azimuth_step=180, elevations=[-60]), mesh_is="exact")
+
+
+def test_registration_starts_from_landmarks_too(monkeypatch):
+    """No view of the bank is near the pose."""
+    T = pose(65.0, 0.4, 4.0)
+    image, box = photograph(T), box_of(T)
+    assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) < 1.0
+    monkeypatch.setattr(Landmarks, "poses", lambda *_: [])
+    assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) > 10.0
+
+
+def test_a_pose_outside_the_limits_is_no_start():
+    T, other = pose(65.0, 0.4, 4.0), pose(155.0, 0.4, 4.0)
+    limits = cr.PosePrior(rotation=other[:3, :3], within=40.0)
+    around = cr.Registrar(mesh(), views=cr.sample_views(azimuth_step=30, elevations=[25]), mesh_is="exact")
+    result = around([photograph(T)], box_of(T)[None], K, prior=limits)[0]
+    assert min(float(rotation_error(h.rotation, T[:3, :3])) for h in result.hypotheses) > 40.0
+
+
+def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmarks():
+    T = pose(65.0, 0.4, 4.0)
+    item = image_items([photograph(T)], box_of(T)[None], K)[0]
+    grey = cr.Registrar(trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0]))
+    poses, count = grey.landmark_poses(item)
+    assert len(poses) == len(count) == 0
+    poses, count = registrar().landmark_poses(replace(item, camera_matrix=None))
+    assert len(poses) == len(count) == 0
+
+
+def test_boxes_of_landmarks_are_the_first_proposals():
+    T = pose(65.0, 0.4, 4.0)
+    item = image_items([photograph(T)], None, K)[0]
+    proposals = propose(registrar(), item)
+    assert float(box_iou(proposals.boxes[:1], box_of(T)[None])) > 0.9
+    assert float(proposals.responses[0]) == landmarks().poses(item.image, K)[0].count
+    assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
