@@ -7,7 +7,8 @@ Input files are untrusted: a file beyond one of the limits below is refused with
 use no network, and open only the named file and, for meshes, files that it names in its folder.
 """
 
-from typing import Self
+from copy import copy
+from typing import Any, Self
 
 
 class _SubjectError(Exception):
@@ -22,7 +23,9 @@ class _SubjectError(Exception):
 
     def with_subject(self, subject: object) -> Self:
         """A copy about another subject."""
-        return type(self)(self.message, subject=subject)
+        other = copy(self)
+        other.subject = str(subject)
+        return other
 
 
 class CurviregError(_SubjectError):
@@ -65,7 +68,13 @@ class MissingFileError(CurviregError, FileNotFoundError):
 
 
 class LostObjectError(CurviregError, ValueError):
-    """The object is not found in a photograph without a box, or not near the pose that a refinement started from."""
+    """The object is not found in a photograph without a box, or not near the pose that a refinement started from.
+
+    Attributes:
+        detection: the :class:`.Detection` of the most likely place, with all proposals, in a photograph without a box.
+    """
+
+    detection: Any = None
 
 
 class OutputError(InvalidInputError, OSError):

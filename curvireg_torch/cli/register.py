@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 MAX_FAILURES = 10  # photographs of a list that could not be registered, of which the command prints the reason
 NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
+WEAK_CONTOURS = 0.35  # edge support below which contours hardly show
 
 STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
@@ -274,8 +275,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     confidence = "not calibrated" if document["confidence"] is None else f"{document['confidence']:.2f}"
     print(f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}")
     if not document["reliable"]:
-        advice = "check that the box is tight, and the mesh the object's, in its --unit and with its --up axis"
-        print(f"no reliable match: take the pose as a guess; {advice}")
+        print(f"no reliable match: take the pose as a guess; {_advice(document)}")
     _print_rivals(document)
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
@@ -312,6 +312,22 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
     words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
     none = f"none of them: {document['none']:.2f}"
     print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
+
+
+def _advice(document: Mapping[str, Any]) -> str:
+    """What to try after a registration that is not reliable, by its likely reason."""
+    support, mesh = document["edge_support"], "that the mesh is the object's, in its --unit and with its --up axis"
+    if document["warnings"]:
+        return "correct what the warning names"
+    if document["ambiguous"] is not None:
+        return "more than one pose fits"
+    if "distance" in document.get("prior", {}):
+        return f"check --distance, --camera, and {mesh}"
+    if "detection" in document:
+        return f"add --box, and check {mesh}"
+    if support is not None and support < WEAK_CONTOURS:
+        return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
+    return f"check that the box is tight, and {mesh}"
 
 
 @contextmanager

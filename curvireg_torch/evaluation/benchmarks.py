@@ -464,7 +464,7 @@ def detection_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
     """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
 
     Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
-    that failed has no proposals. Recalls are None if no box is annotated.
+    that failed has no proposals, unless the object was not found among them. Recalls are None if no box is annotated.
     """
     pairs = [(sample["box"], row) for sample, row in zip(samples, rows, strict=True)]
     ranks = [_rank(box, row) for box, row in pairs if bool(box.isfinite().all())]

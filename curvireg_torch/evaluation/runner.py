@@ -12,10 +12,10 @@ from typing import Any
 from tqdm import tqdm
 
 from ..data import read_photo
-from ..errors import BankError, CurviregError, InvalidInputError, MeshError, MissingFileError
+from ..errors import BankError, CurviregError, InvalidInputError, LostObjectError, MeshError, MissingFileError
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
-from ..registration.result import SCHEMA
+from ..registration.result import SCHEMA, places_document
 from ..utils.files import code_digest, file_digest, text_digest, write_file
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
@@ -125,7 +125,11 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     try:
         found = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
     except CurviregError as error:
-        return failed_row(error, seconds={"bank": bank_seconds, "register": time.perf_counter() - start})
+        seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
+        places: Row = {}
+        if isinstance(error, LostObjectError) and error.detection is not None:
+            places = {"detection": places_document(error.detection), "inputs": {"picture": photo.facts()}}
+        return failed_row(error, seconds=seconds, **places)
     renderer = registrar.of_model(found.model).describer.renderer
     write_file(picture, thumbnail(renderer, found.projection, found.image, found.box.tolist()))
     return {"status": "ok", "message": "", **found.document}

@@ -113,7 +113,8 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
         f"not found: at the most likely place, box {corners(best.detection.box.tolist())}, the object is seen with a "
     )
     error = LostObjectError(f"{message}probability of {best.confidence:.2f}; give a box", subject=subject)
-    return FailedRegistration(error, best.detection)
+    error.detection = best.detection
+    return FailedRegistration(error)
 
 
 def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
@@ -390,9 +391,9 @@ def _templates(backbone: Backbone, describer: ViewDescriber, bank: ViewBank, cou
             templates.append(unit / mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6))
     A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
     scale, shift = A[:, 0, 0, None], A[:, :2, 2]
-    corners = boxes * scale + shift.repeat(1, 2) + 0.5
+    outlines = boxes * scale + shift.repeat(1, 2) + 0.5
     away = torch.ones_like(z) if bank.settings.camera == "orthographic" else z
-    return _Templates(views.cpu(), weights, corners.float(), (away.to(scale) / scale[:, 0]).float())
+    return _Templates(views.cpu(), weights, outlines.float(), (away.to(scale) / scale[:, 0]).float())
 
 
 def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:

@@ -327,11 +327,9 @@ def _finite(deviations: Tensor) -> list[float | None]:
 
 @dataclass(frozen=True)
 class FailedRegistration:
-    """A photograph that could not be registered because of its ``error``, which access to a pose raises; where the
-    object was searched for and not found, with its likely places as ``detection``."""
+    """A photograph that could not be registered because of its ``error``, which access to a pose raises."""
 
     error: CurviregError
-    detection: Detection | None = None
 
     ok = False
 
@@ -384,13 +382,17 @@ def result_document(result: Registration, registrar: "Registrar", seconds: Mappi
 def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
     found = [(result, result.detection) for result in results if result.detection is not None]
-    first = found[0][1]
-    proposals = [{"box": b.tolist(), "response": float(r)} for b, r in zip(first.boxes, first.responses, strict=True)]
     instances = [
         {"box": at.box.tolist(), "score": at.score, "confidence": result.confidence, **result.hypotheses[0].pose_dict()}
         for result, at in found
     ]
-    return {"score": first.score, "proposals": proposals, "instances": instances}
+    return {**places_document(found[0][1]), "instances": instances}
+
+
+def places_document(detection: Detection) -> dict[str, Any]:
+    """Where the object may be: the first place's score, and all proposals."""
+    pairs = zip(detection.boxes, detection.responses, strict=True)
+    return {"score": detection.score, "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs]}
 
 
 def corners(box: Sequence[float]) -> str:

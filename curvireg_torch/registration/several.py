@@ -74,13 +74,16 @@ def register_views(
     if given:
         found = _registered(registrar, items, cameras, given)
     else:
+        lost: Found = {}
         for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
             item = items[i]
             if isinstance(result, Registration) and isinstance(item, ImageItem) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
                 found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
             elif isinstance(result, FailedRegistration):
-                found[i] = result.error
+                (lost if isinstance(result.error, LostObjectError) else found)[i] = result.error
+        if not any(isinstance(one, RigPhotograph) for one in found.values()):  # else the others tell where it is
+            found |= lost
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)

@@ -161,8 +161,9 @@ def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch,
     monkeypatch.setattr(detection_module, "_register_candidates", lambda *_: [one])
     result = registrar([found[0]])[0]
     assert result.ok != lost
-    assert torch.equal(result.detection.box, one.box)
     if lost:
+        assert torch.equal(result.error.detection.box, one.box)
+        assert len(result.error.with_subject("photo.jpg").detection.boxes) > 1
         assert isinstance(result.error, LostObjectError)
         place = corners(one.box.tolist())
         message = f"at the most likely place, box {place}, the object is seen with a probability of 0.10; give a box"
