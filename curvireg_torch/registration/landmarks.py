@@ -29,6 +29,7 @@ SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look ali
 NEIGHBOURS, MAX_DISTANCE_RATIO = 8, 0.8  # Nearest landmarks of a feature, and Lowe's ratio of those at two places
 # Distance in object radii, and factor between sizes, within which two matches predict the same object
 CLUSTER_DISTANCE, CLUSTER_FACTOR = 0.4, 1.5
+MAX_MATCHES = 2000  # Clearest matches of a photograph that are compared with one another
 MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
 MIN_LANDMARKS = 10  # that a pose must put where the photograph shows them
 REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
@@ -105,7 +106,9 @@ class Landmarks:
         """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first, in a photograph (C, H, W),
         floating in [0, 1] or uint8, with camera ``K`` (3, 3), or in a box (4,) of it."""
         found = self._photograph_features(image, box)
-        landmark, clear = self._nearest(found)
+        landmark, ratio = self._nearest(found)
+        clear = np.argsort(ratio, kind="stable")[:MAX_MATCHES]
+        clear = clear[ratio[clear] < MAX_DISTANCE_RATIO]
         found, landmark = found[clear], landmark[clear]
         scale = found.size * np.exp(1j * found.angle)
         centre = found.uv @ [1, 1j] + self._to_centre[landmark] * scale
@@ -151,12 +154,13 @@ class Landmarks:
         return _Features(uv, found.size / scale, found.angle, found.vectors)
 
     def _nearest(self, found: _Features) -> tuple[np.ndarray, np.ndarray]:
-        """(F,) the most similar landmark of each feature, and whether those at other places are clearly less so."""
+        """(F,) the most similar landmark of each feature, and its distance as a fraction of that to the most similar
+        one at another place."""
         known, points = torch.from_numpy(self._features.vectors), torch.from_numpy(self._points)
         count = min(NEIGHBOURS, len(points))
         if count < 2 or not len(found.uv):
-            return np.zeros(len(found.uv), dtype=int), np.zeros(len(found.uv), dtype=bool)
-        landmark, clear = [], []
+            return np.zeros(len(found.uv), dtype=int), np.ones(len(found.uv))
+        landmark, ratio = [], []
         for vectors in torch.from_numpy(found.vectors).split(FEATURES_AT_A_TIME):
             similarity, index = (vectors @ known.T).topk(count, dim=1)
             distance = (2.0 - 2.0 * similarity).clamp(min=0.0)
@@ -164,8 +168,8 @@ class Landmarks:
             apart[:, -1] |= ~apart.any(dim=1)
             other = distance.masked_fill(~apart, torch.inf).amin(dim=1)
             landmark.append(index[:, 0])
-            clear.append(distance[:, 0] < MAX_DISTANCE_RATIO**2 * other)
-        return torch.cat(landmark).numpy(), torch.cat(clear).numpy()
+            ratio.append((distance[:, 0] / other.clamp(min=1e-9)).sqrt())
+        return torch.cat(landmark).numpy(), torch.cat(ratio).numpy()
 
 
 def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> LandmarkPose | None:
