@@ -1,7 +1,7 @@
 """Detection: objects are found and registered in photographs that come without a box.
 
-A few representative views are compared with every position of the photograph; the best boxes are ranked as given boxes
-are, and the most certain ones are registered.
+A few representative views are compared with every position of the photograph, and landmarks with its features. The
+boxes that they propose are compared with all views, and the most probable ones are registered.
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,7 @@ TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
 SAME_OBJECT_OVERLAP = 0.5  # Intersection over union from which boxes show the same object
 MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be recognised
+MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
 FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
 MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
@@ -50,11 +51,10 @@ def detect(
     instances: int = 1,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
 ) -> list[Results]:
-    """Find and register objects in whole photographs, the most certain first.
+    """Find and register objects in whole photographs, the most probable pose first.
 
-    The detector's best proposals are ranked as given boxes are, which yields the probability that each shows the
-    object; the most certain are registered. The box around each pose is ranked too, and registered where it is more
-    certain.
+    All proposals are compared with the views of the bank, which yields the probability that each shows the object. The
+    most probable ones are registered, two at least, and the box around each pose too where it is more probable.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
@@ -177,9 +177,14 @@ class Found:
     response: float
     score: float
 
+    @property
+    def probability(self) -> float:
+        """That the object is there, and its pose right."""
+        return self.score * (1.0 if self.registration.confidence is None else self.registration.confidence)
+
 
 def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int) -> list[Found]:
-    """The most certain objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
+    """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
     none."""
     candidates, failed = [], None
     for box, response in zip(proposals.boxes, proposals.responses.tolist(), strict=True):
@@ -192,9 +197,9 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
     boxes, scores = torch.stack([c.box for c in candidates]), torch.tensor([c.score for c in candidates])
     found: list[Found] = []
     for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
-        if len(found) < instances:
+        if len(found) < max(instances, MIN_REGISTERED):
             _add(found, _refined(registrar, item, candidates[k].register(registrar, item)))
-    return sorted(found, key=lambda one: one.score, reverse=True)
+    return sorted(found, key=lambda one: one.probability, reverse=True)[:instances]
 
 
 def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:

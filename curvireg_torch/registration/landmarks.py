@@ -17,6 +17,7 @@ from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.threads import map_on_threads
+from .confidence import MIN_LANDMARKS
 from .least_squares import nearest_rigid
 
 VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and their side in px
@@ -31,7 +32,6 @@ NEIGHBOURS, MAX_DISTANCE_RATIO = 8, 0.8  # Nearest landmarks of a feature, and L
 CLUSTER_DISTANCE, CLUSTER_FACTOR = 0.4, 1.5
 MAX_MATCHES = 2000  # Clearest matches of a photograph that are compared with one another
 MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
-MIN_LANDMARKS = 10  # that a pose must put where the photograph shows them
 REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
 RANSAC_ROUNDS = 500
 FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks

@@ -1,6 +1,6 @@
 """Fit the constants of confidence, rivals, covariance, detection, refinement and following on generated photographs.
 
-    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--models instance] [--write]
+    python scripts/calibration/calibrate.py WORK --meshes FURNITURE [--count 400] [--models instance] [--write]
 
 FURNITURE is the folder of scripts/benchmark/meshes.py. The script renders the sets that WORK lacks (make.py: the
 object's own mesh, a similar one, a wrong one, and sequences), registers, refines, follows and detects their objects
@@ -22,7 +22,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-import trimesh
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import chi2
@@ -34,11 +33,8 @@ from tqdm import tqdm
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
-from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import RELIABLE, LogisticModel
-from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP, propose
-from curvireg_torch.registration.inputs import image_items
 from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
@@ -69,7 +65,7 @@ MODELS = {
     "category": ("similar",),
     "refinement": ("exact",),
     "tracking": ("sequences",),
-    "detection": ("shelves",),
+    "detection": ("exact",),
 }
 """Of each model: the sets that it is fitted on."""
 
@@ -165,15 +161,19 @@ def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
 
 
 def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
-    """Rows of the proposals of boxes, in a photograph of the object and in one of another shelf, which may lack it."""
+    """Rows of detections without a box, in a photograph of the object and in one without it."""
     for shown in (sample, other):
-        (item,) = image_items([shown["image"]], None, shown["camera_matrix"].double())
-        proposals = propose(registrar, item)
-        overlap = box_iou(proposals.boxes.double(), sample["box"][None].double())[:, 0]
-        for box, response, iou in zip(proposals.boxes, proposals.responses.tolist(), overlap.tolist(), strict=True):
-            similarity = float(registrar.matcher.similarity(registrar.matcher.query([item.image], box[None])))
-            features = {"response": response, "similarity": similarity}
-            yield {"features": features, "right": shown is sample and iou >= SAME_OBJECT_OVERLAP}
+        result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
+        if result.ok:
+            evidence = result.hypotheses[0].evidence
+            features = {"response": result.detection.response, "similarity": evidence["similarity"]}
+            x0, y0, x1, y1 = torch.cat([
+                torch.maximum(result.detection.box[:2], shown["box"][:2].double()),
+                torch.minimum(result.detection.box[2:], shown["box"][2:].double()),
+            ]).tolist()  # fmt: skip
+            area = (shown["box"][2:] - shown["box"][:2]).prod()
+            overlaps = max(0.0, x1 - x0) * max(0.0, y1 - y0) > 0.5 * float(area)
+            yield {"features": features, "right": shown is sample and overlaps}
 
 
 def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
@@ -183,10 +183,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     data = BOPDataset(folder)
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
-    mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
-    if kind == "detected" and samples[0]["obj_id"] % 2:  # half of the meshes without their print
-        mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    registrar = cr.Registrar(mesh, pipeline=pipeline)
+    registrar = cr.Registrar(cr.load_mesh(samples[0]["model_path"], unit="mm"), pipeline=pipeline)
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
     else:
@@ -201,9 +198,8 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
 
 
 def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
-    """Rows of a set, or of what a model in ``KINDS`` measures in its set; finished meshes are read from the file."""
-    model = next((name for name, measured in KINDS.items() if measured == kind), None)
-    folder, out = work / (kind if model is None else MODELS[model][0]), work / f"{kind}.jsonl"
+    """Rows of a set, or of refinements and detections in the set "exact"; finished meshes are read from the file."""
+    folder, out = work / (kind if kind in SETS else "exact"), work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
@@ -217,8 +213,7 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
         indices = [i for _, _, i in group]
         if key not in known:
-            scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
-            beside = next((i for scene, _, i in listed if scene not in scenes), 0)
+            beside = next((i for _, obj_id, i in listed if obj_id != key[0]), 0)
             tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
         found = pool.map(measure, [task for _, task in tasks])
@@ -313,7 +308,7 @@ def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str]) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py, for furniture")
+    parser.add_argument("--meshes", type=Path, required=True, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
     parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")

@@ -17,7 +17,8 @@ from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration import landmarks as landmarks_module
-from curvireg_torch.registration.detection import propose
+from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY
+from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
 from curvireg_torch.registration.landmarks import Landmarks, _pose
 from curvireg_torch.rendering import render_colour
@@ -116,15 +117,15 @@ def test_nothing_is_found_where_the_print_is_not():
 
 
 def test_a_pose_needs_enough_landmarks_at_different_places():
-    points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
+    points = np.random.default_rng(0).uniform(-1, 1, (14, 3))
     camera = K.numpy()
     seen = (points + np.array([0, 0, 6])) @ camera.T
     uv = seen[:, :2] / seen[:, 2:]
-    assert _pose(points, uv, camera, 2.0).count == 12
-    assert _pose(points[:9], uv[:9], camera, 2.0) is None
-    twice = np.repeat(np.arange(8), 2)
+    assert _pose(points, uv, camera, 2.0).count == 14
+    assert _pose(points[:11], uv[:11], camera, 2.0) is None
+    twice = np.repeat(np.arange(11), 2)
     assert _pose(points[twice], uv[twice], camera, 2.0) is None
-    assert _pose(points[[0] * 12], uv[[0] * 12], camera, 2.0) is None
+    assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0) is None
 
 
 @cache
@@ -166,4 +167,6 @@ def test_boxes_of_landmarks_are_the_first_proposals():
     proposals = propose(registrar(), item)
     assert float(box_iou(proposals.boxes[:1], box_of(T)[None])) > 0.9
     assert float(proposals.responses[0]) == landmarks().poses(item.image, K)[0].count
+    (found,) = detect(registrar(), [item.image], K)[0]
+    assert found.detection.score == LANDMARK_PROBABILITY
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
