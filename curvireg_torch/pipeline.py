@@ -31,7 +31,7 @@ from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
 
 __all__ = ["DEPTH_FIELDS", "FIELDS", "PRESETS", "BankSettings", "DetectionSettings", "Pipeline", "ViewPolicy"]
-VERSION = 1  # of the JSON form
+VERSION = 2  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
 
 FIELDS: dict[str, Callable[[], nn.Module]] = {

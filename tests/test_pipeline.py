@@ -67,7 +67,7 @@ def test_json_contains_every_setting():
     for part, names in {
         "views": ("directions", "theta_step", "azimuth_step", "distance"),
         "bank": ("image_size", "sigma", "margin", "bins"),
-        "detection": ("views", "proposals", "candidates"),
+        "detection": ("views", "proposals"),
     }.items():
         changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
     for term in base.terms:
@@ -96,7 +96,7 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ('{"version": 99}', "version 1"),
+        ('{"version": 99}', "version 2"),
         ('{"field": "nope"}', "field: expected one of 'learned'"),
         ('{"colour": 1}', "colour"),
         ('{"views": {"theta_step": 0}}', "theta_step"),

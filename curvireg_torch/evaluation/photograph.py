@@ -196,7 +196,7 @@ def register_entry(
         best, *others = together.hypotheses
         best = replace(best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix))
         results = [replace(together, hypotheses=(best, *others))]
-    elif entry.box is None and entry.mask is None:
+    elif entry.box is None and entry.mask is None and entry.instances > 1:
         results = detect(registrar, [photo.image], camera, instances=entry.instances, prior=entry.prior)[0]
     else:
         boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))

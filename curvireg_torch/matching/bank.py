@@ -23,7 +23,7 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import ViewDescriber, hog_layer
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 6
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 7
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 import trimesh
 
-from ..errors import BankError
+from ..errors import BankError, OutputError
 from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
@@ -117,8 +117,11 @@ def cached_bank(
     try:
         bank.save(path)
         _trim(folder, keep=path)
-    except OSError as error:  # not written, or an old bank not removed
-        warning = f"the bank is not cached, or the cache exceeds its limit: {error}, by CURVIREG_CACHE=FOLDER"
+    except OutputError as error:
+        warning = f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
+        warnings.warn(warning, stacklevel=2)
+    except OSError as error:  # files may be added to the folder, but not removed
+        warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
         warnings.warn(warning, stacklevel=2)
     return bank
 

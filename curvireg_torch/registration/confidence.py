@@ -130,18 +130,19 @@ def tracking_confidence(features: Features) -> float:
     return model({name: features[name] for name in model.weights})
 
 
-def detection_probability(response: float, similarity: float) -> float:
+def detection_probability(response: float, similarity: float, *, by_landmarks: bool = False) -> float:
     """Probability that a photograph shows the object in a box.
 
     Args:
-        response: the detector's, of the box; from ``MIN_LANDMARKS`` on it is the number of landmarks that agree.
+        response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
+        by_landmarks: whether landmarks led to the box.
 
     Example:
         >>> detection_probability(8.0, 0.9) > detection_probability(4.0, 0.6)
         True
     """
-    if response >= MIN_LANDMARKS:
+    if by_landmarks:
         return LANDMARK_PROBABILITY
     return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 

@@ -96,10 +96,14 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, **limits)
     poses, count = registrar.landmark_poses(item)
+    if item.prior is not None:
+        kept = Limits(item, registrar.bank).keeps(poses).nonzero()[:, 0]
+        poses, count = poses[kept], count[kept]
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
     pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)
-    proposals = Proposals(*(torch.cat(pair) for pair in pairs))
+    boxes, responses, views = (torch.cat(pair) for pair in pairs)
+    proposals = Proposals(boxes, responses, views, by_landmarks=int(visible.sum()))
     if not len(proposals.boxes):
         raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
     return proposals
@@ -134,13 +138,16 @@ class Proposals:
 
     Attributes:
         boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
-        responses: (P,) similarity, in standard deviations above the view's mean over the photograph.
+        responses: (P,) similarity, in standard deviations above the view's mean over the photograph; of boxes that
+            landmarks led to, the number of these.
         views: (P,) int64 view of the bank.
+        by_landmarks: how many of the boxes landmarks led to, the first ones.
     """
 
     boxes: Tensor
     responses: Tensor
     views: Tensor
+    by_landmarks: int = 0
 
 
 @dataclass(frozen=True)
@@ -150,31 +157,37 @@ class Candidate:
 
     box: Tensor
     response: float
+    by_landmarks: bool
     query: QueryFeatures
     score: float
 
     @classmethod
-    def compared(cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float) -> "Candidate":
+    def compared(
+        cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float, *, by_landmarks: bool
+    ) -> "Candidate":
         """Compare a box (4,) with all views."""
         query = registrar.matcher.query([item.image], box[None].float())
         allowed = None
         if item.prior is not None:
             allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
         similarity = float(registrar.matcher.similarity(query, allowed))
-        return cls(box, response, query, detection_probability(response, similarity))
+        score = detection_probability(response, similarity, by_landmarks=by_landmarks)
+        return cls(box, response, by_landmarks, query, score)
 
     def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
         result = registrar.register(replace(item, box=self.box.float()), self.query)
-        return Found(result, projected_box(registrar.describer, result.projection), self.response, self.score)
+        box = projected_box(registrar.describer, result.projection)
+        return Found(result, box, self.response, self.by_landmarks, self.score)
 
 
 @dataclass(frozen=True)
 class Found:
-    """A registration, the ``box`` (4,) around its pose, and ``response`` and ``score`` of the box that led to it."""
+    """A registration, the ``box`` (4,) around its pose, and what is known of the box that led to it."""
 
     registration: Registration
     box: Tensor
     response: float
+    by_landmarks: bool
     score: float
 
     @property
@@ -187,9 +200,10 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
     """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
     none."""
     candidates, failed = [], None
-    for box, response in zip(proposals.boxes, proposals.responses.tolist(), strict=True):
+    for k, (box, response) in enumerate(zip(proposals.boxes, proposals.responses.tolist(), strict=True)):
+        by_landmarks = k < proposals.by_landmarks
         try:
-            candidates.append(Candidate.compared(registrar, item, box, response))
+            candidates.append(Candidate.compared(registrar, item, box, response, by_landmarks=by_landmarks))
         except CurviregError as error:  # such as limits on the pose that leave no view here
             failed = failed or error
     if not candidates and failed is not None:
@@ -205,7 +219,8 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
 def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
-        candidate = Candidate.compared(registrar, item, found.box, found.response)
+        known = found.box, found.response
+        candidate = Candidate.compared(registrar, item, *known, by_landmarks=found.by_landmarks)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
         return replace(found, score=0.0)
     return found if candidate.score <= found.score else candidate.register(registrar, item)

@@ -123,10 +123,12 @@ class Landmarks:
             cluster = near[votes.argmax()] & left
             size = float(np.median(radius[cluster]))
             points, uv = self._points[landmark[cluster]], found.uv[cluster]
-            pose = _pose(points, uv, K.double().cpu().numpy(), REPROJECTION_ERROR * size)
+            pose = _pose(points - self._centre, uv, K.double().cpu().numpy(), REPROJECTION_ERROR * size)
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
-                poses.append(pose)
+                T = pose.T.clone()
+                T[:3, 3] -= T[:3, :3] @ torch.from_numpy(self._centre)
+                poses.append(LandmarkPose(T, pose.count))
                 left &= np.abs(centre - centre[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
@@ -139,16 +141,17 @@ class Landmarks:
             low, high = (box[:2] - margin).floor().int().tolist(), (box[2:] + margin).ceil().int().tolist()
             x0, y0, x1, y1 = max(low[0], 0), max(low[1], 0), min(high[0] + 1, W), min(high[1] + 1, H)
         crop = image[:, y0:y1, x0:x1].detach().cpu()
-        crop = crop.float() / 255.0 if crop.dtype == torch.uint8 else crop.float()
-        if not bool(crop.isfinite().all()):
-            crop = crop.nan_to_num(0.0, 0.0, 0.0)
-        longer = max(crop.shape[-2:])
+        longer, unit = max(crop.shape[-2:]), 1.0 if crop.is_floating_point() else 1.0 / 255.0
         scale = min(MAX_SIDE / longer, 1.0) if box is None else CROP_SIDE / longer
-        if scale != 1.0:
-            size = [max(1, round(scale * side)) for side in crop.shape[-2:]]
-            scale = size[0] / crop.shape[-2] if crop.shape[-2] >= crop.shape[-1] else size[1] / crop.shape[-1]
-            crop = F.interpolate(crop[None], size, mode="bicubic", align_corners=False, antialias=scale < 1.0)[0]
-            crop = crop.clamp(0.0, 1.0)
+        size = [max(1, round(scale * side)) for side in crop.shape[-2:]]
+        scale = max(size) / longer
+        grey = torch.zeros(size)
+        for channel in crop:  # one at a time to save memory: photographs are large
+            one = channel[None, None].float()
+            if scale != 1.0:
+                one = F.interpolate(one, size, mode="bicubic", align_corners=False, antialias=scale < 1.0)
+            grey += one[0, 0] * (unit / len(crop))
+        crop = grey.nan_to_num(0.0, 0.0, 0.0).clamp(0.0, 1.0)[None]
         found = _Features.of(crop)
         uv = (found.uv + 0.5) / scale - 0.5 + [x0, y0]
         return _Features(uv, found.size / scale, found.angle, found.vectors)

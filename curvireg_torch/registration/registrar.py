@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -239,10 +239,19 @@ class Registrar:
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:
         """Register photographs of one object together, see :func:`curvireg_torch.registration.register_views`."""
-        result = register_views(self, images, boxes, camera_matrices, T_cam_from_world)
+        given = images, boxes, camera_matrices, T_cam_from_world
+        result: Registration | FailedRegistration
+        try:
+            result = register_views(self, *given)
+        except CurviregError as error:
+            if not self.others:
+                raise
+            result = FailedRegistration(error)
         for model, other in enumerate(self.others, 1):
-            rival = other.register_views(images, boxes, camera_matrices, T_cam_from_world)
-            result = cast(Registration, _better(result, rival, model))
+            with suppress(CurviregError):  # that of the first mesh is raised if all fail
+                result = _better(result, other.register_views(*given), model)
+        if isinstance(result, FailedRegistration):
+            raise result.error
         return result
 
     def of_model(self, model: int) -> "Registrar":

@@ -140,7 +140,8 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
     if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
         confidence = probabilities[0]
         if len(rig.photographs) > 1:
-            scores = [1.0 if p.result.detection is None else p.result.detection.score for p in rig.photographs]
+            found_in = [p.result.detection for p in every.photographs]
+            scores = [detection.score for detection in found_in if detection is not None] or [1.0]
             confidence = max(scores) * registration_confidence(features, exact=rig.exact)
         odds = confidence / max(1.0 - confidence, 1e-9)
         for p in every.photographs:  # those that were left out, and are confident of another pose

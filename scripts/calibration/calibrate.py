@@ -32,9 +32,12 @@ from tqdm import tqdm
 
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
-from curvireg_torch.registration.confidence import RELIABLE, LogisticModel
+from curvireg_torch.registration.confidence import MIN_LANDMARKS, RELIABLE, LogisticModel
+from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
 from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
@@ -164,16 +167,13 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
     """Rows of detections without a box, in a photograph of the object and in one without it."""
     for shown in (sample, other):
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
-        if result.ok:
-            evidence = result.hypotheses[0].evidence
-            features = {"response": result.detection.response, "similarity": evidence["similarity"]}
-            x0, y0, x1, y1 = torch.cat([
-                torch.maximum(result.detection.box[:2], shown["box"][:2].double()),
-                torch.minimum(result.detection.box[2:], shown["box"][2:].double()),
-            ]).tolist()  # fmt: skip
-            area = (shown["box"][2:] - shown["box"][:2]).prod()
-            overlaps = max(0.0, x1 - x0) * max(0.0, y1 - y0) > 0.5 * float(area)
-            yield {"features": features, "right": shown is sample and overlaps}
+        lost = not result.ok and isinstance(result.error, LostObjectError)
+        found = result.detection if result.ok else result.error.detection if lost else None
+        if found is not None and found.response < MIN_LANDMARKS:
+            query = registrar.matcher.query([shown["image"]], found.box[None].float())
+            features = {"response": found.response, "similarity": float(registrar.matcher.similarity(query))}
+            overlap = float(box_iou(found.box[None], shown["box"][None].double()))
+            yield {"features": features, "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP}
 
 
 def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
@@ -213,7 +213,8 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
         indices = [i for _, _, i in group]
         if key not in known:
-            beside = next((i for _, obj_id, i in listed if obj_id != key[0]), 0)
+            scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
+            beside = next((i for scene, _, i in listed if scene not in scenes), 0)
             tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
         found = pool.map(measure, [task for _, task in tasks])

@@ -27,9 +27,7 @@ def bank() -> ViewBank:
     """The default pipeline; the appearance of views is described on demand, as in large banks."""
     views = sample_views(azimuth_step=30, elevations=[0, 30, 60])
     pipeline = Pipeline().with_term("appearance", exhaustive_limit=10, top=8)
-    pipeline = replace(
-        pipeline, hypotheses=2, detection=replace(pipeline.detection, views=12, proposals=4, candidates=2)
-    )
+    pipeline = replace(pipeline, hypotheses=2, detection=replace(pipeline.detection, views=12, proposals=4))
     return ViewBank.build(example_mesh(), views, pipeline=pipeline, progress=False)
 
 

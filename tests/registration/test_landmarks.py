@@ -128,6 +128,15 @@ def test_a_pose_needs_enough_landmarks_at_different_places():
     assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0) is None
 
 
+def test_origin_of_the_mesh_may_be_far_away():
+    """Behind the camera, and a thousand object radii off."""
+    T, away = pose(20.0, 0.4, 4.0), torch.tensor([0.0, 0.0, 1000.0], dtype=torch.float64)
+    moved = as_mesh(carton().apply_translation(away.numpy()))
+    (found,) = Landmarks(ViewDescriber(moved, BankSettings())).poses(photograph(T), K)
+    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 2.0
+    assert float((found.T[:3, :3] @ away + found.T[:3, 3] - T[:3, 3]).norm()) < 0.02 * 4.0
+
+
 @cache
 def registrar() -> cr.Registrar:
     """Of views from far away directions."""
@@ -169,4 +178,7 @@ def test_boxes_of_landmarks_are_the_first_proposals():
     assert float(proposals.responses[0]) == landmarks().poses(item.image, K)[0].count
     (found,) = detect(registrar(), [item.image], K)[0]
     assert found.detection.score == LANDMARK_PROBABILITY
+    near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
+    assert proposals.by_landmarks == 1
+    assert propose(registrar(), near).by_landmarks == 0
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1

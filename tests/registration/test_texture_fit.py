@@ -128,7 +128,7 @@ def registrar():
 
 def test_label_does_not_pull_a_pose_out_of_its_limits(registrar):
     """They are 10 degrees away from the true rotation."""
-    prior = cr.PosePrior(rotation=turned_can(14.0)[0, :3, :3], within=4.0)
+    prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     free, limited = (registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior))
     assert float(rotation_error(free.rotation, R)) < 1.0
