@@ -364,7 +364,7 @@ class Registrar:
             query: the same, cropped and described by the matcher.
         """
         work = self._rank(item, query)
-        starts, outside = self._starts(work)
+        starts, outside, by_landmarks = self._starts(work)
         poses = starts
         if self.pipeline.search:
             self.report_progress("search")
@@ -382,6 +382,10 @@ class Registrar:
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
+        # Unlike a view, a pose of landmarks starts near the one that it merged with: it is no rival.
+        other = (distinct | ~by_landmarks).nonzero()[:, 0]
+        starts, poses, features = starts[other], poses[other], features[other]
+        distinct, outside = distinct[other], outside[other]
         keep = self._kept(work, poses, distinct, outside)
         if not bool(keep.all()):
             # Poses that merged, or whose fit is not trusted, go back to the views that they started from.
@@ -405,10 +409,11 @@ class Registrar:
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
         return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries, crops)
 
-    def _starts(self, work: _Work) -> tuple[Poses, Tensor]:
-        """Poses of the most promising distinct views, and (H,) bool: the last one may lie outside the limits.
+    def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
+        """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
+        most, and which landmarks agree on, in place of the views near it.
 
-        That is the best view outside; it is never reported, and tells whether the limits are wrong.
+        That outside is the best view there; it is never reported, and tells whether the limits are wrong.
         """
         count = max(MIN_REFINED, self.pipeline.hypotheses)
         screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
@@ -418,19 +423,23 @@ class Registrar:
             poses = work.limits.moved_inside(poses)
         if work.crops is not None and len(poses) > count:
             poses = self._screened(work.crops, poses, count)
+        by_landmarks = torch.zeros(len(poses), dtype=torch.bool)
         if work.crops is not None and work.exact:
             found, _ = self.landmark_poses(work.item, work.item.box)
-            kept = torch.arange(len(found)) if work.limits is None else work.limits.keeps(found).nonzero()[:, 0]
-            poses = Poses.cat([poses, found[kept[:1]]])
-        outside = torch.zeros(len(poses), dtype=torch.bool)
+            found = found if work.limits is None else found[work.limits.keeps(found)]
+            if len(found):
+                poses = poses[~are_near(poses.rotation, found.rotation[0], work.symmetries)]
+                poses = Poses.cat([poses, found[torch.tensor([0])]])
+                by_landmarks = torch.arange(len(poses)) == len(poses) - 1
+        outside = torch.zeros_like(by_landmarks)
         if work.limits is None:
-            return poses, outside
+            return poses, outside, by_landmarks
         assert work.ranking.outside is not None
         view = work.ranking.outside.cpu()
         if int(view) < 0:
-            return poses, outside
+            return poses, outside, by_landmarks
         other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
-        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True)
+        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(by_landmarks, (0, 1))
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
