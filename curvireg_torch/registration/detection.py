@@ -152,18 +152,18 @@ class Proposals:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A described box (4,) of a photograph, with the detector's ``response``, and as ``score`` the probability that it
-    shows the object."""
+    """A described box (4,) of a photograph, with its ``response`` and ``rival`` (:func:`detection_probability`), and as
+    ``score`` the probability that it shows the object."""
 
     box: Tensor
     response: float
-    by_landmarks: bool
+    rival: float | None
     query: QueryFeatures
     score: float
 
     @classmethod
     def compared(
-        cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float, *, by_landmarks: bool
+        cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float, rival: float | None
     ) -> "Candidate":
         """Compare a box (4,) with all views."""
         query = registrar.matcher.query([item.image], box[None].float())
@@ -171,13 +171,13 @@ class Candidate:
         if item.prior is not None:
             allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
         similarity = float(registrar.matcher.similarity(query, allowed))
-        score = detection_probability(response, similarity, by_landmarks=by_landmarks)
-        return cls(box, response, by_landmarks, query, score)
+        score = detection_probability(response, similarity, rival=rival)
+        return cls(box, response, rival, query, score)
 
     def register(self, registrar: "Registrar", item: ImageItem) -> "Found":
         result = registrar.register(replace(item, box=self.box.float()), self.query)
         box = projected_box(registrar.describer, result.projection)
-        return Found(result, box, self.response, self.by_landmarks, self.score)
+        return Found(result, box, self.response, self.rival, self.score)
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Found:
     registration: Registration
     box: Tensor
     response: float
-    by_landmarks: bool
+    rival: float | None
     score: float
 
     @property
@@ -201,9 +201,10 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
     none."""
     candidates, failed = [], None
     for k, (box, response) in enumerate(zip(proposals.boxes, proposals.responses.tolist(), strict=True)):
-        by_landmarks = k < proposals.by_landmarks
+        counts = proposals.responses[: proposals.by_landmarks].tolist()
+        rival = max([0.0, *counts[:k], *counts[k + 1 :]]) if k < len(counts) else None
         try:
-            candidates.append(Candidate.compared(registrar, item, box, response, by_landmarks=by_landmarks))
+            candidates.append(Candidate.compared(registrar, item, box, response, rival))
         except CurviregError as error:  # such as limits on the pose that leave no view here
             failed = failed or error
     if not candidates and failed is not None:
@@ -219,8 +220,7 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
 def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
-        known = found.box, found.response
-        candidate = Candidate.compared(registrar, item, *known, by_landmarks=found.by_landmarks)
+        candidate = Candidate.compared(registrar, item, found.box, found.response, found.rival)
     except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
         return replace(found, score=0.0)
     return found if candidate.score <= found.score else candidate.register(registrar, item)

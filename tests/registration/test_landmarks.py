@@ -17,7 +17,7 @@ from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration import landmarks as landmarks_module
-from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY
+from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
 from curvireg_torch.registration.landmarks import Landmarks, _pose
@@ -168,6 +168,13 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmar
     assert len(poses) == len(count) == 0
     poses, count = registrar().landmark_poses(replace(item, camera_matrix=None))
     assert len(poses) == len(count) == 0
+
+
+def test_a_second_place_with_landmarks_makes_the_first_less_certain():
+    """As two objects with similar prints do."""
+    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
+    assert alone == LANDMARK_PROBABILITY
+    assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
 
 
 def test_boxes_of_landmarks_are_the_first_proposals():
