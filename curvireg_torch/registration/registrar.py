@@ -275,8 +275,10 @@ class Registrar:
 
     def landmark_poses(self, item: ImageItem, box: Tensor | None = None) -> tuple[Poses, Tensor]:
         """Poses on which landmarks of the mesh's print agree, as promising as the best view, and how many, the largest
-        number first, see :class:`.Landmarks`; none without colours or a camera matrix. ``box`` (4,) is where
-        they are looked for."""
+        number first; none without colours or a camera matrix. ``box`` (4,) is where they are looked for.
+
+        :meta private:
+        """
         found: list[LandmarkPose] = []
         if self.describer.draws_colours and item.camera_matrix is not None:
             with _SHAPE_LOCK:  # photographs share them
