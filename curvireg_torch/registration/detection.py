@@ -71,7 +71,6 @@ def detect(
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-
     _ = registrar.detector  # created once, before threads use it
 
     def detect_in(item: ImageItem, index: int) -> Results:
@@ -113,10 +112,9 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
     """The answer where no place is convincing: the most likely one, without its pose."""
     best = max(found, key=lambda one: one.confidence or 0.0)
     assert best.detection is not None
-    message = (
-        f"not found: at the most likely place, box {corners(best.detection.box.tolist())}, the object is seen with a "
-    )
-    error = LostObjectError(f"{message}probability of {best.confidence:.2f}; give a box", subject=subject)
+    place = f"at the most likely place, box {corners(best.detection.box.tolist())}"
+    seen = f"the object is seen with a probability of {best.confidence:.2f}"
+    error = LostObjectError(f"not found: {place}, {seen}; give a box", subject=subject)
     error.detection = best.detection
     return FailedRegistration(error)
 
@@ -200,8 +198,8 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
     """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
     none."""
     candidates, failed = [], None
+    counts = proposals.responses[: proposals.by_landmarks].tolist()
     for k, (box, response) in enumerate(zip(proposals.boxes, proposals.responses.tolist(), strict=True)):
-        counts = proposals.responses[: proposals.by_landmarks].tolist()
         rival = max([0.0, *counts[:k], *counts[k + 1 :]]) if k < len(counts) else None
         try:
             candidates.append(Candidate.compared(registrar, item, box, response, rival))

@@ -75,7 +75,7 @@ class ObjectMask:
     """Probabilities (B, 1, s, s) that pixels of image crops belong to the object."""
 
     def __init__(self, probability: Tensor) -> None:
-        self._probability = probability.detach().cpu().float()
+        self.probability = probability.detach().cpu().float()
 
     def weights(self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int) -> Tensor:
         """How well edges at offsets along the normals of contour points agree with the mask.
@@ -93,9 +93,7 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = torch.cat([offsets - aside, offsets + aside])
-        probability = _sampled_lines(
-            self._probability, uv, points.normals, at, image_index, size=size, padding="border"
-        )
+        probability = _sampled_lines(self.probability, uv, points.normals, at, image_index, size=size, padding="border")
         inside, outside = probability[:, 0].chunk(2, dim=-1)
         outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
@@ -146,7 +144,7 @@ class EdgeCrops:
 
     def __init__(self, crops: Tensor, inside: Tensor, transforms: Tensor, mask: Tensor | None = None) -> None:
         self.crops, self.transforms = crops, transforms.double()
-        self._inside, self._probability = inside, mask
+        self._inside = inside
         self.mask = None if mask is None else ObjectMask(mask)
         self._fields: dict[int, EdgeField] = {}
 
@@ -164,7 +162,7 @@ class EdgeCrops:
         crops, inside, transforms = (
             torch.cat([getattr(part, name) for part in parts]) for name in ("crops", "_inside", "transforms")
         )
-        masks = [part._probability for part in parts if part._probability is not None]
+        masks = [part.mask.probability for part in parts if part.mask is not None]
         return cls(crops, inside, transforms, torch.cat(masks) if masks else None)
 
     def edges(self, factor: int) -> EdgeField:

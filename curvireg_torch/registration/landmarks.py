@@ -49,7 +49,7 @@ class _Features:
 
     @staticmethod
     def of(picture: Tensor, mask: np.ndarray | None = None) -> "_Features":
-        """RootSIFT features of a picture (C, H, W) in [0, 1]; no place has two."""
+        """RootSIFT features of a picture (C, H, W) in [0, 1]; a place has one for each of its main orientations."""
         grey = (255.0 * picture.mean(dim=0)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
         points, vectors = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST).detectAndCompute(grey, mask)
         if vectors is None or not len(points):
@@ -126,9 +126,8 @@ class Landmarks:
             pose = _pose(points - self._centre, uv, K.double().cpu().numpy(), REPROJECTION_ERROR * size)
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
-                T = pose.T.clone()
-                T[:3, 3] -= T[:3, :3] @ torch.from_numpy(self._centre)
-                poses.append(LandmarkPose(T, pose.count))
+                R, position = pose.T[:3, :3], pose.T[:3, 3]
+                poses.append(LandmarkPose(transform(R, position - R @ torch.from_numpy(self._centre)), pose.count))
                 left &= np.abs(centre - centre[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
@@ -183,9 +182,9 @@ def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> La
         )
     except cv2.error:  # points in one place
         return None
-    # Several features at one place are one landmark.
     if not found or inliers is None:
         return None
+    # Several features at one place are one landmark.
     count = len(np.unique((uv[inliers[:, 0]] / max(error, 1e-9)).round(), axis=0))
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])

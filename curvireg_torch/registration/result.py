@@ -115,7 +115,7 @@ class Detection:
     Attributes:
         box: (4,) float64 x0, y0, x1, y1 in px, around the projected mesh.
         score: probability that the photograph shows the object there.
-        response: the detector's, of the proposal that led here, see :class:`.Proposals`.
+        response: of the proposal that led here, see :class:`.Proposals`.
         boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``responses`` (P,).
     """
 
