@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
-from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError
+from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -326,3 +326,22 @@ def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, 
 def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
     item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
     assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
+
+
+def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
+    """Photographs of a rig, registered to two meshes; if both are absent, the error is that of the first."""
+    both, found = Registrar([truck_bank(), truck_bank()]), truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
+    absent = {both}
+
+    def register(registrar, *_):
+        if registrar in absent:
+            raise LostObjectError("first" if registrar is both else "second")
+        return found
+
+    monkeypatch.setattr(registrar_module, "register_views", register)
+    assert both.register_views([IMAGE], None, CAMERA, None).model == 1
+    absent.add(both.others[0])
+    with pytest.raises(LostObjectError, match="first"):
+        both.register_views([IMAGE], None, CAMERA, None)
+    absent.remove(both)
+    assert both.register_views([IMAGE], None, CAMERA, None).model == 0
