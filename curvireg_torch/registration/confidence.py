@@ -50,7 +50,7 @@ on generated shelves 28 of 29. It is less where other objects have a similar pri
 RELIABLE = 0.9
 """Confidence from which a registration is called reliable."""
 
-CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration")
+CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
 """Features of the confidence, see :func:`confidence_features`."""
 
 MAX_MARGIN = 5.0
@@ -173,18 +173,19 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
 def confidence_features(evidence: Tensor, scores: Tensor, share: float | None) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support: of the best hypothesis. margin: its score minus the largest of its rivals, clamped to
-    +-5; None without rivals.
+    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest of its rivals,
+    clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, 4) :data:`POSE_FEATURES` of the hypotheses, the best first.
+        evidence: (H, 5) :data:`POSE_FEATURES` of the hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
     """
-    _, similarity, edge_support, _ = evidence[0].tolist()
+    _, similarity, edge_support, _, landmarks = evidence[0].tolist()
     rivals = scores[1:]
     margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
-    return {"similarity": similarity, "margin": margin, "edge_support": edge_support, "concentration": share}
+    values = similarity, margin, edge_support, share, landmarks
+    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
 
 
 def hypothesis_probabilities(confidence: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:

@@ -20,7 +20,7 @@ from ..geometry.pose_prior import PosePrior, check_distance
 from ..matching import ViewBank, ViewDescriber, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
-from .confidence import detection_probability
+from .confidence import MIN_LANDMARKS, detection_probability
 from .inputs import ImageItem, check_crop, image_items
 from .poses import projected_box
 from .priors import Limits
@@ -94,10 +94,11 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
         limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, **limits)
-    poses, count = registrar.landmark_poses(item)
+    poses, count = registrar.landmark_poses(item, registrar.landmark_matches(item))
+    kept = count >= MIN_LANDMARKS
     if item.prior is not None:
-        kept = Limits(item, registrar.bank).keeps(poses).nonzero()[:, 0]
-        poses, count = poses[kept], count[kept]
+        kept = kept & Limits(item, registrar.bank).keeps(poses)
+    poses, count = poses[kept], count[kept]
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
     pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)

@@ -17,7 +17,6 @@ from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.threads import map_on_threads
-from .confidence import MIN_LANDMARKS
 from .least_squares import nearest_rigid
 
 VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and their side in px
@@ -33,7 +32,9 @@ CLUSTER_DISTANCE, CLUSTER_FACTOR = 0.4, 1.5
 MAX_MATCHES = 2000  # Clearest matches of a photograph that are compared with one another
 MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
 REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
+AGREEMENT = 0.06  # The same of poses that were fitted to edges as well
 RANSAC_ROUNDS = 500
+MIN_AGREEING = 8  # Landmarks on which a pose must agree: on generated shelves 48 of 50 such poses are right
 FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks
 
 
@@ -70,6 +71,53 @@ class LandmarkPose:
     count: int
 
 
+@dataclass(frozen=True)
+class LandmarkMatches:
+    """Features of a photograph that resemble landmarks of a mesh with a ``centre`` (3,) and a ``radius``: pixels ``uv``
+    (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has the object: ``centres`` (M,) in px, x + iy, and
+    ``radii`` (M,) in px. ``K`` (3, 3) is the camera."""
+
+    uv: np.ndarray
+    points: np.ndarray
+    centres: np.ndarray
+    radii: np.ndarray
+    K: np.ndarray
+    centre: np.ndarray
+    radius: float
+
+    def poses(self) -> list[LandmarkPose]:
+        """Poses on which at least ``MIN_AGREEING`` agree, the largest number first."""
+        near = np.abs(self.centres[:, None] - self.centres) < CLUSTER_DISTANCE * np.sqrt(
+            self.radii[:, None] * self.radii
+        )
+        near &= np.abs(np.log(self.radii[:, None] / self.radii)) < math.log(CLUSTER_FACTOR)
+        poses, left = [], np.ones(len(self.uv), dtype=bool)
+        for _ in range(MAX_CLUSTERS):
+            votes = (near & left).sum(axis=1) * left
+            if not len(votes) or votes.max() < MIN_AGREEING:
+                break
+            cluster = near[votes.argmax()] & left
+            size = float(np.median(self.radii[cluster]))
+            pose = _pose(self.points[cluster] - self.centre, self.uv[cluster], self.K, REPROJECTION_ERROR * size)
+            left &= ~cluster
+            if pose is not None:  # what is left at its place has no other one
+                R, position = pose.T[:3, :3], pose.T[:3, 3]
+                poses.append(LandmarkPose(transform(R, position - R @ torch.from_numpy(self.centre)), pose.count))
+                left &= np.abs(self.centres - self.centres[cluster].mean()) > size
+        return sorted(poses, key=lambda pose: -pose.count)
+
+    def agreeing(self, T: Tensor) -> Tensor:
+        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4)."""
+        counts = []
+        for pose in T.double().cpu().numpy():
+            cam = self.points @ pose[:3, :3].T + pose[:3, 3]
+            z = float(pose[2, :3] @ self.centre + pose[2, 3])
+            error = AGREEMENT * self.K[0, 0] * self.radius / max(z, 1e-9)
+            uv = cam @ self.K[:2].T / np.maximum(cam[:, 2:], 1e-9)
+            counts.append(_places(self.uv[np.linalg.norm(uv - self.uv, axis=1) < error], error))
+        return torch.tensor(counts, dtype=torch.float64)
+
+
 class Landmarks:
     """Features of the views of a mesh with colours, with their places on its surface."""
 
@@ -102,34 +150,18 @@ class Landmarks:
         self._to_centre = (middle * (1 + 1j) - self._features.uv @ [1, 1j]) * turn
         self._radii = focal / VIEW_DISTANCE / self._features.size
 
-    def poses(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> list[LandmarkPose]:
-        """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first, in a photograph (C, H, W),
-        floating in [0, 1] or uint8, with camera ``K`` (3, 3), or in a box (4,) of it."""
+    def matches(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> LandmarkMatches:
+        """Compare a photograph (C, H, W), floating in [0, 1] or uint8, with camera ``K`` (3, 3), or a box (4,) of it,
+        with the landmarks."""
         found = self._photograph_features(image, box)
         landmark, ratio = self._nearest(found)
         clear = np.argsort(ratio, kind="stable")[:MAX_MATCHES]
         clear = clear[ratio[clear] < MAX_DISTANCE_RATIO]
         found, landmark = found[clear], landmark[clear]
-        scale = found.size * np.exp(1j * found.angle)
-        centre = found.uv @ [1, 1j] + self._to_centre[landmark] * scale
-        radius = self._radii[landmark] * found.size
-        near = np.abs(centre[:, None] - centre) < CLUSTER_DISTANCE * np.sqrt(radius[:, None] * radius)
-        near &= np.abs(np.log(radius[:, None] / radius)) < math.log(CLUSTER_FACTOR)
-        poses, left = [], np.ones(len(landmark), dtype=bool)
-        for _ in range(MAX_CLUSTERS):
-            votes = (near & left).sum(axis=1) * left
-            if not len(votes) or votes.max() < MIN_LANDMARKS:
-                break
-            cluster = near[votes.argmax()] & left
-            size = float(np.median(radius[cluster]))
-            points, uv = self._points[landmark[cluster]], found.uv[cluster]
-            pose = _pose(points - self._centre, uv, K.double().cpu().numpy(), REPROJECTION_ERROR * size)
-            left &= ~cluster
-            if pose is not None:  # what is left at its place has no other one
-                R, position = pose.T[:3, :3], pose.T[:3, 3]
-                poses.append(LandmarkPose(transform(R, position - R @ torch.from_numpy(self._centre)), pose.count))
-                left &= np.abs(centre - centre[cluster].mean()) > size
-        return sorted(poses, key=lambda pose: -pose.count)
+        centres = found.uv @ [1, 1j] + self._to_centre[landmark] * found.size * np.exp(1j * found.angle)
+        radii = self._radii[landmark] * found.size
+        camera = K.double().cpu().numpy()
+        return LandmarkMatches(found.uv, self._points[landmark], centres, radii, camera, self._centre, self._radius)
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:
         """Features in px of the photograph."""
@@ -184,10 +216,14 @@ def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> La
         return None
     if not found or inliers is None:
         return None
-    # Several features at one place are one landmark.
-    count = len(np.unique((uv[inliers[:, 0]] / max(error, 1e-9)).round(), axis=0))
+    count = _places(uv[inliers[:, 0]], error)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
-    if count < MIN_LANDMARKS or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
+    if count < MIN_AGREEING or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
     return LandmarkPose(nearest_rigid(T[None])[0], count)
+
+
+def _places(uv: np.ndarray, error: float) -> int:
+    """Number of places of pixels (M, 2): several features at one place are one landmark."""
+    return len(np.unique((uv / max(error, 1e-9)).round(), axis=0))

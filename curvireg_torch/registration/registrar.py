@@ -36,8 +36,9 @@ from .contour_fit import quick_support
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
-from .landmarks import LandmarkPose, Landmarks
+from .landmarks import MIN_AGREEING, LandmarkMatches, Landmarks
 from .poses import (
+    POSE_FEATURES,
     SCORE_WEIGHTS,
     Poses,
     best_views,
@@ -45,6 +46,7 @@ from .poses import (
     fit_poses,
     fit_texture_of,
     hypothesis_of,
+    landmark_evidence,
     named_features,
     pose_features,
     pose_scores,
@@ -67,6 +69,9 @@ SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
 """Number of the best distinct views of an exact mesh that get a short contour fit, and weight of the edge support that
 they reach, beside log S, in the choice of those that become hypotheses."""
 
+KEPT_LANDMARKS = 0.5
+"""Fraction of the landmarks that agree with a start, which must agree with its fit as well."""
+
 SAME_BOX_OVERLAP = 0.85
 """Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
 on 60 generated photographs."""
@@ -84,8 +89,8 @@ _SHAPE_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class _Work:
-    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's, and ``crops`` for
-    contour fits, if there are any."""
+    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
+    fits, and ``landmarks`` in the box, if there are any."""
 
     item: ImageItem
     query: QueryFeatures
@@ -95,6 +100,7 @@ class _Work:
     exact: bool
     symmetries: Tensor | None
     crops: EdgeCrops | None
+    landmarks: LandmarkMatches | None
 
 
 class Registrar:
@@ -273,17 +279,24 @@ class Registrar:
     def _shape_symmetries(self) -> Tensor | None:
         return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
-    def landmark_poses(self, item: ImageItem, box: Tensor | None = None) -> tuple[Poses, Tensor]:
-        """Poses on which landmarks of the mesh's print agree, as promising as the best view, and how many, the largest
-        number first; none without colours or a camera matrix. ``box`` (4,) is where they are looked for.
+    def landmark_matches(self, item: ImageItem, box: Tensor | None = None) -> LandmarkMatches | None:
+        """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without colours or a camera
+        matrix.
 
         :meta private:
         """
-        found: list[LandmarkPose] = []
-        if self.describer.draws_colours and item.camera_matrix is not None:
-            with _SHAPE_LOCK:  # photographs share them
-                landmarks = self._landmarks
-            found = landmarks.poses(item.image, item.camera_matrix, box)
+        if not self.describer.draws_colours or item.camera_matrix is None:
+            return None
+        with _SHAPE_LOCK:  # photographs share them
+            landmarks = self._landmarks
+        return landmarks.matches(item.image, item.camera_matrix, box)
+
+    def landmark_poses(self, item: ImageItem, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
+        """Poses on which landmarks agree, as promising as the best view, and how many, the largest number first.
+
+        :meta private:
+        """
+        found = [] if matches is None else matches.poses()
         T = torch.stack([pose.T for pose in found]) if found else torch.zeros(0, 4, 4, dtype=torch.float64)
         K, none = torch.eye(3) if item.camera_matrix is None else item.camera_matrix, torch.zeros(len(T))
         poses = Poses.at(T, K.double().expand(len(T), 3, 3), self.describer.centre, none.long(), none.double())
@@ -349,7 +362,7 @@ class Registrar:
             if _shows_other_part(box, item):
                 with suppress(CurviregError):
                     again = self._register_box(replace(item, box=box.float()))
-                    result = replace(again, corrected_box=box) if again.score > result.score else result
+                    result = replace(again, corrected_box=box) if _agreement(again) > _agreement(result) else result
         return result
 
     def _register_box(self, item: ImageItem) -> Registration:
@@ -376,7 +389,7 @@ class Registrar:
                 poses = work.limits.moved_inside(poses)
         if work.crops is not None:
             self.report_progress("contours")
-            poses = fit_poses(self.describer, work.crops, poses)
+            poses = self._fitted(work, work.crops, poses)
         features = self._features(work, poses)
         if work.crops is not None and work.exact:
             poses, features = self._fitted_again(work, work.crops, poses, features, outside)
@@ -409,7 +422,9 @@ class Registrar:
         if self.pipeline.contours:
             mask = self.object_mask(query, [item])
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
-        return _Work(item, query, ranking, self.describer.descriptor(query.field), limits, exact, symmetries, crops)
+        landmarks = self.landmark_matches(item, item.box) if exact and crops is not None else None
+        descriptors = self.describer.descriptor(query.field)
+        return _Work(item, query, ranking, descriptors, limits, exact, symmetries, crops, landmarks)
 
     def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
@@ -427,7 +442,7 @@ class Registrar:
             poses = self._screened(work.crops, poses, count)
         by_landmarks = torch.zeros(len(poses), dtype=torch.bool)
         if work.crops is not None and work.exact:
-            found, _ = self.landmark_poses(work.item, work.item.box)
+            found, _ = self.landmark_poses(work.item, work.landmarks)
             found = found if work.limits is None else found[work.limits.keeps(found)]
             if len(found):
                 poses = poses[~are_near(poses.rotation, found.rotation[0], work.symmetries)]
@@ -467,19 +482,30 @@ class Registrar:
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
     def _features(self, work: _Work, poses: Poses) -> Tensor:
-        """(H, 4) :data:`POSE_FEATURES`."""
+        """(H, 5) :data:`POSE_FEATURES`."""
         appearance = None
         if Appearance.name in work.ranking.terms:
             pictures = self.matcher.describer.shaded(poses.rotation, poses.distance)
             appearance = self.matcher.appearance_score(work.query, work.ranking, pictures)
-        return pose_features(self.describer, work.descriptors, poses, appearance)
+        landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
+        return pose_features(self.describer, work.descriptors, poses, appearance, landmarks)
+
+    def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses) -> Poses:
+        """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
+        poses = fit_poses(self.describer, crops, starts)
+        if work.landmarks is not None:
+            before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
+            left = ((before >= MIN_AGREEING) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
+            if len(left):
+                poses = poses.replaced(left, with_edge_support(self.describer, crops, starts[left]))
+        return poses
 
     def _fitted_again(
         self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose again from where it is, and keep the result if it has a higher score."""
         best = _best_inside(features, outside)
-        fitted = fit_poses(self.describer, crops, poses[best])
+        fitted = self._fitted(work, crops, poses[best])
         new = self._features(work, fitted)
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features
@@ -563,6 +589,12 @@ def _better(
         return replace(rival, model=model)
     ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
     return replace(rival, model=model) if ahead else one
+
+
+def _agreement(result: Registration) -> float:
+    """Evidence for the pose that does not depend on the box: similarity and landmarks, with their weights."""
+    weights, evidence = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True)), result.hypotheses[0].evidence
+    return sum(weights[name] * evidence[name] for name in ("similarity", "landmarks"))
 
 
 def _shows_other_part(box: Tensor, item: ImageItem) -> bool:

@@ -20,8 +20,9 @@ from .confidence import MAX_MARGIN, refinement_confidence
 from .contour_fit import FIRST_RADII, FULL_SIZE_RADII, QUARTER_SIZE_RADII, ContourProblem, ContourState
 from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
+from .landmarks import LandmarkMatches
 from .least_squares import Measurements, pose_covariance
-from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
+from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, landmark_evidence
 from .refinement import LOST_CONFIDENCE, nearest_view
 from .result import Hypothesis, Registration
 from .tracker import boxes_at
@@ -97,7 +98,7 @@ def in_frames(axes: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class RigPhotograph:
     """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the ``box``
-    (4,) in which poses are compared, the crops of it, and the registration of it alone."""
+    (4,) in which poses are compared, the crops of it, its landmarks, and the registration of it alone."""
 
     index: int
     camera: Tensor
@@ -107,6 +108,7 @@ class RigPhotograph:
     crops: EdgeCrops
     query: QueryFeatures
     descriptor: Tensor
+    landmarks: LandmarkMatches | None
     result: Registration
 
     @staticmethod
@@ -128,6 +130,7 @@ class RigPhotograph:
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
             descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1)[0],
+            landmarks=registrar.landmark_matches(item, box),
             result=result,
         )
 
@@ -148,7 +151,7 @@ Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by thei
 
 @dataclass(frozen=True)
 class Answer:
-    """M candidate poses in the world, best first, with evidence (V, M, 4) and scores (V, M) in V photographs, and
+    """M candidate poses in the world, best first, with evidence (V, M, 5) and scores (V, M) in V photographs, and
     covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
@@ -374,22 +377,25 @@ class Rig:
         return 1.0 / (1.0 - angle / SAME_DIRECTION).clamp(min=0.0).fill_diagonal_(1.0).sum(dim=1)
 
     def evidence(self, T: Tensor, support: Tensor) -> Tensor:
-        """(V, M, 4) :data:`POSE_FEATURES` of world poses with edge supports (V, M)."""
+        """(V, M, 5) :data:`POSE_FEATURES` of world poses with edge supports (V, M)."""
         matcher, parts = self.registrar.matcher, []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
             views = F.normalize(self.describer.descriptors(R, distance), dim=1)
             similarity = (views @ photograph.descriptor).double().cpu()
-            appearance, ranking = torch.zeros_like(similarity), photograph.result.ranking
+            appearance = landmarks = torch.zeros_like(similarity)
+            ranking = photograph.result.ranking
             if Appearance.name in ranking.terms:
                 pictures = matcher.describer.shaded(R, distance)
                 appearance = matcher.appearance_score(photograph.query, ranking, pictures)
-            parts.append(torch.stack([similarity, appearance]))
-        similarity, appearance = torch.stack(parts, dim=1)
-        return torch.stack([self.ranks(T), similarity, support, appearance], dim=-1)
+            if photograph.landmarks is not None:
+                landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
+            parts.append(torch.stack([similarity, appearance, landmarks]))
+        similarity, appearance, landmarks = torch.stack(parts, dim=1)
+        return torch.stack([self.ranks(T), similarity, support, appearance, landmarks], dim=-1)
 
     def scores(self, evidence: Tensor) -> Tensor:
-        """(V, M) of (V, M, 4)."""
+        """(V, M) of (V, M, 5)."""
         return evidence @ torch.tensor(SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64)
 
     def lost(self, answer: Answer) -> dict[int, str]:

@@ -156,7 +156,7 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
     for i, camera in enumerate(cameras):
         view = PhotographPose(camera @ answer.T[0], failure=reasons.get(i), contribution=contributions.get(i, 0.0))
         if isinstance(one := found[i], RigPhotograph):
-            _, similarity, support, _ = compared[i].tolist()
+            _, similarity, support, *_ = compared[i].tolist()
             view = replace(view, box=one.box, similarity=similarity, edge_support=support)
         views.append(view)
     return Registration(

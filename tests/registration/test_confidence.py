@@ -64,17 +64,19 @@ def test_logistic_model():
 def test_every_feature_raises_the_confidence(exact):
     model = CALIBRATION["instance" if exact else "category"]
     assert tuple(model["weights"]) == CONFIDENCE_FEATURES
-    tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3}
-    for name in CONFIDENCE_FEATURES:
+    tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3, "landmarks": 1.0}
+    for name in CONFIDENCE_FEATURES if exact else CONFIDENCE_FEATURES[:-1]:  # similar meshes have no landmarks
         assert registration_confidence({**tied, name: tied[name] + 0.1}, exact=exact) > registration_confidence(
             tied, exact=exact
         )
 
 
 def test_confidence_features():
-    evidence = torch.tensor([[0.0, 0.7, 0.4, 1.0], [-1.0, 0.6, 0.5, 0.4], [-2.0, 0.5, 0.1, 0.8]], dtype=torch.float64)
+    evidence = torch.tensor(
+        [[0.0, 0.7, 0.4, 1.0, 2.0], [-1.0, 0.6, 0.5, 0.4, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0]], dtype=torch.float64
+    )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
-    expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3}
+    expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0}
     assert confidence_features(evidence, scores, 0.3) == pytest.approx(expected)
     for factor in (10.0, -10.0):
         assert confidence_features(evidence, factor * scores, 0.3)["margin"] == math.copysign(MAX_MARGIN, factor)

@@ -4,6 +4,7 @@ from dataclasses import replace
 import cv2
 import pytest
 import torch
+import torch.nn.functional as F
 import trimesh
 
 from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
@@ -114,7 +115,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = torch.stack([0 * similarity, similarity, 0 * similarity, 0 * similarity], dim=1)
+    features = F.pad(similarity[:, None], (1, 3))
     outside = torch.tensor([False, False, True, False])
     assert registrar_module._best_inside(features, outside).tolist() == [1]
 
@@ -248,11 +249,17 @@ def test_wrong_box_is_corrected():
     assert result.to_dict()["corrected_box"] == result.corrected_box.tolist()
 
 
-@pytest.mark.parametrize("better", [True, False])
-def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
+@pytest.mark.parametrize(
+    ("better", "evidence"), [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"landmarks": 2.0})]
+)
+def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evidence):
+    """Evidence that depends on the box, as the rank does, is not compared."""
     registrar = truck_registrar()
-    first = uncorrected(BOX)
-    other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
+    one = uncorrected(BOX)
+    first, other = (
+        replace(one, hypotheses=(replace(one.hypotheses[0], evidence=one.hypotheses[0].evidence | {**known}),))
+        for known in ({"similarity": 0.7, "rank": 0.0}, {"similarity": 0.7, "rank": -3.0} | evidence)
+    )
     answers = iter([first, other])
     monkeypatch.setattr(registrar, "_register_box", lambda _: next(answers))
     result = registrar([IMAGE], WRONG[None], CAMERA)[0]
