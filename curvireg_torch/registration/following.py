@@ -2,13 +2,12 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from ..geometry.calibration import Camera
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
@@ -82,10 +81,10 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
-        self._start(item, T, confidence)
+        map_on_threads(lambda item: self._start(item, T, confidence), [item])
 
     def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
-        map_on_threads(partial(self._tracker.start, item.image, _camera(item)), [T])
+        self._tracker.start(item.image, _camera(item), T)
         self._base = confidence
 
     @torch.no_grad()
@@ -99,21 +98,21 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
+        return map_on_threads(lambda item: self._next(item, image, box), [item])[0]  # one thread: rounding is the same
+
+    def _next(self, item: ImageItem, image: Any, box: Any) -> Registration | FailedRegistration:
         if not self._base:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
-        tracked = map_on_threads(self._track, [item])[0]
+        tracked = self._track(item)
         found = None if tracked is None else self._registration(tracked, item)
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
         starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
-        refined = map_on_threads(lambda T: self._refined(item, T), [torch.cat(starts)])[0]
+        refined = self._refined(item, torch.cat(starts))
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
             with suppress(LostObjectError):  # track on from it, if it lies within the frame
-                measured = map_on_threads(
-                    lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(refined)]
-                )
-                self._tracker.accept(measured[0])
+                self._tracker.accept(self._tracker.measure(item.image, _camera(item), _pose(refined)))
                 self._base = _confidence(refined)
             return refined
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
@@ -141,7 +140,7 @@ class Follower:
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
     def _track(self, item: ImageItem) -> TrackedPose | None:
-        with suppress(LostObjectError):
+        with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
             return self._tracker.track(item.image, _camera(item))
         return None
 
