@@ -21,7 +21,7 @@ from ..matching import ViewBank, ViewDescriber, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
 from .confidence import detection_probability
-from .inputs import ImageItem, check_crop, image_items
+from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
 from .priors import Limits
 from .result import Detection, FailedRegistration, Registration, corners
@@ -326,9 +326,9 @@ class Detector(nn.Module):
         for scale in self._scales(image, focal, distance, float(side.quantile(0.5))):
             h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
             if not maps:  # the largest copy comes first; the smaller ones are resized from it
-                largest = _resized(image, (h, w)).to(self.matcher.bank.device)
+                largest = resized(image, (h, w)).to(self.matcher.bank.device)
                 check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
-            maps.append(self._similarity(_resized(largest, (h, w))[None]))
+            maps.append(self._similarity(resized(largest, (h, w))[None]))
             ratios.append((w / image.shape[-1], h / image.shape[-2]))
             fits = usable.to(side.device)
             if distance is not None and focal is not None:
@@ -412,16 +412,6 @@ def _templates(backbone: Backbone, describer: ViewDescriber, bank: ViewBank, cou
     outlines = boxes * scale + shift.repeat(1, 2) + 0.5
     away = torch.ones_like(z) if bank.settings.camera == "orthographic" else z
     return _Templates(views.cpu(), weights, outlines.float(), (away.to(scale) / scale[:, 0]).float())
-
-
-def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """(C, h, w) float32 in [0, 1]."""
-    if tuple(image.shape[-2:]) == size and image.is_floating_point():
-        return image.float()
-    options: dict[str, Any] = {"size": size, "mode": "bilinear", "antialias": True, "align_corners": False}
-    # One channel at a time to save memory: photographs are large.
-    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
-    return small / 255.0 if image.dtype == torch.uint8 else small
 
 
 def representative_views(bank: ViewBank, count: int) -> Tensor:
