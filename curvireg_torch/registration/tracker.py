@@ -156,17 +156,6 @@ class Frame:
     K: Tensor
     contours: MeshContours
 
-    @classmethod
-    def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
-        """The square around a mesh at ``T`` (1, 4, 4), of an image (1 or 3, H, W) in [0, 1] or uint8 with camera ``K``
-        (3, 3). Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
-        boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
-        if not bool(visible):
-            raise LostObjectError(OUTSIDE)
-        crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
-        grey = (255.0 * crops.crops[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
-        return cls(crops, grey, crops.transforms @ K, contours)
-
     @cached_property
     def bins(self) -> Tensor:
         """(S, S) histogram bins of the colours."""
@@ -393,7 +382,13 @@ class Tracker:
         return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
 
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
-        return Frame.cut(image, K, self.hull, self.contours, T)
+        """The square around the mesh at ``T`` (1, 4, 4) in an image with camera matrix ``K`` (3, 3)."""
+        boxes, visible = boxes_at(self.hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
+        if not bool(visible):
+            raise LostObjectError(OUTSIDE)
+        crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
+        grey = (255.0 * crops.crops[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
+        return Frame(crops, grey, crops.transforms @ K, self.contours)
 
 
 def _silhouette(state: ContourState) -> tuple[Tensor, Tensor]:
