@@ -84,7 +84,7 @@ class Follower:
         map_on_threads(lambda item: self._start(item, T, confidence), [item])
 
     def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
-        self._tracker.start(item.image, _camera(item), T)
+        self._tracker.start(item.image, item.K, T)
         self._base = confidence
 
     @torch.no_grad()
@@ -112,7 +112,7 @@ class Follower:
         refined = self._refined(item, torch.cat(starts))
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
             with suppress(LostObjectError):  # track on from it, if it lies within the frame
-                self._tracker.accept(self._tracker.measure(item.image, _camera(item), _pose(refined)))
+                self._tracker.accept(self._tracker.measure(item.image, item.K, refined.projection[0]))
                 self._base = _confidence(refined)
             return refined
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
@@ -127,7 +127,7 @@ class Follower:
         result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
             with suppress(LostObjectError):
-                self._start(item, _pose(result), _confidence(result))
+                self._start(item, result.projection[0], _confidence(result))
         return result
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
@@ -141,13 +141,13 @@ class Follower:
 
     def _track(self, item: ImageItem) -> TrackedPose | None:
         with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
-            return self._tracker.track(item.image, _camera(item))
+            return self._tracker.track(item.image, item.K)
         return None
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
         describer, T, none = self.registrar.describer, tracked.state.T, torch.zeros(1, dtype=torch.long)
-        poses = Poses.at(T, _camera(item)[None], describer.centre, none, none)
+        poses = Poses.at(T, item.K[None], describer.centre, none, none)
         poses = replace(
             poses,
             view=torch.tensor([nearest_view(self.registrar, poses.rotation[0])]),
@@ -158,18 +158,6 @@ class Follower:
         probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
         return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)
-
-
-def _camera(item: ImageItem) -> Tensor:
-    """(3, 3) float64."""
-    assert item.camera_matrix is not None
-    return item.camera_matrix.double()
-
-
-def _pose(result: Registration) -> Tensor:
-    """(4, 4) of a result with a camera matrix."""
-    assert result.transform is not None
-    return result.transform
 
 
 def _confidence(result: Registration) -> float:

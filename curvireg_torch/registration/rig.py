@@ -115,14 +115,13 @@ class RigPhotograph:
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
         settings, boxes, image = registrar.bank.settings, box.float()[None], item.image.expand(3, -1, -1)
-        assert item.camera_matrix is not None
         crop = crop_regions([image], boxes[:, None], size=settings.image_size, margin=settings.margin)[:, 0].float()
         query = registrar.matcher.features(crop.to(registrar.bank.device))
         mask = registrar.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
             camera=camera,
-            K=item.camera_matrix.double(),
+            K=item.K,
             size=item.size,
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),

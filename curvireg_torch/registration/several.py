@@ -101,10 +101,9 @@ def _registered(
 
     def located(k: int) -> ImageItem | CurviregError:
         item = items[chosen[k]]
-        if T is None or not isinstance(item, ImageItem) or item.camera_matrix is None:
+        if T is None or not isinstance(item, ImageItem):
             return item
-        T_cam, K = cameras[chosen[k]] @ T, item.camera_matrix.double()
-        box, visible = boxes_at(registrar.describer.hull, T_cam, K, item.size)
+        box, visible = boxes_at(registrar.describer.hull, cameras[chosen[k]] @ T, item.K, item.size)
         return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
 
     def register(item: ImageItem, k: int) -> RigPhotograph | CurviregError:
