@@ -118,8 +118,6 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
     cannot be used is the reason.
     """
-    if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; check the path of the list")
     header, *rows = read_csv(path) or [[]]
     header = _without_empty_end(header, 0)
     names = [column.strip().lower() for column in header]
