@@ -90,8 +90,7 @@ class RigProblem(ContourProblem):
 
 def in_frames(axes: Tensor) -> Tensor:
     """(N, 6, 6) from twists along some axes to those along other ones, of rotations (N, 3, 3)."""
-    zero = torch.zeros_like(axes)
-    return torch.cat([torch.cat([axes, zero], dim=2), torch.cat([zero, axes], dim=2)], dim=1)
+    return torch.kron(torch.eye(2, dtype=axes.dtype), axes)
 
 
 @dataclass(frozen=True)

@@ -99,21 +99,16 @@ def _registered(
 ) -> Found:
     """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1, 4, 4)."""
 
-    def located(k: int) -> ImageItem | CurviregError:
-        item = items[chosen[k]]
-        if T is None or not isinstance(item, ImageItem):
-            return item
-        box, visible = boxes_at(registrar.describer.hull, cameras[chosen[k]] @ T, item.K, item.size)
-        return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
+    def register(item: ImageItem, k: int) -> RigPhotograph:
+        camera = cameras[chosen[k]]
+        if T is not None:
+            box, visible = boxes_at(registrar.describer.hull, camera @ T, item.K, item.size)
+            if not bool(visible):
+                raise LostObjectError(ELSEWHERE)
+            item = replace(item, box=box[0].float())
+        return RigPhotograph.of(registrar, item, registrar.register_item(item), chosen[k], camera)
 
-    def register(item: ImageItem, k: int) -> RigPhotograph | CurviregError:
-        i = chosen[k]
-        try:
-            return RigPhotograph.of(registrar, item, registrar.register_item(item), i, cameras[i])
-        except CurviregError as error:
-            return error.with_subject(f"image {i}")
-
-    found = registrar.map_items(OnDemand(located, len(chosen)), register)
+    found = registrar.map_items(OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
     return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
 
 
