@@ -74,6 +74,7 @@ class Follower:
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
+            ImageError: pixels around the mesh are missing or outside [0, 1].
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))
@@ -103,7 +104,9 @@ class Follower:
     def _next(self, item: ImageItem, image: Any, box: Any) -> Registration | FailedRegistration:
         if not self._base:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
-        tracked = self._track(item)
+        tracked: TrackedPose | None = None
+        with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
+            tracked = self._tracker.track(item.image, item.K)
         found = None if tracked is None else self._registration(tracked, item)
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
             self._tracker.accept(tracked)
@@ -111,7 +114,7 @@ class Follower:
         starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
         refined = self._refined(item, torch.cat(starts))
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
-            with suppress(LostObjectError):  # track on from it, if it lies within the frame
+            with suppress(LostObjectError, ImageError):  # track on from it, if it lies within the frame
                 self._tracker.accept(self._tracker.measure(item.image, item.K, refined.projection[0]))
                 self._base = _confidence(refined)
             return refined
@@ -126,7 +129,7 @@ class Follower:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
         result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
-            with suppress(LostObjectError):
+            with suppress(LostObjectError, ImageError):
                 self._start(item, result.projection[0], _confidence(result))
         return result
 
@@ -138,11 +141,6 @@ class Follower:
             return FailedRegistration(error)
         bound = self._base if _confidence(result) < RELIABLE else 1.0
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
-
-    def _track(self, item: ImageItem) -> TrackedPose | None:
-        with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
-            return self._tracker.track(item.image, item.K)
-        return None
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
