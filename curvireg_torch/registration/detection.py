@@ -89,15 +89,14 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     number being the response, and those of the detector."""
     extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
-    limits: dict[str, Any] = {}
-    if item.prior is not None:
-        limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
-    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
-    others = registrar.detector(item.image, focal=focal, **limits)
+    distance = allowed = None
     poses, count = registrar.landmark_poses(item)
     if item.prior is not None:
-        kept = Limits(item, registrar.bank).keeps(poses).nonzero()[:, 0]
+        distance, allowed = item.prior.distance, _allowed_views(registrar, item)
+        kept = Limits(item, registrar.bank).keeps(poses)
         poses, count = poses[kept], count[kept]
+    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+    others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
     pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)
