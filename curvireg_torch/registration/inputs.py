@@ -169,9 +169,7 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
 
 def _contradict(one: ImageItem, other: ImageItem) -> bool:
     """Whether small copies of two photographs by the same camera are hardly correlated."""
-    if one.size != other.size or not torch.equal(
-        torch.as_tensor(one.camera_matrix), torch.as_tensor(other.camera_matrix)
-    ):
+    if one.size != other.size or not torch.equal(one.K, other.K):
         return False
     grey = [item.image.float().mean(dim=0).nan_to_num()[None, None] for item in (one, other)]
     a, b = (F.adaptive_avg_pool2d(picture, 32).flatten() for picture in grey)
