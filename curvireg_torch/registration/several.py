@@ -74,16 +74,15 @@ def register_views(
     if given:
         found = _registered(registrar, items, cameras, given)
     else:
-        lost: Found = {}
         for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
             item = items[i]
-            if isinstance(result, Registration) and isinstance(item, ImageItem) and result.detection is not None:
+            if isinstance(result, FailedRegistration):
+                found[i] = result.error
+            elif isinstance(item, ImageItem) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
                 found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
-            elif isinstance(result, FailedRegistration):
-                (lost if isinstance(result.error, LostObjectError) else found)[i] = result.error
-        if not any(isinstance(one, RigPhotograph) for one in found.values()):  # else the others tell where it is
-            found |= lost
+        if any(isinstance(one, RigPhotograph) for one in found.values()):  # they tell where it is in the others
+            found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)
