@@ -16,7 +16,7 @@ from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
 from . import commands, follow, register
-from .options import Parser
+from .options import Parser, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def parse(argv: Sequence[str]) -> argparse.Namespace:
     """The options of a command line; a mistake in them ends the process with code 2."""
     parser = build_parser()
-    arguments, rest = parser.parse_known_args(argv)
+    arguments, rest = parser.parse_known_args(join_numbers(argv))
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
         arguments.paths += map(Path, rest)  # argparse does not collect positionals that follow an option
     elif rest:

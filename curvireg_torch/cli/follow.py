@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
@@ -108,7 +108,7 @@ def _follow(
     try:
         with ExitStack() as stack:
             if out is not None:
-                video = stack.enter_context(closing(OverlayVideo(out / "overlay.mp4", registrar, fps=fps)))
+                video = stack.enter_context(OverlayVideo(out / "overlay.mp4", registrar, fps=fps))
             if show:
                 from ..viewer.live import LivePage
 

@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -27,13 +26,10 @@ PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that takes no abbreviations, and numbers as separate words too: ``--box 1 2 3 4``, ``--box 1,2,3,4``."""
+    """A parser that takes no abbreviations."""
 
     def __init__(self, **how: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how)
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        return super().parse_known_args(join_numbers(sys.argv[1:] if args is None else args), namespace)
 
 
 def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
@@ -107,7 +103,7 @@ _COUNTS = {"--camera": 4} | {
 
 
 def join_numbers(words: Sequence[str]) -> list[str]:
-    """The command line with one word for each option of numbers: "--box=1,2,3,4".
+    """The command line with one word for each option of numbers, "--box=1,2,3,4", for ``--box 1 2 3 4`` too.
 
     Example:
         >>> join_numbers(["a.jpg", "--box", "1,", "-2", "3", "4", "--near=5", "6", "b.stl", "--camera", "exif"])

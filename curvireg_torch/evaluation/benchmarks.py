@@ -219,9 +219,13 @@ class Benchmark(ABC):
             error="unknown_box" if unknown else "",
         )
 
-    @abstractmethod
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown. The first one orders."""
+        R, truth = estimated_rotations(rows), true_rotations(samples)
+        known = truth.isfinite().flatten(1).all(1)
+        errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
+        errors[known] = symmetric_rotation_error(R[known], truth[known], _HALF_TURN[:0])
+        return {"error_deg": errors}
 
     @abstractmethod
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
@@ -317,7 +321,7 @@ class Pascal3DBenchmark(Benchmark):
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         R, truth = estimated_rotations(rows), true_rotations(samples)
-        plain = symmetric = symmetric_rotation_error(R, truth, _HALF_TURN[:0])
+        plain = symmetric = super().errors(samples, rows)["error_deg"]
         for category, (_, error) in SYMMETRIES.items():
             mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
             symmetric = torch.where(mask & plain.isfinite(), error(R, truth), symmetric)
@@ -351,13 +355,6 @@ class PoseFolderBenchmark(Benchmark):
         *("true_theta", "error_deg", "score", "confidence", "reliable", "failed", "seconds"),
     )
     dataset: PoseFolder
-
-    def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
-        R, truth = estimated_rotations(rows), true_rotations(samples)
-        known = truth.isfinite().flatten(1).all(1)
-        errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
-        errors[known] = symmetric_rotation_error(R[known], truth[known], _HALF_TURN[:0])
-        return {"error_deg": errors}
 
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
         """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of all."""

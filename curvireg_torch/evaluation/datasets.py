@@ -140,17 +140,16 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
         number = row.get("confidence")
         confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
         if row["status"] == "failed":
-            kind, caption, order = "failed", row["message"], (2, 0.0)
+            kind, caption, rank = "failed", row["message"], (2.0, 0.0)
         elif math.isnan(error):
             kind, caption = "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}"
-            order = 1, -(number or 0.0)
+            rank = 1.0, -(number or 0.0)
         else:
             kind, caption = "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}"
-            order = 0, error
+            rank = 0.0, error
         name, picture = benchmark.entries[i].key, thumbnail_of(out, row)
-        shown.append((order, SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture)))
-    shown.sort(key=lambda pair: pair[0])
+        shown.append(SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture, rank=rank))
     known = [error for error in errors.tolist() if not math.isnan(error)]
     right, failed = sum(error < RIGHT_DEG for error in known), sum(row["status"] == "failed" for row in rows)
     title = f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} failed"
-    write_sheet(out / "index.html", title, [entry for _, entry in shown], table="predictions.csv", each=SHOWN_EACH)
+    write_sheet(out / "index.html", title, shown, table="predictions.csv", each=SHOWN_EACH)

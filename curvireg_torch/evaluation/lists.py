@@ -118,8 +118,6 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
     cannot be used is the reason.
     """
-    if not path.is_file():
-        raise MissingFileError(f"{path}: no such file; check the path of the list")
     header, *rows = read_csv(path) or [[]]
     header = _without_empty_end(header, 0)
     names = [column.strip().lower() for column in header]
@@ -189,15 +187,14 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
         reliable, confidence = row.get("reliable", False), row.get("confidence") or 0.0
         kind = "failed" if message else "reliable" if reliable else "doubtful"
         caption, picture = message or f"confidence {confidence:.2f}, {kind}", thumbnail_of(out, row)
-        on_page = SheetEntry(number=number, name=entry.name, caption=caption, kind=kind, picture=picture)
-        shown.append(((bool(message), not reliable, -confidence, number), on_page))
+        rank = bool(message), not reliable, -confidence, number
+        shown.append(SheetEntry(number, entry.name, caption, kind, picture, rank))
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
         lines.append([*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
-    counts = Counts(len(shown) - len(failures), sum(not key[1] for key, _ in shown), tuple(failures))
-    shown.sort(key=lambda pair: pair[0])
-    write_sheet(out / "index.html", str(counts), [on_page for _, on_page in shown], table="results.csv")
+    counts = Counts(len(shown) - len(failures), sum(shot.kind == "reliable" for shot in shown), tuple(failures))
+    write_sheet(out / "index.html", str(counts), shown, table="results.csv")
     store.rewrite(_rows(entries, store))
     write_csv(out / "results.csv", lines)
     return counts

@@ -6,6 +6,7 @@ Thresholds are strict: an error equal to the threshold is a miss.
 
 import math
 from collections.abc import Callable, Sequence
+from statistics import median
 
 import torch
 from scipy.spatial import cKDTree
@@ -222,10 +223,7 @@ def median_error(errors: Tensor) -> float:
         26.0
     """
     _check_errors(errors)
-    if not len(errors):
-        return math.nan
-    ordered = errors.double().sort().values
-    return float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
+    return median(errors.tolist()) if len(errors) else math.nan
 
 
 def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) -> Tensor:

@@ -73,7 +73,7 @@ class Entry:
         return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, kw_only=True)
 class RegisteredPhotograph(Registration):
     """A :class:`Registration` that knows its photograph, and so can be drawn and saved.
 
@@ -83,10 +83,10 @@ class RegisteredPhotograph(Registration):
         document: the content of ``result.json``.
     """
 
-    registrar: Registrar = None  # type: ignore[assignment]  # fields of the base class have defaults
-    image: Tensor = None  # type: ignore[assignment]
-    box: Tensor = None  # type: ignore[assignment]
-    document: dict[str, Any] = field(default_factory=dict)
+    registrar: Registrar
+    image: Tensor
+    box: Tensor
+    document: dict[str, Any]
 
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the box."""

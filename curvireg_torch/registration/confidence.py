@@ -17,53 +17,28 @@ from torch import Tensor
 
 from ..pipeline import BankSettings, Pipeline
 
-__all__ = [
-    "CALIBRATION",
-    "CONFIDENCE_FEATURES",
-    "COVARIANCE_SCALE",
-    "RELIABLE",
-    "LogisticModel",
-    "are_near",
-    "concentration",
-    "confidence_features",
-    "detection_probability",
-    "hypothesis_probabilities",
-    "is_calibrated",
-    "model_name",
-    "refinement_confidence",
-    "registration_confidence",
-    "tracking_confidence",
-]
-
+# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``none``, see
+# :func:`hypothesis_probabilities`
 CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
-"""For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``none``, see
-:func:`hypothesis_probabilities`."""
-
+# Factor of the least-squares covariance, which ignores edges that do not belong to the object: with it, nine in ten
+# true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs
 COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
-"""Factor of the least-squares covariance, which ignores edges that do not belong to the object: with it, nine in ten
-true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs."""
-
+# Landmarks that must agree on a pose, and the probability that the object is where they do, in a whole photograph: on
+# generated shelves 28 of 29. It is less where other objects have a similar print
 MIN_LANDMARKS, LANDMARK_PROBABILITY = 12, 0.95
-"""Landmarks that must agree on a pose, and the probability that the object is where they do, in a whole photograph:
-on generated shelves 28 of 29. It is less where other objects have a similar print."""
+RELIABLE = 0.9  # Confidence from which a registration is called reliable
+CONFIDENCE_FEATURES = (
+    "similarity",
+    "margin",
+    "edge_support",
+    "concentration",
+    "landmarks",
+)  # See :func:`confidence_features`
+MAX_MARGIN = 5.0  # Margins are clamped to +- this value
+UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
+RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals
 
-RELIABLE = 0.9
-"""Confidence from which a registration is called reliable."""
-
-CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
-"""Features of the confidence, see :func:`confidence_features`."""
-
-MAX_MARGIN = 5.0
-"""Margins are clamped to +- this value."""
-
-UNCOMPARED_CONFIDENCE = 0.5
-"""Largest confidence in a result without rival views."""
-
-RIVAL_ANGLE = 30.0
-"""Degrees beyond which two views are rivals."""
-
-Features = Mapping[str, float | None]
-"""Features by name; None where there is no rival view to compare with."""
+Features = Mapping[str, float | None]  # by name; None where there is no rival view to compare with
 
 
 @dataclass(frozen=True)
@@ -112,20 +87,14 @@ def registration_confidence(features: Features, *, exact: bool) -> float:
 
 
 def refinement_confidence(features: Features) -> float:
-    """Probability that a pose refined from a good start is within 10 degrees and 10 % of the distance of the truth.
-
-    Args:
-        features: ``similarity`` and ``edge_support`` of the pose.
-    """
+    """Probability that a pose refined from a good start is within 10 degrees and 10 % of the distance of the truth,
+    from its ``similarity`` and ``edge_support``."""
     return LogisticModel.named("refinement")(features)
 
 
 def tracking_confidence(features: Features) -> float:
-    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth, if it was before.
-
-    Args:
-        features: of :class:`.tracker.TrackedPose`.
-    """
+    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth, if it was before,
+    from the features of :class:`.tracker.TrackedPose`."""
     model = LogisticModel.named("tracking")
     return model({name: features[name] for name in model.weights})
 

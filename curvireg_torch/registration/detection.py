@@ -17,11 +17,11 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..features.backbone import STRIDES, Backbone
 from ..geometry.crops import box_iou, crop_transforms, non_maximum_suppression, square_boxes
 from ..geometry.pose_prior import PosePrior, check_distance
-from ..matching import ViewBank, ViewDescriber, ViewMatcher
+from ..matching import ViewBank, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
 from .confidence import MIN_LANDMARKS, detection_probability
-from .inputs import ImageItem, check_crop, image_items
+from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
 from .priors import Limits
 from .result import Detection, FailedRegistration, Registration, corners
@@ -89,16 +89,15 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     number being the response, and those of the detector."""
     extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
-    limits: dict[str, Any] = {}
-    if item.prior is not None:
-        limits = {"distance": item.prior.distance, "allowed": _allowed_views(registrar, item)}
-    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
-    others = registrar.detector(item.image, focal=focal, **limits)
+    distance = allowed = None
     poses, count = registrar.landmark_poses(item, registrar.landmark_matches(item))
     kept = count >= MIN_LANDMARKS
     if item.prior is not None:
+        distance, allowed = item.prior.distance, _allowed_views(registrar, item)
         kept = kept & Limits(item, registrar.bank).keeps(poses)
     poses, count = poses[kept], count[kept]
+    focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
+    others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
     pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)
@@ -247,17 +246,6 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
     return results
 
 
-@dataclass(frozen=True)
-class _Templates:
-    """K views of a bank, and their weights (K, C, h, w) for each stride and each shading; ``boxes`` (K, 4) in px of the
-    templates, from the outer border; ``unit`` (K,) distances at which a focal length of 1 px shows this size."""
-
-    views: Tensor
-    weights: list[list[Tensor]]
-    boxes: Tensor
-    unit: Tensor
-
-
 class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
@@ -284,13 +272,42 @@ class Detector(nn.Module):
         self.matcher, self.settings = matcher, matcher.pipeline.detection
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))
         self.backbone = (next(networks, None) or Backbone()).to(matcher.bank.device)
-        self._templates = _templates(self.backbone, matcher.describer, matcher.bank, self.settings.views)
+        bank = matcher.bank
+        self._views = representative_views(bank, self.settings.views)
+        boxes, away = bank.boxes[self._views].double(), bank.distances[self._views]
+        A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
+        scale, shift = A[:, 0, 0, None], A[:, :2, 2]
+        # In px of the templates, from the outer border; and distances at which a focal length of 1 px shows this size.
+        self._boxes = (boxes * scale + shift.repeat(1, 2) + 0.5).float()
+        away = torch.ones_like(away) if bank.settings.camera == "orthographic" else away
+        self._unit = (away.to(scale) / scale[:, 0]).float()
+        self._weights = self._template_weights()
+
+    def _template_weights(self) -> list[list[Tensor]]:
+        """(K, C, h, w) for each stride and each shading."""
+        bank = self.matcher.bank
+        pictures = self.matcher.describer.shaded(bank.rotations[self._views], bank.distances[self._views])
+        masks = bank.silhouettes_at(self._views)[:, None].float()
+        small = F.interpolate(pictures, (TEMPLATE_SIDE,) * 2, mode="bilinear", antialias=True, align_corners=False)
+        weights: list[list[Tensor]] = [[] for _ in STRIDES]
+        # Grey, and in colour where the mesh has colours.
+        for shaded in (small[:, :1], small[:, 1:])[: 2 if small.shape[1] > 1 else 1]:
+            for stride, cells, templates in zip(STRIDES, self._features(shaded), weights, strict=True):
+                mask = F.interpolate(masks, size=(TEMPLATE_SIDE // stride,) * 2, mode="area")
+                common = (cells * mask).sum(dim=(0, 2, 3)) / mask.sum()
+                unit = F.normalize(cells - common[:, None, None], dim=1) * mask
+                templates.append(unit / mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6))
+        return weights
+
+    def _features(self, image: Tensor) -> list[Tensor]:
+        """(B, C, H / stride, W / stride) for each of ``STRIDES``, of (B, 1 or 3, H, W) images in [0, 1]."""
+        return [f / s[:, None, None] for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)]
 
     @cached_property
     def _template_of_view(self) -> Tensor:
         """(N,) template that is most similar to each view of the bank; on the CPU."""
         bank = self.matcher.bank
-        views, chosen = (_view_features(bank, index) for index in (torch.arange(len(bank)), self._templates.views))
+        views, chosen = (_view_features(bank, index) for index in (torch.arange(len(bank)), self._views))
         return torch.cdist(views, chosen).argmin(dim=1).cpu()
 
     @torch.no_grad()
@@ -317,23 +334,22 @@ class Detector(nn.Module):
         check_distance(distance)
         if distance is not None and focal is None:
             raise InvalidInputError("distance: needs the camera matrix of every photograph")
-        templates = self._templates
-        usable = torch.ones(len(templates.views), dtype=torch.bool)
+        usable = torch.ones(len(self._views), dtype=torch.bool)
         if allowed is not None:
             usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[allowed.cpu()], True)
-        side = (templates.boxes[:, 2:] - templates.boxes[:, :2]).amax(dim=1)
+        side = (self._boxes[:, 2:] - self._boxes[:, :2]).amax(dim=1)
         maps: list[Tensor] = []
         fitting, ratios = [], []
         for scale in self._scales(image, focal, distance, float(side.quantile(0.5))):
             h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
             if not maps:  # the largest copy comes first; the smaller ones are resized from it
-                largest = _resized(image, (h, w)).to(self.matcher.bank.device)
+                largest = resized(image, (h, w)).to(self.matcher.bank.device)
                 check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
-            maps.append(self._similarity(_resized(largest, (h, w))[None]))
+            maps.append(self._similarity(resized(largest, (h, w))[None]))
             ratios.append((w / image.shape[-1], h / image.shape[-2]))
             fits = usable.to(side.device)
             if distance is not None and focal is not None:
-                away = templates.unit * focal * scale
+                away = self._unit * focal * scale
                 fits = fits & (away >= distance[0] / SIZE_STEP**0.5) & (away <= distance[1] * SIZE_STEP**0.5)
             fitting.append(fits)
         if not maps:
@@ -347,7 +363,7 @@ class Detector(nn.Module):
         longer = float(max(image.shape[-2:]))
         small, large = min(max(self.settings.min_size * longer, MIN_OBJECT_SIDE), longer), longer
         if focal is not None and distance is not None:
-            extent = side * focal * self._templates.unit  # px at distance 1
+            extent = side * focal * self._unit  # px at distance 1
             small = max(small, float(extent.min()) / distance[1])
             large = min(large, float(extent.max()) / distance[0])
         scales, size = [], small
@@ -359,7 +375,7 @@ class Detector(nn.Module):
     def _similarity(self, image: Tensor) -> Tensor:
         """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8 j."""
         cosines: list[Tensor] = []
-        for cells, weights in zip(_features(self.backbone, image), self._templates.weights, strict=True):
+        for cells, weights in zip(self._features(image), self._weights, strict=True):
             cells = F.normalize(cells - cells.mean(dim=(0, 2, 3))[:, None, None], dim=1)
             padded = F.pad(cells, (weights[0].shape[-1] // 2,) * 4)
             cosines.append(torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0))
@@ -368,7 +384,6 @@ class Detector(nn.Module):
         return sum(fine, cosines[0]) / len(cosines)
 
     def _peaks(self, maps: list[Tensor], fitting: list[Tensor], ratios: list[tuple[float, float]]) -> Proposals:
-        templates = self._templates
         every = torch.cat([m.flatten(1) for m in maps], dim=1)
         mean, spread = every.mean(dim=1), every.std(dim=1).clamp(min=1e-6)
         boxes, responses, views = [], [], []
@@ -378,51 +393,14 @@ class Detector(nn.Module):
             peak = (best == F.max_pool2d(best[None], 3, stride=1, padding=1)[0]) & best.isfinite()
             i, j = peak.nonzero(as_tuple=True)
             corner = torch.stack([j, i], dim=1).repeat(1, 2) * 8.0 - TEMPLATE_SIDE / 2.0
-            boxes.append((templates.boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5)
+            boxes.append((self._boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5)
             responses.append(best[i, j])
-            views.append(templates.views[view[i, j].cpu()])
+            views.append(self._views[view[i, j].cpu()])
         response, index = torch.cat(responses).sort(descending=True, stable=True)
         index = index[:MAX_PEAKS]
         box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
         kept = non_maximum_suppression(box, response[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[: self.settings.proposals]
         return Proposals(box[kept].cpu(), response[kept].cpu(), view[kept.cpu()])
-
-
-def _features(backbone: Backbone, image: Tensor) -> list[Tensor]:
-    """(B, C, H / stride, W / stride) for each of ``STRIDES``, of (B, 1 or 3, H, W) images in [0, 1]."""
-    return [f / s[:, None, None] for f, s in zip(backbone(image), backbone.spreads, strict=True)]
-
-
-def _templates(backbone: Backbone, describer: ViewDescriber, bank: ViewBank, count: int) -> _Templates:
-    views = representative_views(bank, count)
-    R, z, boxes = bank.rotations[views], bank.distances[views], bank.boxes[views].double()
-    masks = bank.silhouettes_at(views)[:, None].float()
-    small = F.interpolate(
-        describer.shaded(R, z), size=(TEMPLATE_SIDE,) * 2, mode="bilinear", antialias=True, align_corners=False
-    )
-    weights: list[list[Tensor]] = [[] for _ in STRIDES]
-    # Grey, and in colour where the mesh has colours.
-    for shaded in (small[:, :1], small[:, 1:])[: 2 if small.shape[1] > 1 else 1]:
-        for stride, cells, templates in zip(STRIDES, _features(backbone, shaded), weights, strict=True):
-            mask = F.interpolate(masks, size=(TEMPLATE_SIDE // stride,) * 2, mode="area")
-            common = (cells * mask).sum(dim=(0, 2, 3)) / mask.sum()
-            unit = F.normalize(cells - common[:, None, None], dim=1) * mask
-            templates.append(unit / mask.sum(dim=(2, 3), keepdim=True).clamp(min=1e-6))
-    A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
-    scale, shift = A[:, 0, 0, None], A[:, :2, 2]
-    outlines = boxes * scale + shift.repeat(1, 2) + 0.5
-    away = torch.ones_like(z) if bank.settings.camera == "orthographic" else z
-    return _Templates(views.cpu(), weights, outlines.float(), (away.to(scale) / scale[:, 0]).float())
-
-
-def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """(C, h, w) float32 in [0, 1]."""
-    if tuple(image.shape[-2:]) == size and image.is_floating_point():
-        return image.float()
-    options: dict[str, Any] = {"size": size, "mode": "bilinear", "antialias": True, "align_corners": False}
-    # One channel at a time to save memory: photographs are large.
-    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
-    return small / 255.0 if image.dtype == torch.uint8 else small
 
 
 def representative_views(bank: ViewBank, count: int) -> Tensor:

@@ -2,13 +2,12 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from ..geometry.calibration import Camera
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
@@ -75,6 +74,7 @@ class Follower:
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
+            ImageError: pixels around the mesh are missing or outside [0, 1].
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))
@@ -82,10 +82,10 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
-        self._start(item, T, confidence)
+        map_on_threads(lambda item: self._start(item, T, confidence), [item])
 
     def _start(self, item: ImageItem, T: Tensor, confidence: float) -> None:
-        map_on_threads(partial(self._tracker.start, item.image, _camera(item)), [T])
+        self._tracker.start(item.image, item.K, T)
         self._base = confidence
 
     @torch.no_grad()
@@ -99,21 +99,23 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
+        return map_on_threads(lambda item: self._next(item, image, box), [item])[0]  # one thread: rounding is the same
+
+    def _next(self, item: ImageItem, image: Any, box: Any) -> Registration | FailedRegistration:
         if not self._base:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
-        tracked = map_on_threads(self._track, [item])[0]
+        tracked: TrackedPose | None = None
+        with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
+            tracked = self._tracker.track(item.image, item.K)
         found = None if tracked is None else self._registration(tracked, item)
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
         starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
-        refined = map_on_threads(lambda T: self._refined(item, T), [torch.cat(starts)])[0]
+        refined = self._refined(item, torch.cat(starts))
         if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
-            with suppress(LostObjectError):  # track on from it, if it lies within the frame
-                measured = map_on_threads(
-                    lambda T: self._tracker.measure(item.image, _camera(item), T), [_pose(refined)]
-                )
-                self._tracker.accept(measured[0])
+            with suppress(LostObjectError, ImageError):  # track on from it, if it lies within the frame
+                self._tracker.accept(self._tracker.measure(item.image, item.K, refined.projection[0]))
                 self._base = _confidence(refined)
             return refined
         if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
@@ -127,8 +129,8 @@ class Follower:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
         result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
-            with suppress(LostObjectError):
-                self._start(item, _pose(result), _confidence(result))
+            with suppress(LostObjectError, ImageError):
+                self._start(item, result.projection[0], _confidence(result))
         return result
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
@@ -140,15 +142,10 @@ class Follower:
         bound = self._base if _confidence(result) < RELIABLE else 1.0
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
-    def _track(self, item: ImageItem) -> TrackedPose | None:
-        with suppress(LostObjectError):
-            return self._tracker.track(item.image, _camera(item))
-        return None
-
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
         describer, T, none = self.registrar.describer, tracked.state.T, torch.zeros(1, dtype=torch.long)
-        poses = Poses.at(T, _camera(item)[None], describer.centre, none, none)
+        poses = Poses.at(T, item.K[None], describer.centre, none, none)
         poses = replace(
             poses,
             view=torch.tensor([nearest_view(self.registrar, poses.rotation[0])]),
@@ -159,18 +156,6 @@ class Follower:
         probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
         return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)
-
-
-def _camera(item: ImageItem) -> Tensor:
-    """(3, 3) float64."""
-    assert item.camera_matrix is not None
-    return item.camera_matrix.double()
-
-
-def _pose(result: Registration) -> Tensor:
-    """(4, 4) of a result with a camera matrix."""
-    assert result.transform is not None
-    return result.transform
 
 
 def _confidence(result: Registration) -> float:

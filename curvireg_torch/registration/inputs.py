@@ -71,6 +71,12 @@ class ImageItem:
         return int(self.image.shape[-2]), int(self.image.shape[-1])
 
     @property
+    def K(self) -> Tensor:  # noqa: N802
+        """(3, 3) float64 camera matrix of a photograph that has one."""
+        assert self.camera_matrix is not None
+        return self.camera_matrix.double()
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What is questionable about box, camera and mask; each names the likely mistake."""
         found = [] if self.camera_matrix is None else camera_warnings(self.camera_matrix, self.size)
@@ -100,15 +106,11 @@ def image_items(
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n, no_box = len(images), boxes is None
     if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
-        if len(boxes) != n:
-            raise InvalidInputError(f"boxes: expected {n}, one for each image or None, got {len(boxes)}")
-        boxes = [None if is_missing(box) else as_boxes([box], 1)[0] for box in boxes]
+        boxes = [None if is_missing(box) else as_boxes([box], 1)[0] for box in _one_each(boxes, n, "boxes")]
     else:
         boxes = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
-    masks = [None] * n if masks is None else list(masks)
-    if len(masks) != n:
-        raise InvalidInputError(f"masks: expected {n}, one for each image or None, got {len(masks)}")
+    masks = [None] * n if masks is None else _one_each(masks, n, "masks")
     if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
         raise InvalidInputError(f"masks: image {masks.index(None)} has neither mask nor box; register it separately")
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
@@ -130,6 +132,12 @@ def image_items(
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
     return OnDemand(item, n)
+
+
+def _one_each(values: Sequence[Any], count: int, name: str) -> list[Any]:
+    if len(values) != count:
+        raise InvalidInputError(f"{name}: expected {count}, one for each image or None, got {len(values)}")
+    return list(values)
 
 
 def is_missing(box: Any) -> bool:
@@ -161,9 +169,7 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
 
 def _contradict(one: ImageItem, other: ImageItem) -> bool:
     """Whether small copies of two photographs by the same camera are hardly correlated."""
-    if one.size != other.size or not torch.equal(
-        torch.as_tensor(one.camera_matrix), torch.as_tensor(other.camera_matrix)
-    ):
+    if one.size != other.size or not torch.equal(one.K, other.K):
         return False
     grey = [item.image.float().mean(dim=0).nan_to_num()[None, None] for item in (one, other)]
     a, b = (F.adaptive_avg_pool2d(picture, 32).flatten() for picture in grey)
@@ -265,6 +271,16 @@ def _pixels(image: Any) -> Tensor:
         raise InvalidInputError(f"expected a tensor, an array or a path, got {type(image).__name__}")
     check_photograph(image, "photograph")
     return image
+
+
+def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> Tensor:
+    """(C, h, w) float32 in about [0, 1] of a photograph (C, H, W), floating in [0, 1] or uint8."""
+    if tuple(image.shape[-2:]) == size and image.is_floating_point():
+        return image.float()
+    options: dict[str, Any] = {"size": size, "mode": mode, "antialias": True, "align_corners": False}
+    # One channel at a time to save memory: photographs are large.
+    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
+    return small / 255.0 if image.dtype == torch.uint8 else small
 
 
 def check_crop(crop: Tensor) -> None:

@@ -10,13 +10,13 @@ from dataclasses import dataclass, fields
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.threads import map_on_threads
+from .inputs import resized
 from .least_squares import nearest_rigid
 
 VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and their side in px
@@ -172,18 +172,12 @@ class Landmarks:
             low, high = (box[:2] - margin).floor().int().tolist(), (box[2:] + margin).ceil().int().tolist()
             x0, y0, x1, y1 = max(low[0], 0), max(low[1], 0), min(high[0] + 1, W), min(high[1] + 1, H)
         crop = image[:, y0:y1, x0:x1].detach().cpu()
-        longer, unit = max(crop.shape[-2:]), 1.0 if crop.is_floating_point() else 1.0 / 255.0
+        longer = max(crop.shape[-2:])
         scale = min(MAX_SIDE / longer, 1.0) if box is None else CROP_SIDE / longer
-        size = [max(1, round(scale * side)) for side in crop.shape[-2:]]
-        scale = max(size) / longer
-        grey = torch.zeros(size)
-        for channel in crop:  # one at a time to save memory: photographs are large
-            one = channel[None, None].float()
-            if scale != 1.0:
-                one = F.interpolate(one, size, mode="bicubic", align_corners=False, antialias=scale < 1.0)
-            grey += one[0, 0] * (unit / len(crop))
-        crop = grey.nan_to_num(0.0, 0.0, 0.0).clamp(0.0, 1.0)[None]
-        found = _Features.of(crop)
+        h, w = (max(1, round(scale * side)) for side in crop.shape[-2:])
+        scale = max(h, w) / longer
+        small = resized(crop, (h, w), mode="bicubic")  # keeps a quarter more features of small crops than bilinear
+        found = _Features.of(small.nan_to_num(0.0, 0.0, 0.0))
         uv = (found.uv + 0.5) / scale - 0.5 + [x0, y0]
         return _Features(uv, found.size / scale, found.angle, found.vectors)
 

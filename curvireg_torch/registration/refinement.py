@@ -79,8 +79,7 @@ def refine(
 def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None) -> Registration:
     """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most ``limit``. Raises
     :class:`LostObjectError` where the object is not near any start."""
-    assert item.camera_matrix is not None
-    describer, K = registrar.describer, item.camera_matrix.double()
+    describer, K = registrar.describer, item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
         raise LostObjectError(OUTSIDE)

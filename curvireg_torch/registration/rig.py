@@ -91,8 +91,7 @@ class RigProblem(ContourProblem):
 
 def in_frames(axes: Tensor) -> Tensor:
     """(N, 6, 6) from twists along some axes to those along other ones, of rotations (N, 3, 3)."""
-    zero = torch.zeros_like(axes)
-    return torch.cat([torch.cat([axes, zero], dim=2), torch.cat([zero, axes], dim=2)], dim=1)
+    return torch.kron(torch.eye(2, dtype=axes.dtype), axes)
 
 
 @dataclass(frozen=True)
@@ -117,14 +116,13 @@ class RigPhotograph:
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
         settings, boxes, image = registrar.bank.settings, box.float()[None], item.image.expand(3, -1, -1)
-        assert item.camera_matrix is not None
         crop = crop_regions([image], boxes[:, None], size=settings.image_size, margin=settings.margin)[:, 0].float()
         query = registrar.matcher.features(crop.to(registrar.bank.device))
         mask = registrar.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
             camera=camera,
-            K=item.camera_matrix.double(),
+            K=item.K,
             size=item.size,
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
@@ -271,24 +269,14 @@ class Rig:
         return R, torch.linalg.vector_norm(position, dim=1)
 
     @cached_property
-    def problems(self) -> list[RigProblem]:
-        """One pose in all photographs: at full size, half of it, and a quarter."""
+    def problems(self) -> list[ContourProblem]:
+        """A pose in each photograph: at full size, half of it, and a quarter."""
         crops = EdgeCrops.cat([p.crops for p in self.photographs])
         K, index = torch.stack([p.K for p in self.photographs]), torch.arange(len(self.photographs))
-        each = (ContourProblem.of(self.describer.contours, crops, K, index, factor=factor) for factor in (1, 2, 4))
-        return [
-            RigProblem(
-                **vars(problem),
-                axes=self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT,
-                group=torch.zeros_like(index),
-                alone=self.cameras,
-                root=torch.zeros(len(index), 6, 6, dtype=torch.float64),
-            )
-            for problem in each
-        ]
+        return [ContourProblem.of(self.describer.contours, crops, K, index, factor=factor) for factor in (1, 2, 4)]
 
-    def tied(self, problem: RigProblem, T: Tensor) -> tuple[RigProblem, Tensor]:
-        """The problem of M world poses, and their poses (M V, 4, 4) in the cameras."""
+    def tied(self, problem: ContourProblem, T: Tensor) -> tuple[RigProblem, Tensor]:
+        """The problem of M world poses in all photographs, and their poses (M V, 4, 4) in the cameras."""
         M, V = len(T), len(self.photographs)
         every, pose = torch.arange(V).repeat(M), torch.arange(M).repeat_interleave(V)
         cams = self.cameras[every] @ T[pose]
@@ -298,7 +286,8 @@ class Rig:
         lever[:, 3:, :3] = cross_matrix(alone[:, :3, :3] @ self.describer.centre)
         values, vectors = torch.linalg.eigh(lever.mT @ _inverse(covariance) @ lever)
         root = (vectors * values.clamp(min=0.0).sqrt()[:, None]).mT
-        return replace(problem[every], group=pose, alone=alone, root=root), cams
+        axes = (self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT)[every]
+        return RigProblem(**vars(problem[every]), axes=axes, group=pose, alone=alone, root=root), cams
 
     def found_alone(self, cams: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         """The poses (N, 4, 4) nearest to given ones that photographs ``source`` (N,) alone found, and their covariances
@@ -311,7 +300,7 @@ class Rig:
                     T[n], C[n] = hypothesis.projection[0], hypothesis.covariance
         return T, C
 
-    def fitted(self, problem: RigProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
+    def fitted(self, problem: ContourProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
         """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If the fit does not
         improve the support of all photographs together, the initial pose is kept."""
         (each, cams), V = self.tied(problem, T), len(self.photographs)

@@ -74,16 +74,15 @@ def register_views(
     if given:
         found = _registered(registrar, items, cameras, given)
     else:
-        lost: Found = {}
         for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
             item = items[i]
-            if isinstance(result, Registration) and isinstance(item, ImageItem) and result.detection is not None:
+            if isinstance(result, FailedRegistration):
+                found[i] = result.error
+            elif isinstance(item, ImageItem) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
                 found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
-            elif isinstance(result, FailedRegistration):
-                (lost if isinstance(result.error, LostObjectError) else found)[i] = result.error
-        if not any(isinstance(one, RigPhotograph) for one in found.values()):  # else the others tell where it is
-            found |= lost
+        if any(isinstance(one, RigPhotograph) for one in found.values()):  # they tell where it is in the others
+            found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)
@@ -99,22 +98,16 @@ def _registered(
 ) -> Found:
     """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1, 4, 4)."""
 
-    def located(k: int) -> ImageItem | CurviregError:
-        item = items[chosen[k]]
-        if T is None or not isinstance(item, ImageItem) or item.camera_matrix is None:
-            return item
-        T_cam, K = cameras[chosen[k]] @ T, item.camera_matrix.double()
-        box, visible = boxes_at(registrar.describer.hull, T_cam, K, item.size)
-        return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
+    def register(item: ImageItem, k: int) -> RigPhotograph:
+        camera = cameras[chosen[k]]
+        if T is not None:
+            box, visible = boxes_at(registrar.describer.hull, camera @ T, item.K, item.size)
+            if not bool(visible):
+                raise LostObjectError(ELSEWHERE)
+            item = replace(item, box=box[0].float())
+        return RigPhotograph.of(registrar, item, registrar.register_item(item), chosen[k], camera)
 
-    def register(item: ImageItem, k: int) -> RigPhotograph | CurviregError:
-        i = chosen[k]
-        try:
-            return RigPhotograph.of(registrar, item, registrar.register_item(item), i, cameras[i])
-        except CurviregError as error:
-            return error.with_subject(f"image {i}")
-
-    found = registrar.map_items(OnDemand(located, len(chosen)), register)
+    found = registrar.map_items(OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
     return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
 
 

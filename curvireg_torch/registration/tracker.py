@@ -13,16 +13,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import LostObjectError
-from ..filters.operations import fill_missing
 from ..geometry import rotation_error
 from ..geometry.cameras import projected_boxes, transform
-from ..geometry.crops import crop_transforms, square_boxes
 from ..rendering import DepthRenderer
 from ..rendering.contours import MeshContours
-from ..terms import crop_regions
 from .confidence import RELIABLE, tracking_confidence
 from .contour_fit import ContourProblem, ContourState
-from .edges import EdgeField, inside_photographs
+from .edges import CROP_SIZE, EdgeCrops
 from .least_squares import (
     INLIER_SCALE,
     Measurements,
@@ -125,7 +122,6 @@ def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
 
 
-WINDOW_SIZE = 256  # Side in px of the part of a frame around the object, which all measurements share
 # Added around the object's box, as a fraction of its longer side: room for motion that was not predicted
 WINDOW_MARGIN = 0.3
 # Message of a LostObjectError
@@ -152,40 +148,24 @@ CORNER_QUALITY, CORNER_INSET = 0.01, 3
 
 @dataclass(frozen=True)
 class Frame:
-    """The part of a frame around the object: ``colours`` (1, 3, S, S) in [0, 1], their mean ``grey`` (S, S) uint8, the
-    camera ``K`` (1, 3, 3), and ``inside`` (1, 1, S, S), 0 beyond the border of the frame."""
+    """The part of a frame around the object: its ``crops`` in three channels, their mean ``grey`` (S, S) uint8, and the
+    camera ``K`` (1, 3, 3) of these."""
 
-    colours: Tensor
+    crops: EdgeCrops
     grey: np.ndarray
     K: Tensor
-    inside: Tensor
     contours: MeshContours
-
-    @classmethod
-    def cut(cls, image: Tensor, K: Tensor, hull: Tensor, contours: MeshContours, T: Tensor) -> "Frame":
-        """The square around a mesh at ``T`` (1, 4, 4), of an image (1 or 3, H, W) in [0, 1] or uint8 with camera ``K``
-        (3, 3). Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
-        boxes, visible = boxes_at(hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
-        if not bool(visible):
-            raise LostObjectError(OUTSIDE)
-        box = boxes.float()
-        crop = crop_regions([image], box[:, None], size=WINDOW_SIZE, margin=WINDOW_MARGIN)[:, 0].float()
-        colours = fill_missing(crop).expand(-1, 3, -1, -1)
-        grey = (255.0 * colours[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
-        inside = inside_photographs([image], box, WINDOW_SIZE, WINDOW_MARGIN)
-        K = crop_transforms(square_boxes(box, WINDOW_MARGIN), WINDOW_SIZE).double() @ K
-        return cls(colours, grey, K, inside, contours)
 
     @cached_property
     def bins(self) -> Tensor:
         """(S, S) histogram bins of the colours."""
-        return colour_bins(self.colours)
+        return colour_bins(self.crops.crops)
 
     @cached_property
     def problem(self) -> ContourProblem:
         """The fit of contours to the edges of the frame."""
-        edges = EdgeField(self.colours, self.inside)
-        return ContourProblem(self.contours, edges, torch.zeros(1, dtype=torch.long), self.K, WINDOW_SIZE)
+        index = torch.zeros(1, dtype=torch.long)
+        return ContourProblem(self.contours, self.crops.edges(1), index, self.K, CROP_SIZE)
 
 
 def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -299,7 +279,7 @@ class Tracker:
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
         self._poses = [*self._poses[-1:], pose.state.T]
-        depth = self.renderer.render(pose.state.T, pose.frame.K, (WINDOW_SIZE, WINDOW_SIZE)).cpu()
+        depth = self.renderer.render(pose.state.T, pose.frame.K, (CROP_SIZE, CROP_SIZE)).cpu()
         self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
 
@@ -385,7 +365,7 @@ class Tracker:
         """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
         distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
         samples, directions = self._lines(frame, state, torch.cat([-distance, distance]))
-        x, y = samples.round().long().clamp(0, WINDOW_SIZE - 1).unbind(-1)
+        x, y = samples.round().long().clamp(0, CROP_SIZE - 1).unbind(-1)
         inside = depth[0, 0, y, x] > 0
         directions = directions[:, None].expand(inside.shape)
         self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten())
@@ -402,7 +382,13 @@ class Tracker:
         return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
 
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
-        return Frame.cut(image, K, self.hull, self.contours, T)
+        """The square around the mesh at ``T`` (1, 4, 4) in an image with camera matrix ``K`` (3, 3)."""
+        boxes, visible = boxes_at(self.hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
+        if not bool(visible):
+            raise LostObjectError(OUTSIDE)
+        crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
+        grey = (255.0 * crops.crops[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
+        return Frame(crops, grey, crops.transforms @ K, self.contours)
 
 
 def _silhouette(state: ContourState) -> tuple[Tensor, Tensor]:

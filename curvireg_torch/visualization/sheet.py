@@ -37,7 +37,7 @@ class SheetEntry:
     """A photograph on the page: the number of its row, from 1, its name, and the outcome in words.
 
     ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red); ``picture`` is the file
-    of its thumbnail.
+    of its thumbnail; ``rank`` is smaller for better ones.
     """
 
     number: int
@@ -45,6 +45,7 @@ class SheetEntry:
     caption: str
     kind: str
     picture: Path | None
+    rank: tuple[float, ...] = ()
 
 
 def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
@@ -58,11 +59,11 @@ def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image:
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int = MAX_ENTRIES) -> None:
-    """Write the page of ``rows``, best first, as one file; ``table`` is the name of the file that has all of them.
+    """Write the page of ``rows`` as one file, best first; ``table`` is the name of the file that has all of them.
 
     Of many rows, ``each`` of the best and of the worst are shown.
     """
-    note = "Best first; failed ones last."
+    note, rows = "Best first; failed ones last.", sorted(rows, key=lambda row: row.rank)
     if len(rows) > 2 * each:
         rows = [*rows[:each], *rows[-each:]]
         note = f"The {each} best, then the {each} worst; {table} has them all."

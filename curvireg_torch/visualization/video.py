@@ -1,6 +1,7 @@
 """A video of the poses of a followed object."""
 
 import warnings
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from .overlay import VERDICT_COLOURS
 _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 
 
-class OverlayVideo:
+class OverlayVideo(AbstractContextManager["OverlayVideo"]):
     """Writes frames with the contours of the mesh at the pose, and the confidence in words, to an MP4 file.
 
     The file is complete only after :meth:`close`; as a context manager, the video closes itself, whatever happens.
@@ -72,9 +73,6 @@ class OverlayVideo:
         """Finish the file. Nothing is written if there was no frame."""
         if self._writer is not None:
             self._writer.release()
-
-    def __enter__(self) -> "OverlayVideo":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

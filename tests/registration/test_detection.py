@@ -261,7 +261,7 @@ def test_detector_rejects_bad_distances_images_and_settings():
 
 def test_boxes_of_peaks_are_exact():
     """The box of a peak is that of the view's projected hull, scaled and shifted with the template."""
-    views = detector()._templates.views
+    views = detector()._views
     describer = ViewDescriber(example_mesh(), replace(bank().settings, image_size=96))
     T, K, _ = describer.cameras(bank().rotations[views], bank().distances[views])
     drawn = projected_boxes(describer.hull, T, K)
@@ -317,7 +317,7 @@ def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, f
 def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
     """Level and spread of a view's similarity do not matter."""
     generator = torch.Generator().manual_seed(3)
-    K = len(detector()._templates.views)
+    K = len(detector()._views)
     maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
     fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
     gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)

@@ -13,9 +13,10 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration import tracker
+from curvireg_torch.registration.edges import CROP_SIZE
 from curvireg_torch.registration.least_squares import fit_points, pixels
 from curvireg_torch.registration.texture_fit import surface_corners
-from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Frame, Keyframe, Tracker, track_points
+from curvireg_torch.registration.tracker import FLOW_SCALES, Frame, Keyframe, Tracker, track_points
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
@@ -62,7 +63,7 @@ def shift_in_pixels(T, truth):
 def plate(x: float = 0.0, y: float = 0.0):
     """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and depth."""
     T = transform(torch.eye(3, dtype=torch.float64), torch.tensor([x, y, 5.0], dtype=torch.float64))[None]
-    size = (WINDOW_SIZE, WINDOW_SIZE)
+    size = (CROP_SIZE, CROP_SIZE)
     depth = make_renderer(trimesh.creation.box((2.0, 2.0, 0.01))).render(T, WINDOW_K, size)
     smooth = torch.nn.functional.interpolate(
         torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0)), size=1024, mode="bicubic"
@@ -77,7 +78,7 @@ def plate(x: float = 0.0, y: float = 0.0):
 def framed(grey) -> Frame:
     """A frame of which only the grey picture is looked at."""
     none: Any = None
-    return Frame(none, grey, WINDOW_K, none, none)
+    return Frame(none, grey, WINDOW_K, none)
 
 
 def keyframe_of(window, T, depth) -> Keyframe:
