@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
-__all__ = ["CAMERA", "SIZE", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar", "unrefined"]
+__all__ = ["CAMERA", "SIZE", "errors", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar"]
+__all__ += ["unrefined"]
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -38,6 +39,12 @@ def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     T = random_pose(example_mesh(), CAMERA, SIZE, generator, elevations=(5.0, 50.0))
     image, box = synthesize_photograph(example_mesh(), T, CAMERA, SIZE, generator)
     return image, box, T
+
+
+def errors(result: Any, T: Tensor) -> tuple[float, float]:
+    """Degrees, and the error of the position as a fraction of the distance."""
+    away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
+    return float(rotation_error(result.rotation, T[:3, :3])), away
 
 
 def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:

@@ -19,16 +19,8 @@ from curvireg_torch.geometry import rotation_error, transform
 from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 
+from .._support import miniature
 from .._support.exif import exif, with_exif
-from .._support.miniature import (
-    pascal_object,
-    write_bop,
-    write_image,
-    write_mesh,
-    write_pascal3d,
-    write_record,
-    write_web,
-)
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 
 # Commands that are not run here, and the reason
@@ -85,18 +77,18 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mesh.apply_scale(1000.0).export(folder / "part.stl")
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
-    write_image(folder / "photo.png", (128, 128))
+    miniature.write_image(folder / "photo.png", (128, 128))
     cv2.imwrite(str(folder / "depth.png"), cv2.imread(str(folder / "photo.png"), cv2.IMREAD_GRAYSCALE))
-    write_pascal3d(folder / DEFECTIVE[0])
-    write_bop(folder / DEFECTIVE[1])
-    write_web(folder / DEFECTIVE[2])
+    miniature.write_pascal3d(folder / DEFECTIVE[0])
+    miniature.write_bop(folder / DEFECTIVE[1])
+    miniature.write_web(folder / DEFECTIVE[2])
     net = folder / "data" / "ObjectNet3D"
     for split in ("train", "val"):
-        write_record(net / "Annotations" / f"{split}.mat", [pascal_object("ashtray")])
-        write_image(net / "Images" / f"{split}.JPEG")
+        miniature.write_record(net / "Annotations" / f"{split}.mat", [miniature.pascal_object("ashtray")])
+        miniature.write_image(net / "Images" / f"{split}.JPEG")
         net.joinpath("Image_sets").mkdir(exist_ok=True)
         net.joinpath("Image_sets", f"{split}.txt").write_text(f"{split}\n")
-    write_mesh(net / "CAD" / "off" / "ashtray" / "01.off")
+    miniature.write_mesh(net / "CAD" / "off" / "ashtray" / "01.off")
     return folder
 
 

@@ -23,10 +23,6 @@ R = rotations(5, 0)
 SYMMETRIES = torch.eye(3, dtype=torch.float64)[None]
 
 
-def _angle(R1: np.ndarray, R2: np.ndarray) -> float:
-    return math.degrees(Rotation.from_matrix(R1.T @ R2).magnitude())
-
-
 def _move(T: Tensor | np.ndarray, points: Tensor = POINTS) -> np.ndarray:
     T = np.asarray(T)
     return np.array([T[:3, :3] @ x + T[:3, 3] for x in points.numpy()])
@@ -46,9 +42,6 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
     for n in (1, 6, 7):
         values = 180.0 * torch.rand(n, generator=torch.Generator().manual_seed(n))
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
-
-
-def test_average_recall_worked_example() -> None:
     errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
     # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of the ten.
     assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
@@ -56,6 +49,8 @@ def test_average_recall_worked_example() -> None:
     pixels = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf], dtype=torch.float64)
     assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
     assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
+    assert math.isnan(metrics.median_error(errors[:0]))
+    assert math.isnan(metrics.average_recall(errors[:0], metrics.MSSD_THRESHOLDS))
 
 
 @pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
@@ -68,10 +63,14 @@ def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
 def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
     est, gt, symmetries = rotations(10, 2), rotations(10, 3), rotations(4, 4)
     group = [np.eye(3), *symmetries.numpy()]
-    slow = [min(_angle(e, g @ s) for s in group) for e, g in zip(est.numpy(), gt.numpy(), strict=True)]
+    slow = [
+        math.degrees(min(Rotation.from_matrix(e.T @ g @ s).magnitude() for s in group))
+        for e, g in zip(est.numpy(), gt.numpy(), strict=True)
+    ]
     np.testing.assert_allclose(metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6)
     plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
     torch.testing.assert_close(plain, rotation_error(est, gt))
+    assert metrics.symmetric_rotation_error(est[:0], gt[:0], symmetries).shape == (0,)
 
 
 @pytest.mark.parametrize(("value", "whole"), [(math.nan, True), (math.nan, False), (-math.inf, False)])
@@ -191,10 +190,3 @@ WRONG: dict[str, Callable[[], object]] = {
 def test_metrics_refuse_wrong_input(message: str) -> None:
     with pytest.raises(InvalidInputError, match=f"^{message}"):
         WRONG[message]()
-
-
-def test_metrics_of_empty_sets() -> None:
-    empty = torch.empty(0, dtype=torch.float64)
-    assert metrics.symmetric_rotation_error(R[:0], R[:0], SYMMETRIES).shape == (0,)
-    assert math.isnan(metrics.median_error(empty))
-    assert math.isnan(metrics.average_recall(empty, metrics.MSSD_THRESHOLDS))

@@ -6,14 +6,14 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch import Camera, camera_matrix, project_points, render_depth, rotation_error
+from curvireg_torch import Camera, camera_matrix, project_points, render_depth
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.inputs import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 
 # The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it
 OFF_CENTRE = camera_matrix(260.0, 260.0, 20.0, 30.0)
@@ -39,12 +39,6 @@ def distorted(camera, seed):
     y, x = (moved[3] >= 0.5).nonzero().unbind(1)
     box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])
     return ideal, moved[:3], box, moved[3], T
-
-
-def errors(result, T):
-    """Degrees, and the error of the position as a fraction of the distance."""
-    away = torch.linalg.vector_norm(result.translation - T[:3, 3]) / torch.linalg.vector_norm(T[:3, 3])
-    return float(rotation_error(result.rotation, T[:3, :3])), float(away)
 
 
 @pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial-tangential", "fisheye"])

@@ -128,10 +128,7 @@ def test_edges_outside_the_photograph_do_not_count():
     assert edges.counts(uv, valid, FIRST).tolist() == [[True, True, False]]
     few = uv.index_fill(1, torch.tensor([1]), 50.0)  # with less than half of the points inside, all count
     assert edges.counts(few, valid, FIRST).tolist() == [[True, True, True]]
-
-
-def test_inside_photographs_is_the_part_of_the_crop_that_shows_the_photograph():
-    """A box whose right half lies beyond the border of a photograph 20 px wide."""
+    # A box whose right half lies beyond the border of a photograph 20 px wide.
     inside = inside_photographs([torch.zeros(3, 40, 20)], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0)
     assert bool(inside[0, 0, :, :20].all())
     assert float(inside[0, 0, :, 21:].max()) == 0.0
@@ -290,21 +287,16 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
         torch.testing.assert_close(one.edge_support[index == b].max(), best, rtol=0, atol=1e-4)
 
 
-def test_start_support_is_that_of_the_start_at_full_size():
+def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gain():
     off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
     start, image = apply_twist(CUBE_POSE[None], off, mesh_centre(cube())), silhouette(cube(), CUBE_POSE)
     expected = contour_support(MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST)
-    torch.testing.assert_close(fitted(image, start).start_support, expected)
-
-
-def test_trustworthy_depends_on_support_or_gain():
-    none, start = torch.zeros(4), torch.tensor([0.49, 0.45, 0.1, 0.1])
-    fit = ContourFit(none, none, torch.tensor([0.51, 0.49, 0.35, 0.25]), start, none)
-    assert fit.trustworthy.tolist() == [True, False, True, False]
-    off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
-    start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
-    assert bool(fitted(silhouette(cube(), CUBE_POSE), start).trustworthy)
+    fit = fitted(image, start)
+    torch.testing.assert_close(fit.start_support, expected)
+    assert bool(fit.trustworthy)
     assert not bool(fitted(noise(), start).trustworthy)
+    none, supports = torch.zeros(4), (torch.tensor([0.51, 0.49, 0.35, 0.25]), torch.tensor([0.49, 0.45, 0.1, 0.1]))
+    assert ContourFit(none, none, *supports, none).trustworthy.tolist() == [True, False, True, False]
 
 
 @pytest.mark.parametrize(

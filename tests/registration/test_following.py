@@ -7,17 +7,11 @@ import torch
 
 from curvireg_torch import Registrar
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration import FailedRegistration, Follower, following
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, sequence, truck_registrar
-
-
-def errors(result, T):
-    """Degrees, and fraction of the distance."""
-    position = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
-    return float(rotation_error(result.rotation, T[:3, :3])), position
+from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
 
 
 def test_follower_keeps_the_object_over_a_sequence():
@@ -156,7 +150,6 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked)
-
     monkeypatch.setattr(following, "refine_item", lost)
     monkeypatch.setattr(Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))])
     result = follow(frames[1][0])

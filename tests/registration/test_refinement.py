@@ -9,7 +9,7 @@ from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, transform
 from curvireg_torch.registration import refinement
 from curvireg_torch.synthetic import procedural_background, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank
+from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_bank
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +25,10 @@ def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
     return out
 
 
-def errors(result, T):
-    position = (result.translation - T[:3, 3]).norm() / T[:3, 3].norm()
-    return float(rotation_error(result.rotation, T[:3, :3])), float(position)
+CHANGES = [(seed, change) for seed in (0, 1, 3) for change in ({"degrees": 10}, {"distance": 0.1}, {"distance": -0.1})]
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
-@pytest.mark.parametrize("change", [{"degrees": 10.0}, {"distance": 0.1}, {"distance": -0.1}], ids=str)
+@pytest.mark.parametrize(("seed", "change"), [*CHANGES, (2, {"degrees": 20, "axis": (0.0, 1.0, 0.0)})], ids=str)
 def test_refine_ends_at_the_truth(registrar, seed, change):
     image, _, T = scene(seed)
     result = registrar.refine([image], CAMERA, [moved(T, **change)])[0]
@@ -96,12 +93,6 @@ def test_refine_calls_the_object_lost_below_its_limit(registrar, monkeypatch, co
     monkeypatch.setattr(refinement, "refinement_confidence", lambda _: confidence)
     image, _, T = scene(0)
     assert registrar.refine([image], CAMERA, [T])[0].ok is ok
-
-
-def test_refine_ends_at_the_truth_from_far_starts(registrar):
-    image, _, T = scene(2)
-    result = registrar.refine([image], CAMERA, [moved(T, degrees=20.0, axis=(0.0, 1.0, 0.0))])[0]
-    assert errors(result, T)[0] < 2.0
 
 
 TURNED = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))

@@ -24,20 +24,10 @@ IMAGES, BOXES, TRUTHS = zip(*(scene(seed) for seed in range(6)), strict=True)
 IMAGE, BOX, TRUTH = scene(0)
 
 
-def ranking_registrar() -> Registrar:
-    """A quick one, which reports views of the bank."""
-    return truck_registrar(contours=False)
-
-
-@pytest.fixture(scope="module")
-def registered() -> tuple[list, list]:
+def test_poses_of_synthetic_scenes():
     """Six scenes of known truth, before and after refinement."""
-    return tuple(
-        registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in (ranking_registrar(), truck_registrar())
-    )
-
-
-def test_poses_of_synthetic_scenes(registered):
+    registrars = truck_registrar(contours=False), truck_registrar()
+    registered = [registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in registrars]
     coarse, fine = (
         torch.stack([rotation_error(r.rotation, T[:3, :3]) for r, T in zip(results, TRUTHS, strict=True)])
         for results in registered
@@ -74,7 +64,7 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     grey, four = torch.full((3, 50, 50), 0.3), torch.zeros(4, 9, 9)
     images = [IMAGE, grey, nan, IMAGE, tmp_path / "none.png", IMAGE * 255, four, IMAGE]
     boxes = torch.stack([BOX, torch.tensor([5.0, 5, 40, 40]), BOX, -BOX, BOX, BOX, BOX, BOX])
-    results = ranking_registrar()(images, boxes, CAMERA)
+    results = truck_registrar(contours=False)(images, boxes, CAMERA)
     assert [result.ok for result in results] == [True, False, False, False, False, False, False, True]
     assert results[0].rotation.equal(results[7].rotation)
     messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
@@ -162,13 +152,13 @@ def test_registrar_accepts_tensors_arrays_and_paths(tmp_path):
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
     images = [pixels, array, array.astype("float32") / 255, tmp_path / "photo.png", str(tmp_path / "photo.png")]
-    first, *others = ranking_registrar()(images, [BOX.tolist()] * 5)
+    first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
     for result in others:
         torch.testing.assert_close(result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4)
 
 
 def test_registrar_rejects_bad_calls():
-    registrar = ranking_registrar()
+    registrar = truck_registrar(contours=False)
     with pytest.raises(InvalidInputError, match="focal"):
         _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[0].rotation
     for images, boxes, camera, message in (
@@ -229,8 +219,7 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
         Registrar(bank, progress=cancel)([IMAGE])
 
 
-EDGES = torch.tensor([-0.1, 0.2, 0.1, 0.15])  # Errors of a box's edges, as fractions of its sides
-WRONG = BOX + EDGES * (BOX[2:] - BOX[:2]).repeat(2)
+WRONG = BOX + torch.tensor([-0.1, 0.2, 0.1, 0.15]) * (BOX[2:] - BOX[:2]).repeat(2)
 
 
 def uncorrected(box):

@@ -244,9 +244,8 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert (workspace.messages, len(session.together())) == ({}, 2)
     assert session.rig_gaps() == "not open: 2.png; drop what is missing here, or go on without"
     example_mesh().apply_scale(1000.0).export(tmp_path / "obj_000005.ply")
-    send(
-        workspace, tmp_path, "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
-    )
+    names = "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
+    send(workspace, tmp_path, *names)
     assert (workspace.messages, session.options.unit) == ({}, "mm")
     assert [shot.path.name for shot in session.together()] == ["000000.png"]
     assert session.shot.box == (5.0, 6.0, 25.0, 36.0)

@@ -196,11 +196,8 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
 
 def test_messages_use_the_names_of_the_user(folder):
     session = Session(RegisterOptions(), folder)
-    assert [session.name(path) for path in (folder / "cat.obj", "other/cat.obj", "")] == [
-        "cat.obj",
-        "other/cat.obj",
-        "",
-    ]
+    paths = (folder / "cat.obj", "other/cat.obj", "")
+    assert [session.name(path) for path in paths] == ["cat.obj", "other/cat.obj", ""]
     warnings = CurviregWarning("large", subject=folder / "cat.obj"), UserWarning("plain")
     assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
@@ -262,9 +259,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     given.load()
     seen = undistorted(plain.image, camera, torch.tensor([10.0, 20, 90, 80]))
     assert torch.equal(given.shot.photo.image, seen.image)
-    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), (
-        "the option is of the photograph as it was taken"
-    )
+    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), "px of the photograph as it was taken"
     with pytest.raises(InvalidInputError, match="--box: needs a photograph"):
         new_session(*box).load()
     session.set_camera(camera)
@@ -321,9 +316,8 @@ def test_command_contains_the_limits_on_the_pose():
 
 @pytest.mark.usefixtures("folder")
 def test_register_is_cancelled_by_the_user():
-    session = new_session(
-        "photo.png", "truck.ply", "--pipeline", "small.json", "--box", *map(str, scene(0)[1].tolist())
-    )
+    box = map(str, scene(0)[1].tolist())
+    session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
     session.load()
     session.cancelled = True
     with pytest.raises(CurviregError, match=r"^stopped$"):
@@ -366,16 +360,12 @@ def seen(T, K, point):
     return at[:2] / at[2]
 
 
-def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
+def test_the_centre_follows_the_mouse_on_the_mesh_and_the_near_side_one_beside_it(pose):
     result, T, K, describer = pose
     moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
     torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
     assert torch.equal(moved[:3, :3], T[:3, :3])
-
-
-def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
-    result, T, K, describer = pose
     near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
     turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
     shift = seen(turned, K, near) - seen(T, K, near)
