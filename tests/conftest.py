@@ -52,6 +52,14 @@ def photographs() -> tuple[list[torch.Tensor], torch.Tensor]:
 
 
 @pytest.fixture
+def threads():
+    """``torch.set_num_threads``, undone after the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
 def pascal(tmp_path):
     """Five objects, of which one has a damaged photograph and one a damaged CAD."""
     root = tmp_path / "pascal"

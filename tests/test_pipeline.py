@@ -54,16 +54,9 @@ def test_presets_have_the_stated_settings():
 
 def test_json_contains_every_setting():
     base = Pipeline()
-    changed = [
-        replace(base, field="focus", weights=""),
-        base.with_pose_prior("upright"),
-        replace(base, terms=base.terms[:2]),
-        replace(base, box_jitter=0.2),
-        replace(base, weights="0123"),
-        replace(base, hypotheses=6),
-        replace(base, search=True),
-        replace(base, contours=False),
-    ]
+    settings = [{"field": "focus", "weights": ""}, {"terms": base.terms[:2]}, {"box_jitter": 0.2}, {"weights": "0123"}]
+    settings += [{"hypotheses": 6}, {"search": True}, {"contours": False}]
+    changed = [base.with_pose_prior("upright"), *(replace(base, **setting) for setting in settings)]
     for part, names in {
         "views": ("directions", "theta_step", "azimuth_step", "distance"),
         "bank": ("image_size", "sigma", "margin", "bins"),

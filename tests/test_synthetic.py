@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar, camera_matrix, rotation_error
+from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import demo_scene, example_mesh, random_pose, synthesize_photograph
-
-SIZE = (180, 240)
-CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
+from tests._support.scenes import CAMERA, SIZE
 
 
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose():

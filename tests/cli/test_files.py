@@ -13,7 +13,6 @@ import sys
 import cv2
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
@@ -86,17 +85,14 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("n", [1, 2], ids=["one thread", "two threads"])
 @pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
-def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, draws, file, threads):
+def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, threads, draws, file, n):
     def fail(*_, **__):
         raise InvalidInputError("it cannot be drawn")
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
+    threads(n)
     monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
     words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
-    status = register(*words)
-    torch.set_num_threads(before)
-    assert status == 2
+    assert register(*words) == 2
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}

@@ -1,15 +1,11 @@
 """``curvireg register --list``: its tables and how it resumes."""
 
-import json
-
 import pytest
 import torch
 
-from curvireg_torch import Pipeline, ViewBank, sample_views
-from curvireg_torch.cli import main
+from curvireg_torch import ViewBank
 from curvireg_torch.evaluation import photograph
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
 from tests._support.scenes import scene
 
@@ -87,22 +83,6 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
     assert printed.splitlines()[-1] == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
-
-
-def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
-    """With the network and the search, where rounding errors would grow."""
-    views = sample_views(azimuth_step=45, elevations=[20])
-    bank = folder / "coarse.safetensors"
-    ViewBank.build(example_mesh(), views, pipeline=Pipeline(), progress=False).save(bank)
-    rows = [[f"photos/{seed}.png", *box_of(seed), *CAMERA] for seed in range(2)]
-    path = written(folder / "alone.csv", f"{HEADER},fx,fy,cx,cy", *rows)
-    assert main(["register", "--list", str(path), str(bank), "--out", str(tmp_path / "list"), "--quiet"]) == 0
-    for line, (photo, *numbers) in zip(lines(tmp_path / "list"), rows, strict=True):
-        words = ["--box", *numbers[:4], "--camera", *numbers[4:], "--out", str(tmp_path / "one"), "--quiet"]
-        assert main(["register", str(folder / photo), str(bank), *words]) == 0
-        alone = json.loads((tmp_path / "one" / "result.json").read_text())
-        keys = ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline")
-        assert [line[name] for name in keys] == [alone[name] for name in keys]
 
 
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):

@@ -28,7 +28,9 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
     assert [row["status"] for row in rows] == ["ok"] * 6 + ["failed"]
     assert capsys.readouterr().err == ""
     assert register(photos / "2.png", bank, out="one") == 0
-    assert document("one")["rotation"] == lines(tmp_path / "out")[0]["rotation"]
+    alone, listed = document("one"), lines(tmp_path / "out")[0]
+    for key in ("rotation", "score", "confidence", "top", "pipeline"):
+        assert alone[key] == listed[key], key
     assert not (tmp_path / "one" / "results.csv").exists()
     refused(register(folder / "nothing*.png", bank), "nothing*.png: no photographs")
 

@@ -113,10 +113,7 @@ def test_bop_dataset_refuses_damaged_target_lists(tree, content):
     ],
 )
 def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change, match):
-    path = tree[0] / "models" / "models_info.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+    edit(tree, "../../models/models_info.json", change)
     with pytest.raises(InvalidInputError, match=rf"models_info\.json: .*{match}") as caught:
         BOPDataset(tree[0])
     assert len(str(caught.value)) < 500
@@ -125,9 +122,10 @@ def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change,
 MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    "value", [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
-)
+INVALID = [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
+
+
+@pytest.mark.parametrize("value", INVALID)
 def test_bop_dataset_counts_invalid_rotations(tree, value):
     edit(tree, "scene_gt.json", lambda content: content["0"][0].update(cam_R_m2c=value))
     dataset = BOPDataset(tree[0], targets=False)
@@ -144,13 +142,10 @@ def test_bop_dataset_skips_invalid_cameras(tree, place, value):
     assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
 
 
-def test_bop_dataset_prefers_colour_to_grey(tree):
+def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(tree):
     scene = tree[0] / "test" / "000001"
     (scene / "gray").mkdir()
     (scene / "gray" / "000000.tif").write_bytes(b"")
     assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
-
-
-def test_targets_take_instances_of_unknown_visibility_last(tree):
     edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
     assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible

@@ -86,9 +86,8 @@ def test_read_mat_bounds_all_variables_together(tmp_path):
     packed = zlib.compress(array(6, (1, 100_000), element(2, bytes(100_000)), b"other"), 9)
     for count in (10, 11):
         (tmp_path / "a.mat").write_bytes(file((struct.pack("<II", 15, len(packed)) + packed) * count))
-        with pytest.raises(
-            InvalidInputError, match="holds no variable" if count == 10 else "more than 1,048,576 bytes"
-        ):
+        message = "holds no variable" if count == 10 else "more than 1,048,576 bytes"
+        with pytest.raises(InvalidInputError, match=message):
             read_mat(tmp_path / "a.mat", "record")
     (tmp_path / "a.mat").write_bytes(file(bytes(MAX_MAT_BYTES)))
     with pytest.raises(InvalidInputError, match="larger than 1,048,576 bytes"):

@@ -86,55 +86,41 @@ def test_pascal3d_reads_image_sets_with_invalid_entries(tree):
     assert dict(dataset.skipped) == {"missing_annotation": 2}
 
 
-def test_pascal3d_defaults_of_missing_camera_fields(tree):
-    entry = pascal_object("car")
-    entry["viewpoint"] = {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}
-    write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(tree):
+    record = tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat"
+    write_record(record, [{**pascal_object("car"), "viewpoint": {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}}])
     sample = Pascal3DPlus(tree[0], categories=["car"])[0]
     assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
     assert sample["viewpoint"].tolist() == [10, 20, 0]
-
-
-def test_pascal3d_skips_invalid_cad_indices(tree):
     for cad_index in (-1.0, 0.0, 1e300, math.nan, math.inf, "one"):
-        entry = pascal_object("car", cad_index=cad_index)
-        write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+        write_record(record, [pascal_object("car", cad_index=cad_index)])
         assert Pascal3DPlus(tree[0], categories=["car"]).skipped["missing_mesh"] == 3
 
 
-def test_pascal3d_reports_missing_files_with_advice(tree, tmp_path):
+def test_pascal3d_reports_missing_files_with_advice_and_refuses_invalid_options(tree, tmp_path):
     with pytest.raises(MissingFileError, match=r"datasets/pascal3d/README\.md"):
         Pascal3DPlus(tmp_path / "nothing")
     with pytest.raises(MissingFileError, match=r"train.*README"):
         Pascal3DPlus(tree[0], "train")
     with pytest.raises(MissingFileError, match=r"boat_val\.txt"):
         Pascal3DPlus(tree[0], categories=["boat"])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+    for options, message in (
         ({"part": "voc"}, "part"),
         ({"pixel_origin": 2}, "pixel_origin"),
         ({"categories": "car"}, "list of names"),
         ({"categories": ["../car"]}, "plain names"),
         ({"split": "../val", "categories": []}, "plain names"),
-    ],
-)
-def test_pascal3d_refuses_invalid_options(tree, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        Pascal3DPlus(tree[0], **options)
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            Pascal3DPlus(tree[0], **options)
 
 
-def test_annotation_has_no_image(tree):
-    dataset = Pascal3DPlus(tree[0])
+def test_annotation_has_no_image(pascal):
+    dataset = pascal
     assert set(dataset[0]) - set(dataset.annotation(0)) == {"image"}
     dataset.annotation(0)["box"].zero_()
     assert dataset.annotation(0)["box"].sum() > 0, "a sample is a copy"
     with pytest.raises(IndexError):
         dataset[len(dataset)]
-
-
-def test_pascal3d_reports_damaged_photographs_on_access(pascal):
     with pytest.raises(ImageError, match="2008_000003"):
-        [pascal[i] for i in range(len(pascal))]
+        [dataset[i] for i in range(len(dataset))]

@@ -20,14 +20,13 @@ from .small import SMALL, rows_of, run, without_seconds
 
 def test_evaluate_pascal3d(pascal, tmp_path):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
+    assert [benchmark.selection(count) for count in (2, 9)] == [[0, 2], [0, 1, 2, 3, 4]], "spread"
     summary = run(benchmark, tmp_path / "out")
     assert summary["n"] == 3
-    assert {k: summary["skipped"][k] for k in ("unreadable_image", "unreadable_mesh")} == {
-        "unreadable_image": 1, "unreadable_mesh": 1,
-    }  # fmt: skip
-    assert summary["skipped"]["missing_image"] == 1, "objects that the dataset leaves out are counted"
-    assert "other_class" not in summary["skipped"], "objects of other classes are not"
-    assert summary["failed"] == 0
+    skipped = summary["skipped"]
+    assert (skipped["unreadable_image"], skipped["unreadable_mesh"], summary["failed"]) == (1, 1, 0)
+    assert skipped["missing_image"] == 1, "objects that the dataset leaves out are counted"
+    assert "other_class" not in skipped, "objects of other classes are not"
     rows = rows_of(benchmark, tmp_path / "out")
     assert {k: (r.get("skipped"), r["status"]) for k, r in rows.items()} == {
         "car/2008_000001/0": (None, "ok"),
@@ -73,17 +72,14 @@ def test_objects_fail_alone(bop, tmp_path):
     assert summary["failed"] == 2
 
 
-def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path):
-    benchmark, before = Pascal3DBenchmark(pascal, Protocol()), torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        run(benchmark, tmp_path / "one")
-        torch.set_num_threads(2)
-        run(benchmark, tmp_path / "two", limit=2)
-        first = rows_of(benchmark, tmp_path / "two")
-        run(benchmark, tmp_path / "two")
-    finally:
-        torch.set_num_threads(before)
+def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path, threads):
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    threads(1)
+    run(benchmark, tmp_path / "one")
+    threads(2)
+    run(benchmark, tmp_path / "two", limit=2)
+    first = rows_of(benchmark, tmp_path / "two")
+    run(benchmark, tmp_path / "two")
     one, two = (rows_of(benchmark, tmp_path / name) for name in ("one", "two"))
     assert without_seconds(one) == without_seconds(two)
     assert len(first) == 2
@@ -99,17 +95,11 @@ def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
 
 
-@pytest.fixture
-def two_cars(pascal):
-    """A second CAD of a car, of another shape."""
-    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")
-    return pascal
-
-
-def test_protocol_and_pipeline_reach_the_registrar(two_cars, tmp_path, monkeypatch):
+def test_protocol_and_pipeline_reach_the_registrar(pascal, tmp_path, monkeypatch):
+    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")  # a second CAD of a car
     registrars, init = [], Registrar.__init__
     monkeypatch.setattr(Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k))
-    benchmark = Pascal3DBenchmark(two_cars, Protocol(cad="any"))
+    benchmark = Pascal3DBenchmark(pascal, Protocol(cad="any"))
     run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
     assert len(registrars[0].others or registrars[-1].others) == 1
     for registrar in registrars:
@@ -149,12 +139,6 @@ def test_every_dataset_opens_and_names_its_groups(kind, tmp_path):
     benchmark = row.scored(dataset, Protocol(pose=row.pose))
     assert benchmark.name == kind
     assert [str(path) for path in benchmark.entries[0].meshes] == [str(sample[benchmark.mesh])]
-
-
-def test_selection_is_spread(pascal):
-    benchmark = Pascal3DBenchmark(pascal, Protocol())
-    assert benchmark.selection(2) == [0, 2]
-    assert benchmark.selection(9) == [0, 1, 2, 3, 4]
 
 
 @pytest.fixture

@@ -99,9 +99,8 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
 def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
     path, options = tmp_path / "excel.csv", RegisterOptions(meshes=(tmp_path / "part.stl",))
-    path.write_text(
-        "Photo ,x0,Y0,x1,y1,note,,\na.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
-    )
+    rows = "a.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
+    path.write_text(f"Photo ,x0,Y0,x1,y1,note,,\n{rows}")
     found = read_list(path, options)
     assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
     assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
@@ -110,17 +109,10 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     assert read_list(path, options)[0].box == (1.0, 2.0, 30.0, 40.0)
 
 
-@pytest.mark.parametrize(
-    ("camera", "source"),
-    [
-        (CAMERA, "given"),
-        (replace(CAMERA, size=SIZE), "file"),
-        (LENS, "file"),
-        (50.0, "fov"),
-        ("exif", "exif"),
-        (None, None),
-    ],
-)
+FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
+
+
+@pytest.mark.parametrize(("camera", "source"), [(CAMERA, "given"), *FILES, (50.0, "fov"), ("exif",) * 2, (None, None)])
 def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
     def with_covariance(image, box, K, **_):
         (result,) = registrar(image, box, K)

@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from functools import cache
 
 import cv2
 import numpy as np
@@ -13,27 +12,19 @@ from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
 from curvireg_torch.evaluation.benchmarks import same_instances
-from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint, transform
-from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE
+from curvireg_torch.geometry import transform
+from curvireg_torch.mesh import mesh_radius
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import CAMERA
+from tests.registration.test_several import WORLD, photograph
 
 from .small import rows_of, run
 
-WORLD = transform(rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.ones(3).double())
-"""``T_world_from_model``."""
 
-
-@cache
-def photograph(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def photograph_in_mm(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Picture, box and ``T_cam_from_model`` of the truck."""
-    mesh, generator = example_mesh(), torch.Generator().manual_seed(int(azimuth))
-    R = rotation_from_viewpoint(azimuth, 10.0, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
-    T = transform(R, ahead - R @ mesh_centre(mesh))
-    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
-    T[:3, 3] *= 1000.0  # BOP is in mm
-    return image, box, T
+    image, box, T = photograph(azimuth, int(azimuth), 0.0)
+    return image, box, transform(T[:3, :3], 1000.0 * T[:3, 3])
 
 
 @pytest.fixture
@@ -44,7 +35,7 @@ def trucks(tmp_path):
         folder, gt, info, cameras = root / "test" / f"{scene:06d}", {}, {}, {}
         (folder / "rgb").mkdir(parents=True)
         for number, azimuth in enumerate(azimuths):
-            image, box, T = photograph(azimuth)
+            image, box, T = photograph_in_mm(azimuth)
             pixels = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
             cv2.imwrite(str(folder / "rgb" / f"{number:06d}.png"), pixels)
             x0, y0, x1, y1 = box.tolist()
@@ -97,7 +88,7 @@ def test_poses_of_the_cameras_come_first(trucks):
     content["0"][0]["cam_t_m2c"][2] *= 1.001
     path.write_text(json.dumps(content))
     benchmark = BOPBenchmark(BOPDataset(trucks.root), Protocol(pose="any", views=4))
-    truths = [photograph(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
+    truths = [photograph_in_mm(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
     for view in benchmark.entries[0].views:
         expected = truths[int(view.photo.stem)] @ torch.linalg.inv(truths[0])
         torch.testing.assert_close(view.T_cam_from_world, expected, atol=1e-3, rtol=0)

@@ -129,18 +129,10 @@ def matrices() -> torch.Tensor:
     across = torch.stack([slope[:, 1], -slope[:, 0]], dim=1)
     adjugate = torch.eye(2, dtype=torch.float64) + across[:, :, None] * across[:, None]
     general = adjugate @ h[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    special = [
-        [[-1, 2], [2, -1]],  # equal diagonal, negative trace: a diagonal ridge
-        [[1, 2], [2, 1]],
-        [[-1, 2], [2, 1]],  # trace 0
-        [[1, -2], [-2, -1]],
-        [[0, 3], [0, 1]],  # triangular
-        [[0, 0], [3, -1]],
-        [[2, 3], [0, -1]],
-        [[0, 0], [0, -5]],
-        [[-5, 0], [0, 0]],
-    ]
-    return torch.cat([general, torch.tensor(special, dtype=torch.float64)])
+    symmetric = [-1, 2, 2, -1], [1, 2, 2, 1], [-1, 2, 2, 1], [1, -2, -2, -1]  # equal diagonal (a ridge), or trace 0
+    triangular = [0, 3, 0, 1], [0, 0, 3, -1], [2, 3, 0, -1], [0, 0, 0, -5], [-5, 0, 0, 0]
+    special = torch.tensor([*symmetric, *triangular], dtype=torch.float64)
+    return torch.cat([general, special.view(-1, 2, 2)])
 
 
 def test_dominant_eigenvector_against_lapack() -> None:

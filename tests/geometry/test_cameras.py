@@ -9,7 +9,7 @@ from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
 
-K = torch.tensor([[240.0, 0.0, 70.3], [0, 260.0, 51.8], [0, 0, 1]], dtype=torch.float64)
+K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
 
 def test_project_points_agrees_with_opencv() -> None:
@@ -21,9 +21,6 @@ def test_project_points_agrees_with_opencv() -> None:
     np.testing.assert_allclose(ours, expected, atol=1e-9)
     box = g.projected_boxes(torch.from_numpy(X), T, K)
     np.testing.assert_allclose(box, [*expected.min(0), *expected.max(0)], atol=1e-9)
-
-
-K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
 
 def true_poses(spread: float, count: int = 25) -> list[tuple[torch.Tensor, ...]]:

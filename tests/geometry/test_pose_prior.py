@@ -14,16 +14,10 @@ def rotations(azimuth, elevation=0.0, theta=0.0):
     return rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta)))
 
 
-@pytest.mark.parametrize(
-    ("limits", "azimuth", "missed"),
-    [
-        ((300, 60), 0, 0),
-        ((300, 60), 290, 10),
-        ((300, 60), 180, 120),
-        ((60, 300), 0, 60),
-        ((0, 360), 123, 0),
-    ],
-)
+WRAPPED = [((300, 60), 0, 0), ((300, 60), 290, 10), ((300, 60), 180, 120), ((60, 300), 0, 60), ((0, 360), 123, 0)]
+
+
+@pytest.mark.parametrize(("limits", "azimuth", "missed"), WRAPPED)
 def test_azimuth_limits_wrap_around_zero(limits, azimuth, missed):
     excess = PosePrior(azimuth=limits).excess(rotations(float(azimuth)))
     assert float(excess.clamp(min=0.0)) == pytest.approx(min(missed, 90), abs=1e-5)

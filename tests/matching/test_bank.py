@@ -52,15 +52,11 @@ def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
     assert a.settings == b.settings
 
 
-def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch):
-    before = torch.get_num_threads()
+def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch, threads):
     monkeypatch.setattr(bank_module, "VIEWS_AT_A_TIME", 5)
-    try:
-        torch.set_num_threads(3)
-        other = build(truck, small_bank.views)
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(before)
+    threads(3)
+    other = build(truck, small_bank.views)
+    assert torch.get_num_threads() == 3
     assert_same(other, small_bank, atol=1e-5)
     assert torch.equal(other.points_at(torch.tensor([3, 0])), small_bank.points_at(slice(None))[[3, 0]])
 

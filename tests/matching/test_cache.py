@@ -126,13 +126,8 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
     cached_box(None)
     (bank,) = list_cache()
     assert bank.size == bank.path.stat().st_size > 1000
-    foreign = [
-        tmp_path / "model.safetensors",
-        tmp_path / bank.path.name,  # a bank in another folder
-        bank.path.with_name("my bank.safetensors"),
-        bank.path.with_name(f"{bank.path.name}.orig"),
-        bank.path.with_name("notes.txt"),
-    ]
+    foreign = [tmp_path / "model.safetensors", tmp_path / bank.path.name]  # the second is a bank in another folder
+    foreign += map(bank.path.with_name, ("my bank.safetensors", f"{bank.path.name}.orig", "notes.txt"))
     for path in foreign:
         path.write_bytes(b"notes")
     assert list_cache() == [bank]

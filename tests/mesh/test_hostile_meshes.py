@@ -136,11 +136,6 @@ def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.Mo
     assert texture[9, 9].tolist() == [200, 100, 50]
 
 
-def test_check_gltf_counts_every_copy_of_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_MESH_FACES", 100)
-    refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
-
-
 OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
 
 
@@ -182,6 +177,9 @@ def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.Mo
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
     refused(tmp_path / "a.stl", content, "1,280 faces")
+    copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode()
+    monkeypatch.setattr(files, "MAX_MESH_FACES", 100)
+    refused(tmp_path / "a.gltf", copies, "more than 100 faces")
     monkeypatch.setattr(files, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
 

@@ -213,9 +213,6 @@ def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
     assert 0.001 < float(torch.rad2deg(C.diagonal()[:3].sqrt()).max()) < 5.0
     assert int(fit.observable) == 6
     assert float(fit.start_support) < float(fit.edge_support)
-    both = fit_contours(contours, image, box, camera, torch.cat([start, truth[None]]))
-    torch.testing.assert_close(both.transform[:1], fit.transform)
-    torch.testing.assert_close(both.edge_support[:1], fit.edge_support)
     crops = EdgeCrops.cut([image], box[None], 0.1)
     support = contour_support(contours, crops, camera[None], fit.transform, FIRST)
     assert float(support) == pytest.approx(float(fit.edge_support), abs=0.03)

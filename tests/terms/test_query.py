@@ -29,9 +29,8 @@ def test_box_jitter_recovers_a_shifted_view(bank):
     side = S / (1 + 2 * margin)
     box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
     shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
-    exact, jitter = (
-        ViewMatcher(bank, field=_Gradient(), pipeline=replace(bank.pipeline, box_jitter=s)) for s in (0.0, 0.1)
-    )
+    pipelines = (replace(bank.pipeline, box_jitter=jitter) for jitter in (0.0, 0.1))
+    exact, jitter = (ViewMatcher(bank, field=_Gradient(), pipeline=pipeline) for pipeline in pipelines)
     cases = ((exact, box), (exact, shifted), (jitter, shifted))
     reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
     assert lost < reference - 0.05

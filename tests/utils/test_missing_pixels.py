@@ -1,5 +1,3 @@
-"""NaN and infinite pixels: refused in the box, ignored beside it, filled in fields."""
-
 import math
 
 import torch
@@ -7,9 +5,6 @@ import torch
 import curvireg_torch as cr
 from curvireg_torch import filters
 from curvireg_torch.features.backbone import Backbone, describe
-from tests._support.scenes import scene
-
-IMAGE, BOX, _ = scene(0)
 
 
 def test_fields_fill_missing_pixels() -> None:

@@ -1,6 +1,6 @@
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -9,11 +9,8 @@ from curvireg_torch.utils import threads
 
 
 @pytest.fixture(autouse=True)
-def two_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+def _two_threads(threads: Callable[[int], None]) -> None:
+    threads(2)
 
 
 def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
