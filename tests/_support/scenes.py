@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 __all__ = ["CAMERA", "SIZE", "errors", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar"]
-__all__ += ["unrefined"]
+__all__ += ["unrefined", "write_photo"]
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -69,3 +71,8 @@ def unrefined(bank: ViewBank, **changes: Any) -> Pipeline:
 def truck_registrar(**changes: Any) -> Registrar:
     """A registrar of the truck, with changed fields of its pipeline."""
     return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))
+
+
+def write_photo(path: Path, image: Tensor) -> None:
+    """Write a photograph (3, H, W) in [0, 1]."""
+    assert cv2.imwrite(str(path), (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy())

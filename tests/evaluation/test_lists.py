@@ -4,8 +4,6 @@ import json
 import os
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
@@ -21,7 +19,7 @@ from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import lines, table
-from tests._support.scenes import SIZE, scene, unrefined
+from tests._support.scenes import SIZE, scene, unrefined, write_photo
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
@@ -38,8 +36,7 @@ def registrar():
 @pytest.fixture
 def entry(tmp_path):
     """A photograph with its box."""
-    picture = (scene(0)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-    cv2.imwrite(str(tmp_path / "photo.png"), picture)
+    write_photo(tmp_path / "photo.png", scene(0)[0])
     (tmp_path / "mesh.ply").write_text("a mesh")
     return Entry({}, "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
 

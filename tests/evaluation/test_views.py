@@ -3,7 +3,6 @@
 import json
 from collections import Counter
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +14,7 @@ from curvireg_torch.evaluation.benchmarks import same_instances
 from curvireg_torch.geometry import transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import CAMERA
+from tests._support.scenes import CAMERA, write_photo
 from tests.registration.test_several import WORLD, photograph
 
 from .small import rows_of, run
@@ -36,8 +35,7 @@ def trucks(tmp_path):
         (folder / "rgb").mkdir(parents=True)
         for number, azimuth in enumerate(azimuths):
             image, box, T = photograph_in_mm(azimuth)
-            pixels = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-            cv2.imwrite(str(folder / "rgb" / f"{number:06d}.png"), pixels)
+            write_photo(folder / "rgb" / f"{number:06d}.png", image)
             x0, y0, x1, y1 = box.tolist()
             gt[number] = [{"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}]
             info[number] = [{"bbox_obj": [x0, y0, x1 - x0, y1 - y0], "visib_fract": 1.0}]

@@ -76,14 +76,11 @@ def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("info", "step", "match"),
-    [
+def test_symmetry_transforms_refuses_malformed_input() -> None:
+    for info, step, match in (
         ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
         ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
         *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
-    ],
-)
-def test_symmetry_transforms_refuses_malformed_input(info: dict[str, object], step: float, match: str) -> None:
-    with pytest.raises(InvalidInputError, match=match):
-        g.symmetry_transforms(info, max_step_fraction=step)
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            g.symmetry_transforms(info, max_step_fraction=step)

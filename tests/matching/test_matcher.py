@@ -69,18 +69,15 @@ def test_ranking_breaks_ties_in_the_order_of_the_bank(bank, matcher):
     assert ranking.order[0].tolist() == list(range(len(bank)))
 
 
-@pytest.mark.parametrize(
-    ("image", "boxes", "message"),
-    [
+def test_matcher_refuses_unusable_input(matcher):
+    for image, boxes, message in (
         (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
         (torch.rand(1, 3, 64, 64), [[500.0, 5, 600, 50]], "outside"),
         (torch.rand(2, 3, 64, 64), [[5.0, 5, 50, 50]] * 3, r"shape \(2, 4\), one for each image, got \(3, 4\)"),
         (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
-    ],
-)
-def test_matcher_refuses_unusable_input(matcher, image, boxes, message):
-    with pytest.raises(InvalidInputError, match=message):
-        matcher(image, torch.tensor(boxes))
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            matcher(image, torch.tensor(boxes))
 
 
 @pytest.mark.parametrize("channels", [3, 1])

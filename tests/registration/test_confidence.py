@@ -78,20 +78,16 @@ def test_probabilities_of_hypotheses_in_closed_form():
     assert confidence.hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
-@pytest.mark.parametrize(
-    ("pipeline", "calibrated"),
-    [
+def test_only_the_default_pipeline_is_calibrated():
+    for pipeline, calibrated in (
         (Pipeline(), True),
         (replace(Pipeline(), hypotheses=1, box_jitter=0.0), True),
         (replace(Pipeline(), contours=False), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),
-    ],
-    ids=str,
-)
-def test_only_the_default_pipeline_is_calibrated(pipeline, calibrated):
-    assert confidence.is_calibrated(pipeline) == calibrated
+    ):
+        assert confidence.is_calibrated(pipeline) == calibrated
 
 
 def test_uncalibrated_pipeline_gives_no_number():

@@ -77,17 +77,14 @@ def test_edges_are_measured_to_a_fraction_of_a_pixel(side):
     assert measured.weight[0, :, 0].tolist() == pytest.approx([strength * tukey] * 7 + [0.0] * 2)
 
 
-@pytest.mark.parametrize(
-    ("distances", "valid", "expected"),
-    [
+def test_edge_support_is_the_mean_strength_near_valid_points():
+    for distances, valid, expected in (
         (at(8, 0.0), 4, 0.7),
         (at(8, -3.0), 4, 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)),
         (torch.tensor([[0.0, 50.0] * 4]).double(), 4, 0.35),
         (torch.tensor([[0.0, 50.0] * 4]).double(), 0, 0.0),
-    ],
-)
-def test_edge_support_is_the_mean_strength_near_valid_points(distances, valid, expected):
-    assert float(problem(distances, [0.7]).edge_support(state(8, valid=valid))) == pytest.approx(expected)
+    ):
+        assert float(problem(distances, [0.7]).edge_support(state(8, valid=valid))) == pytest.approx(expected)
 
 
 def test_step_undoes_a_motion_despite_stronger_wrong_edges():
@@ -146,21 +143,18 @@ def row_of_points(outline: bool, direction: float, *, count: int = 1) -> Contour
     return ContourPoints(torch.zeros(count, 1, 3, dtype=torch.float64), normals, there, there & outline)
 
 
-@pytest.mark.parametrize(
-    ("outline", "direction", "expected"),
-    [
+def test_mask_weights_within_at_the_border_and_beyond():
+    """At 20 px to the left of the border, on it, and at 20 px to the right."""
+    for outline, direction, expected in (
         (True, 1.0, [0.6, 2.0, 0.6]),
         (True, -1.0, [0.6, 0.6, 0.6]),  # the object lies outside
         (False, 1.0, [1.0, 0.3, 0.3]),
         (False, -1.0, [0.3, 0.3, 1.0]),
-    ],
-)
-def test_mask_weights_within_at_the_border_and_beyond(outline, direction, expected):
-    """At 20 px to the left of the border, on it, and at 20 px to the right."""
-    uv = torch.tensor([[[127.5, 90.0]]], dtype=torch.float64)
-    offsets = torch.tensor([-20.0, 0.0, 20.0], dtype=torch.float64)
-    weights = half_planes(128).weights(uv, row_of_points(outline, direction), offsets, FIRST, 256)
-    assert weights[0, 0].tolist() == pytest.approx(expected)
+    ):
+        uv = torch.tensor([[[127.5, 90.0]]], dtype=torch.float64)
+        offsets = torch.tensor([-20.0, 0.0, 20.0], dtype=torch.float64)
+        weights = half_planes(128).weights(uv, row_of_points(outline, direction), offsets, FIRST, 256)
+        assert weights[0, 0].tolist() == pytest.approx(expected)
 
 
 def test_each_pose_has_the_mask_of_its_crop_at_any_size():
@@ -296,19 +290,16 @@ def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gai
     assert ContourFit(none, none, *supports, none).trustworthy.tolist() == [True, False, True, False]
 
 
-@pytest.mark.parametrize(
-    ("start", "options", "message"),
-    [
+def test_fit_rejects_bad_input():
+    for start, options, message in (
         (CUBE_POSE[None] * math.nan, {}, "starts: expected finite"),
         (CUBE_POSE[None], {"box": torch.zeros(2, 4)}, "box: expected shape"),
         (CUBE_POSE[None], {"finish": 0}, "finish: expected"),
         (CUBE_POSE[None], {"object_mask": torch.ones(2, 1, 8, 8)}, "object_mask"),
         (CUBE_POSE[None], {"image_index": torch.tensor([1])}, "image_index: expected"),
-    ],
-)
-def test_fit_rejects_bad_input(start, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        fitted(noise(), start, **options)
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            fitted(noise(), start, **options)
 
 
 def test_quick_support_reaches_far_and_counts_the_mask():

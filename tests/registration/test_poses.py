@@ -20,16 +20,12 @@ def poses(degrees: list[float]) -> Poses:
     return Poses(**{**{f.name: number for f in fields(Poses)}, "rotation": rotation_from_axis_angle(axis_angle)})
 
 
-@pytest.mark.parametrize(
-    ("degrees", "score", "expected"),
-    [
+def test_distinct_poses():
+    for degrees, score, expected in (
         ([0.0, 14.0, 16.0, 180.0], [0.9, 0.8, 0.7, 0.6], [True, False, True, True]),
         ([0.0, 10.0], [0.1, 0.2], [False, True]),
-    ],
-    ids=["15 degrees", "best is kept"],
-)
-def test_distinct_poses(degrees, score, expected):
-    assert distinct_poses(poses(degrees), torch.tensor(score)).tolist() == expected
+    ):
+        assert distinct_poses(poses(degrees), torch.tensor(score)).tolist() == expected
 
 
 def ranking(scores: torch.Tensor, allowed: torch.Tensor | None = None) -> Ranking:

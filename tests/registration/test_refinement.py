@@ -55,37 +55,29 @@ def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     assert result.ok or (isinstance(result.error, LostObjectError) and "image 0" in str(result.error))
 
 
-@pytest.mark.parametrize(
-    ("move", "message"),
-    [
+def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar):
+    for move, message in (
         ((0.0, 0.0, -100.0), "outside the photograph"),
         ((50.0, 0.0, 0.0), "outside the photograph"),
         ((0.0, 0.0, 1000.0), "less than 12 px wide; check unit and distance"),
-    ],
-    ids=["behind", "beside", "far"],
-)
-def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar, move, message):
-    image, _, T = scene(0)
-    T = T.clone()
-    T[:3, 3] += torch.tensor(move)
-    result = registrar.refine([image], CAMERA, [T])[0]
-    assert isinstance(result.error, LostObjectError)
-    assert message in str(result.error)
+    ):
+        image, _, T = scene(0)
+        T = T.clone()
+        T[:3, 3] += torch.tensor(move)
+        result = registrar.refine([image], CAMERA, [T])[0]
+        assert isinstance(result.error, LostObjectError)
+        assert message in str(result.error)
 
 
-@pytest.mark.parametrize(
-    ("poses", "camera", "message"),
-    [
+def test_refine_checks_its_arguments(registrar):
+    for poses, camera, message in (
         ([torch.eye(4)], None, "camera matrix"),
         ([torch.eye(4)] * 2, CAMERA, "starts of 1 photographs, got 2"),
         ([2 * torch.eye(4)], CAMERA, "poses"),
         ([torch.eye(3)], CAMERA, "poses"),
-    ],
-    ids=["no camera", "count", "scale", "shape"],
-)
-def test_refine_checks_its_arguments(registrar, poses, camera, message):
-    with pytest.raises(InvalidInputError, match=message):
-        registrar.refine([scene(0)[0]], camera, poses)
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            registrar.refine([scene(0)[0]], camera, poses)
 
 
 @pytest.mark.parametrize(("confidence", "ok"), [(0.34, False), (0.36, True)])

@@ -286,35 +286,29 @@ def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
     assert restored > 0
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "message"),
-    [
+def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
+    for low, high, message in (
         (0.4, 0.4 + 0.9 / 255.0, "one colour"),
         (0.2, 1.01, r"outside \[0, 1\]"),
         (-0.01, 0.8, r"outside \[0, 1\]"),
         (0.4, 0.4 + 2.0 / 255.0, None),
         (-0.0005, 1.0005, None),
-    ],
-)
-def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, high, message):
-    crop = torch.full((3, 8, 8), low)
-    crop[:, 2:5, 3] = high
-    with pytest.raises(ImageError, match=message) if message else nullcontext():
-        check_crop(crop)
+    ):
+        crop = torch.full((3, 8, 8), low)
+        crop[:, 2:5, 3] = high
+        with pytest.raises(ImageError, match=message) if message else nullcontext():
+            check_crop(crop)
 
 
-@pytest.mark.parametrize(
-    ("size", "given", "box", "expected"),
-    [
+def test_boxes_are_compared_inside_the_photograph():
+    for size, given, box, expected in (
         ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
         ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
         ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
-    ],
-)
-def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
-    item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
-    assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
+    ):
+        item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+        assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):

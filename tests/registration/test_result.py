@@ -103,21 +103,18 @@ def test_remarks_print_the_replaced_box_in_whole_pixels():
     assert line.endswith(": 1 3 30 41")
 
 
-@pytest.mark.parametrize(
-    ("viewpoint", "words"),
-    [
+def test_pose_in_words():
+    for viewpoint, words in (
         ((0, 0, 0), "seen from the front (azimuth 0°), level"),
         ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
         ((225, 30, -40), "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the right"),
         ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
         ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
-    ],
-)
-def test_pose_in_words(viewpoint, words):
-    R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
-    assert pose_in_words(R) == words
-    for up, front in (("y", None), ("-x", None), ("z", "x")):
-        assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
+    ):
+        R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+        assert pose_in_words(R) == words
+        for up, front in (("y", None), ("-x", None), ("z", "x")):
+            assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
 
 
 def test_verdict_has_three_words():
@@ -133,18 +130,15 @@ def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
     return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
 
 
-@pytest.mark.parametrize(
-    ("rotations", "word"),
-    [
+def test_ambiguity():
+    for rotations, word in (
         (turned(10.0), None),
         (turned(10.0, 190.0), "half turn"),
         (turned(40.0, 320.0), "mirror"),
         (turned(40.0, 100.0), "several"),
         (turned(0.0, 120.0, 240.0), "several"),
-    ],
-)
-def test_ambiguity(rotations, word):
-    assert ambiguity(rotations) == word
+    ):
+        assert ambiguity(rotations) == word
 
 
 @pytest.mark.parametrize(("second", "word"), [(0.31, "mirror"), (0.29, None)])

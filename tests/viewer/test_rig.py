@@ -6,10 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
@@ -19,9 +17,9 @@ from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.workspace import Workspace
-from tests._support.lists import CAMERA as NUMBERS
+from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos
 from tests._support.scenes import learned_registrar
-from tests.registration.test_several import EASY, WORLD, rig_of
+from tests.registration.test_several import WORLD
 from tests.viewer.test_workspace import upload
 
 HEADER = ["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION]
@@ -29,12 +27,8 @@ HEADER = ["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION]
 
 def write_rig(folder: Path) -> list[list]:
     """Write 0.png to 2.png, truck.safetensors and rig.csv, without a box of the second; returns its rows."""
-    rows = []
-    for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
-        picture = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
-        cv2.imwrite(str(folder / f"{k}.png"), picture)
-        given = [""] * 4 if k == 1 else box.tolist()
-        rows.append([f"{k}.png", *given, *NUMBERS, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()])
+    rows = write_rig_photos(folder)
+    rows[1][1:5] = [""] * 4
     write_table(folder / "rig.csv", HEADER, rows)
     learned_registrar().bank.save(folder / "truck.safetensors")
     return rows
@@ -224,19 +218,10 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
 
 def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     folder, rows = rig
-    T = [torch.tensor(row[9:]).double() for row in rows]
-    lines, scene = [], {}
     for k, row in enumerate(rows):
-        x, y, z, w = Rotation.from_matrix(T[k][:9].view(3, 3).numpy()).as_quat()
-        lines += [f"{k + 1} {w} {x} {y} {z} {row[18]} {row[19]} {row[20]} 1 {row[0]}", ""]
-        K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-        scene[str(k)] = {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]}
         shutil.copy(folder / row[0], tmp_path / f"00000{k}.png")
-    (tmp_path / "images.txt").write_text("\n".join(lines))
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
-    (tmp_path / "scene_camera.json").write_text(json.dumps(scene))
-    (tmp_path / "scene_gt.json").write_text(json.dumps({str(k): [{"obj_id": 5}] for k in range(3)}))
-    (tmp_path / "scene_gt_info.json").write_text(json.dumps({str(k): [{"bbox_obj": [5, 6, 20, 30]}] for k in range(3)}))
+    write_colmap(tmp_path, rows)
+    write_bop_scene(tmp_path, rows, [[5]] * 3, [[5, 6, 20, 30]])
     session = send(workspace, folder, "0.png", "1.png")
     send(workspace, tmp_path, "images.txt")
     assert workspace.messages["rig"].startswith("images.txt: ")
