@@ -76,36 +76,20 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     assert [line["inputs"]["camera_source"] for line in lines(tmp_path)] == ["given", "fov", "fov"]
 
 
-CALIBRATION = """%YAML:1.0
----
-image_width: 240
-image_height: 180
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [260., 0., 20., 0., 260., 30., 0., 0., 1.]
-distortion_coefficients: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data: [-0.25, 0.1, 0., 0., 0.]
-"""
-
-
 @pytest.fixture(scope="module")
 def lens(folder):
     """A photograph that a lens with distortion took, its calibration and mask; returns its box and the true pose."""
     camera = Camera(camera_matrix(260.0, 260.0, 20.0, 30.0), (-0.25, 0.1, 0.0, 0.0, 0.0), size=(180, 240))
+    calibration = {"mtx": camera.matrix.tolist(), "dist": camera.distortion, "image_size": [240, 180]}
     _, photo, box, mask, T = distorted(camera, 1)
     write_photo(folder / "distorted.png", photo)
     cv2.imwrite(str(folder / "mask.png"), (255 * mask).round().byte().numpy())
-    (folder / "cam.yaml").write_text(CALIBRATION)
+    (folder / "cam.json").write_text(json.dumps(calibration))
     return [str(v) for v in box.tolist()], T
 
 
 def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys):
-    (box, T), out, camera = lens, tmp_path / "out", str(folder / "cam.yaml")
+    (box, T), out, camera = lens, tmp_path / "out", str(folder / "cam.json")
     files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", camera]
     words = ["--box", *box, "--out", str(out), "--quiet", "--format", "ros"]
     assert main(["register", *files, *words]) == 0
@@ -127,7 +111,7 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys)
 
 def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
     box, T = lens
-    rows = [["distorted.png", *box, "cam.yaml", ""], ["distorted.png", *[""] * 4, "cam.yaml", "mask.png"]]
+    rows = [["distorted.png", *box, "cam.json", ""], ["distorted.png", *[""] * 4, "cam.json", "mask.png"]]
     rows += [["distorted.png", *box, "none.yaml", ""], ["distorted.png", *box, "", "none.png"]]
     path = written(folder / "calibrated.csv", "photo,x0,y0,x1,y1,camera,mask", *rows)
     words = ["register", "--list", str(path), str(folder / "learned.safetensors"), "--quiet", "--out", str(tmp_path)]
@@ -148,7 +132,7 @@ def test_masks_and_calibrations_that_do_not_fit_are_refused(folder, refused, tmp
     for photo, words, message in (
         ("photos/0.png", ["--mask", "black.png"], "no white pixel"),
         ("photos/0.png", ["--mask", "small.png"], "that of the photograph"),
-        ("tall.png", ["--camera", "cam.yaml"], "turn the photograph by 90 degrees"),
+        ("tall.png", ["--camera", "cam.json"], "turn the photograph by 90 degrees"),
         ("photos/0.png", ["--camera", "photos/1.png"], "not a text file"),
     ):
         words[1] = str(folder / words[1])

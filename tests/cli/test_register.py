@@ -126,14 +126,11 @@ def start(folder):
     return write
 
 
-def test_register_refines_a_start(register_one, document, start):
+def test_register_refines_a_start_or_writes_that_the_object_is_lost(register_one, document, start, capsys):
     assert register_one(*start(), box=()) == 0
     result = document()
     assert float(rotation_error(rotation(result), scene(0)[2][:3, :3])) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
-
-
-def test_register_writes_that_the_object_is_lost(register_one, document, start, capsys):
     assert register_one(*start(shift=100.0), box=()) == 2
     assert document()["status"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err

@@ -25,10 +25,6 @@ distortion_coefficients:
   rows: 1
   cols: 5
   data: [-0.31, 0.12, 0.001, -0.002, 0.03]
-rectification_matrix:
-  rows: 3
-  cols: 3
-  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
 projection_matrix:
   rows: 3
   cols: 4
@@ -75,9 +71,7 @@ cam1:
   resolution: [640, 480]
   rostopic: /cam1/image_raw
 """
-COLMAP = """# Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
-# Number of cameras: 6
+COLMAP = """#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 1 SIMPLE_PINHOLE 640 480 520.5 321.75 239
 2 PINHOLE 640 480 520.5 522 321.75 239
 3 SIMPLE_RADIAL 640 480 520.5 321.75 239 -0.31

@@ -1,5 +1,6 @@
-"""Links, names, options and commands on the documentation's pages exist."""
+"""Links, names, options and commands on the documentation's pages exist, and the page of messages is made."""
 
+import importlib.util
 import inspect
 import re
 from importlib import import_module
@@ -78,3 +79,13 @@ def test_reference_lists_every_public_name() -> None:
     assert {name for name, _ in listed} == public - {"__version__"}
     for name, dotted in listed:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
+
+
+def test_messages_are_listed_with_what_to_do():
+    spec = importlib.util.spec_from_file_location("messages", DOCS / "messages.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    photographs, meshes = module.page(ROOT / "curvireg_torch").split("## Meshes")
+    assert "| frame … cannot be read | save the video again |" in photographs  # an f-string
+    assert "| every face is degenerate (area 0) | repair the mesh |" in meshes
+    assert "give --camera FX FY CX CY, --camera FILE (a calibration)" in meshes, "a constant of another module"

@@ -153,7 +153,7 @@ def evaluate(tmp_path):
     return run
 
 
-def test_evaluate_prints_the_headline_of_some_categories(pascal, evaluate, capsys):
+def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_file(pascal, evaluate, capsys, tmp_path):
     words = ("pascal3d", pascal.root, "--categories", "car")
     assert evaluate(*words, "--limit", "2")["limit"] == 2
     summary = evaluate(*words)
@@ -163,6 +163,9 @@ def test_evaluate_prints_the_headline_of_some_categories(pascal, evaluate, capsy
     assert lines[-3].startswith("3 objects, 0 failed, ")
     numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
     assert lines[-2].startswith(numbers)
+    (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
+    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
+    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
@@ -192,9 +195,3 @@ def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):
     with pytest.raises(InvalidInputError, match=r"nothing was scored .*unreadable_image"):
         evaluate("pascal3d", pascal.root)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["n"] == 0
-
-
-def test_evaluate_takes_a_pipeline_file(pascal, evaluate, tmp_path):
-    (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
-    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
-    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)

@@ -217,7 +217,7 @@ def located(*boxes):
     return {"detection": {"proposals": proposals}, "inputs": {"picture": {"width": 200, "height": 100}}}
 
 
-def test_detection_recall_counts_the_first_right_proposal_and_failures_but_no_unknown_boxes():
+def test_detection_recall_counts_the_first_right_proposal_and_clips_boxes():
     half, less = (10, 10, 30, 20), (10, 10, 30, 19.9)
     rows = [located(BOX), located(AWAY, half), located(*[AWAY] * 5, BOX), located(less), located(*[AWAY] * 20, BOX)]
     recall = detection_recall([sample(*BOX)] * 5, rows)
@@ -226,9 +226,6 @@ def test_detection_recall_counts_the_first_right_proposal_and_failures_but_no_un
     recall = detection_recall([sample(*BOX), unknown, sample(*BOX)], [located(BOX), located(AWAY), FAILED])
     assert (recall["n"], recall["recall_1"]) == (2, 0.5)
     assert detection_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
-
-
-def test_detection_recall_clips_boxes_to_the_image():
     left = ((-20.5, 10.0, 19.5, 50.0), (-0.5, 10.0, 19.5, 50.0))
     low = ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5))
     for annotated, proposed in (left, left[::-1], low):

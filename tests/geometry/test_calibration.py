@@ -68,12 +68,20 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
     assert float(folded[beyond.numpy()].min()) < 0.05  # the centre again
 
 
-def test_box_outside_of_what_is_shown_is_refused():
+def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (0.0,) * 4, "fisheye")
     with pytest.raises(InvalidInputError, match=r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([0.0, 0, 15, 15]))
     with pytest.raises(InvalidInputError, match="entirely outside the 160 x 120 image"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
+    for arguments, words in (
+        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
+        ({"model": "fisheye"}, "expected 4 finite coefficients"),
+        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
+        ({"size": (0, 640)}, "size of the image"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            Camera(**{"matrix": MATRIX, **arguments})
 
 
 def test_camera_of_a_resized_photograph():
@@ -88,14 +96,3 @@ def test_camera_of_a_resized_photograph():
         RADIAL.at((90, 160))
     with pytest.raises(InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"):
         RADIAL.at((160, 120))
-
-
-def test_unusable_cameras_are_refused():
-    for arguments, words in (
-        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
-        ({"model": "fisheye"}, "expected 4 finite coefficients"),
-        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
-        ({"size": (0, 640)}, "size of the image"),
-    ):
-        with pytest.raises(InvalidInputError, match=words):
-            Camera(**{"matrix": MATRIX, **arguments})

@@ -57,12 +57,19 @@ CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
 HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
 
 
-def test_symmetry_transforms_reads_matrices_row_by_row() -> None:
+def test_symmetry_transforms_reads_matrices_row_by_row_and_refuses_malformed_input() -> None:
     assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
     np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
+    for info, step, match in (
+        ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
+        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
+        *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            g.symmetry_transforms(info, max_step_fraction=step)
 
 
 def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
@@ -74,13 +81,3 @@ def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
         for along in (-5.0, 0.0, 2.0):
             point = np.array(OFFSET) + along * unit
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
-
-
-def test_symmetry_transforms_refuses_malformed_input() -> None:
-    for info, step, match in (
-        ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
-        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
-        *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
-    ):
-        with pytest.raises(InvalidInputError, match=match):
-            g.symmetry_transforms(info, max_step_fraction=step)

@@ -68,12 +68,16 @@ def test_detection_refinement_and_following_take_cameras():
     assert errors(follow(photo), T)[1] < 0.02
 
 
-def test_box_that_the_camera_did_not_record_is_warned_of():
+def test_inverted_masks_and_boxes_that_the_camera_did_not_record_are_warned_of():
     camera = Camera(CAMERA, (1.5, 0.0, 0.0, 0.0), size=SIZE)
     item = image_item(torch.rand(3, *SIZE), torch.tensor([0.0, 0.0, 60.0, 60.0]), camera)
     assert not item.warnings
     item = image_item(torch.rand(3, *SIZE), torch.tensor([-60.0, -60.0, 30.0, 30.0]), camera)
     assert "% of the box lie where the distorted photograph shows nothing" in item.warnings[0]
+    mask = torch.ones(40, 60)
+    mask[5:35, 20:50] = 0.0
+    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
 
 
 def test_mask_gives_the_box_and_the_outline():
@@ -133,13 +137,6 @@ def test_unusable_masks_are_named(mask, box, words):
     assert isinstance(result, FailedRegistration)
     with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
         raise result.error
-
-
-def test_inverted_mask_is_warned_of():
-    mask = torch.ones(40, 60)
-    mask[5:35, 20:50] = 0.0
-    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
-    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
 
 
 def test_camera_is_scaled_to_each_photograph():

@@ -74,7 +74,7 @@ def test_a_pose_that_is_not_believed_is_not_followed(monkeypatch, first):
     assert results[3].confidence <= 0.8
 
 
-def test_confidence_is_a_fraction_of_that_of_the_first_pose(monkeypatch):
+def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_the_same_frame(monkeypatch):
     frames, found = sequence(2), []
     for first in (1.0, 0.7):
         registrar = truck_registrar()
@@ -84,6 +84,10 @@ def test_confidence_is_a_fraction_of_that_of_the_first_pose(monkeypatch):
             follow(*frames[0][:2])
             found.append(follow(frames[1][0]))
     assert found[1].confidence == pytest.approx(0.7 * found[0].confidence, rel=1e-6)
+    registrar = truck_registrar()
+    answering(monkeypatch, registrar, [0.6])
+    follow = Follower(registrar, CAMERA)
+    assert max(follow(*frames[0][:2]).confidence for _ in range(5)) <= 0.6
 
 
 def test_a_wrong_start_never_becomes_believed():
@@ -184,10 +188,3 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
     assert not lost.ok or lost.confidence < BELIEVED_CONFIDENCE
     result = follow(frames[1][0])
     assert errors(result, frames[1][2])[0] < 4.0
-
-
-def test_the_same_frame_again_and_again_does_not_raise_the_confidence(monkeypatch):
-    (image, box, _), registrar = sequence(1)[0], truck_registrar()
-    answering(monkeypatch, registrar, [0.6])
-    follow = Follower(registrar, CAMERA)
-    assert max(follow(image, box).confidence for _ in range(5)) <= 0.6

@@ -1,5 +1,6 @@
-"""The tracker: each measurement alone on drawn objects, and together on generated sequences."""
+"""The tracker: each measurement alone on drawn objects and in closed form, and together on generated sequences."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,18 @@ from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration import tracker
 from curvireg_torch.registration.least_squares import fit_points, pixels
 from curvireg_torch.registration.texture_fit import surface_corners
-from curvireg_torch.registration.tracker import FLOW_SCALES, WINDOW_SIZE, Frame, Keyframe, Tracker, track_points
+from curvireg_torch.registration.tracker import (
+    FLOW_SCALES,
+    HALF_RATE_COUNT,
+    WINDOW_SIZE,
+    Frame,
+    Keyframe,
+    RegionModel,
+    Tracker,
+    colour_bins,
+    line_posterior,
+    track_points,
+)
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
@@ -91,7 +103,7 @@ def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
     assert flow.inlier_ratio(T, WINDOW_K, ZERO) < 0.05  # 14 px beside
 
 
-def test_flow_that_does_not_lead_back_is_left_out():
+def test_flow_that_does_not_lead_back_is_left_out_and_a_uniform_surface_has_none():
     """The right half of the plate is covered by another print."""
     window, T, depth = plate()
     covered = framed(window.grey.copy())
@@ -100,10 +112,6 @@ def test_flow_that_does_not_lead_back_is_left_out():
     right = flow.model[0, :, 0] > 0.1
     assert float((flow.weight[0, right] > 0).double().mean()) < 0.2
     assert float((flow.weight[0, ~right] > 0).double().mean()) > 0.7
-
-
-def test_uniform_surface_has_no_corners_and_no_flow():
-    window, T, depth = plate()
     bare = framed(np.full_like(window.grey, 90))
     flow = track_points(keyframe_of(bare, T, depth), window, T, ZERO, levels=1)
     assert flow.uv.shape == (1, 0, 2)
@@ -185,3 +193,47 @@ def test_frames_from_other_directions_become_keyframes():
         follow.accept(follow.measure(image, CAMERA, T))
     angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
     assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
+
+
+def test_posterior_is_that_of_bayes():
+    ratio = torch.tensor([[0.3, -0.2, 0.9, -1.1, 0.4]], dtype=torch.float64)
+    likelihood = [math.exp(0.3), math.exp(0.1), math.exp(1.0), math.exp(-0.1)]  # ends at -1.5, -0.5, 0.5, 1.5
+    p = torch.tensor(likelihood) / sum(likelihood)
+    d = torch.tensor([-1.5, -0.5, 0.5, 1.5])
+    mean, variance = line_posterior(ratio, 2)
+    assert float(mean) == pytest.approx(float((p * d).sum()), abs=1e-6)
+    assert float(variance) == pytest.approx(float((p * d**2).sum() - (p * d).sum() ** 2), abs=1e-6)
+
+
+def halves():
+    """A red left half and a green right half; pixel columns of 8 lines that point to the right from the middle."""
+    colours = torch.zeros(1, 3, 16, 16)
+    colours[:, 0, :, :8], colours[:, 1, :, 8:] = 1.0, 1.0
+    y, x = torch.meshgrid(torch.arange(4.0, 12.0), torch.arange(16.0), indexing="ij")
+    return colour_bins(colours), torch.stack([x, y], dim=-1)
+
+
+def test_log_ratio_has_the_sign_of_the_learned_colours():
+    bins, uv = halves()
+    model, zero = RegionModel(), torch.zeros(8)
+    model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten())
+    ratio = model.log_ratio(bins, uv, zero)
+    assert (ratio[:, :8] > 0.3).all()
+    assert (ratio[:, 8:] < -0.3).all()
+    opposite = model.log_ratio(bins, uv, zero + math.pi)  # nothing learned there but the mean of all directions
+    assert (opposite[:, :8] > 0.1).all()
+    assert (opposite[:, :8] < ratio[:, :8]).all()
+    outside = model.log_ratio(bins, uv - 100.0, zero)
+    assert (outside == 0).all()
+
+
+def test_histograms_move_by_the_rate_towards_new_colours():
+    bins, uv = halves()
+    model, directions = RegionModel(), torch.zeros(128)
+    red, green = bins[0, 0], bins[0, 15]
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten())
+    assert float(model._histograms[0, 0, red]) == 1.0
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten())  # the colours swap
+    step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
+    assert float(model._histograms[0, 0, green]) == pytest.approx(step)
+    assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)

@@ -1,4 +1,4 @@
-"""Scores of descriptors, feature points and box shapes."""
+"""Scores of descriptors, feature points and box shapes, and jittered copies of a box."""
 
 import math
 from dataclasses import replace
@@ -10,18 +10,22 @@ import sklearn.covariance
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
+from torch import nn
 
 from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
 
 
-def test_correlation_is_the_cosine_of_the_better_crop():
+def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():
     queries, views = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [0.0, 2.0], [5.0, 12.0]])
     expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
     module = terms.Correlation().build(SimpleNamespace(descriptors=views))
     torch.testing.assert_close(module(SimpleNamespace(descriptors=queries[:, None])), expected)
     together = module(SimpleNamespace(descriptors=queries[None]))
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
+    score = terms.Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
+    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
+    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
 
 def sample(count: int, length: int = 12) -> torch.Tensor:
@@ -99,12 +103,6 @@ def test_whole_box_shapes_are_nan_at_the_border():
         assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
 
 
-def test_correlation_score_is_an_exponential_of_standard_deviations():
-    score = terms.Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
-    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
-    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
-
-
 def test_whitening_decorrelates():
     x = sample(4000)
     white = terms.Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
@@ -114,3 +112,35 @@ def test_whitening_decorrelates():
         terms.Whitening(x[:5].mean(dim=0), x[:5].T.cov())
     with pytest.raises(InvalidInputError, match="covariance"):
         terms.Whitening(torch.zeros(3), torch.eye(2))
+
+
+def test_jittered_boxes_are_shifted_and_scaled():
+    box = torch.tensor([[10.0, 20, 110, 70]])
+    jittered = terms.jittered_boxes(box, 0.2)
+    assert jittered[0, 0].equal(box[0])
+    centres = 0.5 * (jittered[0, :, :2] + jittered[0, :, 2:]) - torch.tensor([60.0, 45])
+    expected = torch.tensor([[0.0, 0], [-15, 0], [15, 0], [0, -15], [0, 15], [0, 0], [0, 0]])
+    torch.testing.assert_close(centres, expected)
+    width = jittered[0, :, 2] - jittered[0, :, 0]
+    assert width.tolist() == pytest.approx([100] * 5 + [100 / 1.2, 120], rel=1e-5)
+    assert terms.jittered_boxes(box, 0.0).equal(box[None])
+    assert terms.jittered_boxes(box, 0.45).shape == (1, 7, 4)
+
+
+def test_box_jitter_recovers_a_shifted_view(bank):
+    S, margin = bank.settings.image_size, bank.settings.margin
+    picture = bank.silhouettes_at(slice(30, 31))[:, None].float().expand(-1, 3, -1, -1)
+    side = S / (1 + 2 * margin)
+    box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
+    shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
+    pipelines = (replace(bank.pipeline, box_jitter=jitter) for jitter in (0.0, 0.1))
+    exact, jitter = (ViewMatcher(bank, field=_Gradient(), pipeline=pipeline) for pipeline in pipelines)
+    cases = ((exact, box), (exact, shifted), (jitter, shifted))
+    reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
+    assert lost < reference - 0.05
+    assert recovered > reference - 0.01
+
+
+class _Gradient(nn.Module):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return torch.stack(torch.gradient(image[:, 0], dim=(2, 1)), dim=1)

@@ -96,7 +96,7 @@ def test_check_photograph_and_check_pixels_refuse_other_images() -> None:
             checks.check_pixels(torch.full((3, 2, 2), value), "of the box")
 
 
-def test_as_boxes_accepts_tensors_arrays_and_lists_only() -> None:
+def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only() -> None:
     boxes = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], boxes.int().numpy()):
         assert torch.equal(checks.as_boxes(given, 2).float(), boxes)
@@ -104,9 +104,6 @@ def test_as_boxes_accepts_tensors_arrays_and_lists_only() -> None:
     for bad in (*others, np.array([[1, 2, 3, None]]), torch.ones(1, 4, dtype=torch.bool)):
         with pytest.raises(InvalidInputError, match="boxes: expected"):
             checks.as_boxes(bad, 1)
-
-
-def test_as_camera_matrices_accepts_one_for_all_or_one_for_each() -> None:
     for K in (CAMERA, [CAMERA, CAMERA], [CAMERA.tolist()] * 2, [*CAMERA.expand(2, 3, 3).numpy()], CAMERA.numpy()):
         assert torch.equal(checks.as_camera_matrices(K, 2), CAMERA.expand(2, 3, 3))
     for bad in ([None], "camera", [CAMERA, None], [[1.0, 2.0, 3.0]], [CAMERA, CAMERA[:2]], [CAMERA] * 3):
