@@ -94,8 +94,7 @@ class LayerContract:
         assert torch.equal(x, before)
         assert type(twin).__name__ in repr(twin)
         for y in tensors(want):
-            assert y.device == x.device
-            assert len(y) == len(x)
+            assert (y.device, len(y)) == (x.device, len(x))
             assert torch.isfinite(y).all()
 
     def test_batched_equals_one_by_one(self, case: LayerCase) -> None:

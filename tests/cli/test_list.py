@@ -165,8 +165,7 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
     assert list(rows[0])[:9] == ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
     names = ["2.png", "0.png", "1.png", "2.png", "0.png", "1.png"]
     assert [row["photo"] for row in rows] == [*(str(photos / name) for name in names), str(folder / "none.png")]
-    assert [row["status"] for row in rows] == ["ok"] * 6 + ["failed"]
-    assert capsys.readouterr().err == ""
+    assert ([row["status"] for row in rows], capsys.readouterr().err) == (["ok"] * 6 + ["failed"], "")
     assert register(photos / "2.png", bank, out="one") == 0
     alone, listed = document("one"), lines(tmp_path / "out")[0]
     for key in ("rotation", "score", "confidence", "top", "pipeline"):
@@ -180,8 +179,7 @@ def test_register_uses_box_and_camera_for_all_photographs(folder, register, tmp_
     assert register(*photos, folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA) == 0
     assert "--box and --camera: used for all 2 photographs" in capsys.readouterr().err
     for line in lines(tmp_path / "out"):
-        assert line["inputs"]["box"] == [float(v) for v in box_of(0)]
-        assert len(line["translation"]) == 3
+        assert (line["inputs"]["box"], len(line["translation"])) == ([float(v) for v in box_of(0)], 3)
 
 
 def test_register_chooses_among_meshes(folder, register, document, tmp_path, capsys):
@@ -196,8 +194,7 @@ def test_register_chooses_among_meshes(folder, register, document, tmp_path, cap
     path = written(folder / "which.csv", "photo,x0,y0,x1,y1", *rows)
     assert register("--list", path, *meshes) == 0
     found = table(tmp_path / "out")
-    assert list(found[0])[-1] == "found_mesh"
-    assert [row["found_mesh"] for row in found] == [str(truck), ""]
+    assert (list(found[0])[-1], [row["found_mesh"] for row in found]) == ("found_mesh", [str(truck), ""])
     assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [str(v) for v in document("one")["rotation"][0]]
 
 

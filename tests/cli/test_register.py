@@ -29,8 +29,7 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     check_pose(result, scene(0)[2], 15.0, 0.05)  # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     assert len(result["top"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
-    assert np.shape(result["covariance"]) == (6, 6)
-    assert len(result["probabilities"]) == 3
+    assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 3)
     assert sum(result["probabilities"]) + result["none"] == pytest.approx(1.0)
     deviations = result["standard_deviations"]
     assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])

@@ -46,8 +46,7 @@ def test_bop_dataset_returns_documented_samples(tree):
     assert sample["box_visible"].tolist() == [0, 4, 25, 24]
     assert sample["camera_matrix"].tolist() == [[300, 0, 40], [0, 310, 30], [0, 0, 1]]
     assert sample["rotation"].tolist() == [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "row by row"
-    assert sample["translation"].tolist() == [1, 2, 400]
-    assert sample["visib_fract"] == 0.8
+    assert (sample["translation"].tolist(), sample["visib_fract"]) == ([1, 2, 400], 0.8)
     assert sample["model_path"].endswith("models/obj_000001.ply")
     assert sample["model_info"] == dataset.models_info[1]
     assert "symmetries_discrete" in sample["model_info"]

@@ -19,8 +19,7 @@ def test_read_image_returns_rgb_floats_in_0_to_1(tmp_path):
     bgr[..., 0], bgr[1, 2, 2] = 51, 255  # blue everywhere, red at x = 2, y = 1
     cv2.imwrite(str(tmp_path / "a.png"), bgr)
     image = read_image(tmp_path / "a.png")
-    assert image.shape == (3, 4, 6)
-    assert image.dtype == torch.float32
+    assert (image.shape, image.dtype) == ((3, 4, 6), torch.float32)
     assert image.is_contiguous()
     assert image[0, 1, 2] == 1
     torch.testing.assert_close(image[2], torch.full((4, 6), 0.2))
@@ -33,8 +32,7 @@ def test_read_image_reads_grey_alpha_and_16_bits(tmp_path, dtype, top, channels)
     pixels[0, 0] = top
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     image = read_image(str(tmp_path / "a.png"))
-    assert image.shape == (3, 5, 7)
-    assert image.max() == 1
+    assert (image.shape, image.max()) == ((3, 5, 7), 1)
     torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
 
 

@@ -17,8 +17,7 @@ def tree(tmp_path):
 def test_pascal3d_counts_skipped_items(tree):
     root, reasons = tree
     dataset = Pascal3DPlus(root)
-    assert dataset.categories == ["car", "sofa"]
-    assert len(dataset) == 5
+    assert (dataset.categories, len(dataset)) == (["car", "sofa"], 5)
     assert dict(dataset.skipped) == reasons
     assert {k: len(v) for k, v in dataset.skipped_items.items()} == reasons
     assert dataset.skipped_items["missing_image"] == ["car_pascal/2008_000009"]
@@ -28,8 +27,7 @@ def test_pascal3d_counts_skipped_items(tree):
 def test_pascal3d_reads_the_imagenet_part(tmp_path):
     reasons = write_pascal3d(tmp_path, part="imagenet")
     dataset = Pascal3DPlus(tmp_path, part="imagenet")
-    assert len(dataset) == 5
-    assert dict(dataset.skipped) == reasons
+    assert (len(dataset), dict(dataset.skipped)) == (5, reasons)
     assert dataset[0]["image_path"].endswith("car_imagenet/2008_000001.JPEG")
     with pytest.raises(MissingFileError, match="no pascal image list"):
         Pascal3DPlus(tmp_path)
@@ -53,8 +51,7 @@ def test_pascal3d_returns_documented_samples(tree):
     assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
     assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
     shifted = Pascal3DPlus(tree[0], pixel_origin=0)[0]
-    assert shifted["box"].tolist() == [11, 6, 71, 56]
-    assert shifted["camera_matrix"][:2, 2].tolist() == [41, 31]
+    assert (shifted["box"].tolist(), shifted["camera_matrix"][:2, 2].tolist()) == ([11, 6, 71, 56], [41, 31])
 
 
 def test_pascal3d_camera_projects_the_model_into_the_box(tree):
@@ -82,8 +79,7 @@ def test_pascal3d_reads_image_sets_with_invalid_entries(tree):
     lists.mkdir()
     lists.joinpath("car_pascal_tiny.txt").write_text("2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n")
     dataset = Pascal3DPlus(root, "tiny")
-    assert len(dataset) == 1
-    assert dict(dataset.skipped) == {"missing_annotation": 2}
+    assert (len(dataset), dict(dataset.skipped)) == (1, {"missing_annotation": 2})
 
 
 def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(tree):

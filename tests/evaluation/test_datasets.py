@@ -103,8 +103,7 @@ def test_protocol_and_pipeline_reach_the_registrar(pascal, tmp_path, monkeypatch
     run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
     assert len(registrars[0].others or registrars[-1].others) == 1
     for registrar in registrars:
-        assert registrar.pipeline.box_jitter == 0.05
-        assert registrar.pipeline.views.pose == "upright"
+        assert (registrar.pipeline.box_jitter, registrar.pipeline.views.pose) == (0.05, "upright")
 
 
 def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
@@ -170,8 +169,7 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
-    assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
-    assert summary["settings"]["dataset"] == "bop"
+    assert (summary["protocol"], summary["settings"]["dataset"]) == ("cad=annotated pose=any box=0.1 seed=3", "bop")
     views = summary["settings"]["pipeline"]["views"]
     assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 

@@ -19,8 +19,7 @@ def test_parse_and_str_are_inverse():
         (["box=none"], "cad=annotated pose=upright box=none"),
     ):
         protocol = Protocol.parse(words)
-        assert str(protocol) == text
-        assert Protocol.parse(text.split()) == protocol
+        assert (str(protocol), Protocol.parse(text.split())) == (text, protocol)
 
 
 def test_perturbed_boxes_fill_the_range_and_depend_on_key_and_seed():

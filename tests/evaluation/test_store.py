@@ -62,8 +62,7 @@ def test_cut_line_is_removed(tmp_path, cut):
     reader, store = ResultStore(tmp_path), ResultStore(tmp_path)
     assert [reader.is_current(key, DIGESTS) for key in "abc"] == [True, True, False]
     store.append(row("c"))
-    assert store.path.read_bytes() == whole
-    assert store.read("c") == row("c")
+    assert (store.path.read_bytes(), store.read("c")) == (whole, row("c"))
 
 
 @pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])

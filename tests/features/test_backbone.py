@@ -78,7 +78,6 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
         cells = F.normalize(cells / spread.view(1, -1, 1, 1), dim=1)
         expected += torch.einsum("achw,bchw->abhw", cells, cells).mean(dim=(2, 3)) / 2
     d = describe(pictures, network)
-    assert d.dtype == torch.float16
-    assert d.shape == (3, 40 * 8 * 8 + 112 * 4 * 4)
+    assert (d.dtype, d.shape) == (torch.float16, (3, 40 * 8 * 8 + 112 * 4 * 4))
     torch.testing.assert_close(similarity(d, d), expected, atol=2e-3, rtol=0)
     torch.testing.assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)

@@ -80,8 +80,7 @@ def test_save_and_load(small_bank, tmp_path):
     assert_same(loaded, small_bank, atol=5e-4)
     np.testing.assert_array_equal(loaded.mesh.vertices, small_bank.mesh.vertices)
     np.testing.assert_array_equal(loaded.mesh.faces, small_bank.mesh.faces)
-    assert loaded.mesh.units == "m"
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert (loaded.mesh.units, [p.name for p in path.parent.iterdir()]) == ("m", [path.name])
     if os.name == "posix":
         mask = os.umask(0)
         os.umask(mask)

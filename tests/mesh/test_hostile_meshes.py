@@ -130,8 +130,7 @@ def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.Mo
     decode = Mock(wraps=colours._texture)
     monkeypatch.setattr(colours, "_texture", decode)
     found = cr.load_mesh(tmp_path / "a.gltf").metadata["colours"]
-    assert decode.call_count == 1
-    assert len(found) == 40
+    assert (decode.call_count, len(found)) == (1, 40)
     (texture,) = found.textures
     assert texture[9, 9].tolist() == [200, 100, 50]
 

@@ -103,8 +103,7 @@ def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: s
     mesh = cr.load_mesh(path)
     fans = [[f[0], f[i], f[i + 1]] for f in faces for i in range(1, len(f) - 1)]
     assert silhouette(trimesh.Trimesh(vertices, fans, process=False)) - silhouette(mesh) > 150
-    assert mesh.area == pytest.approx(2 * 7 + 16)
-    assert len(mesh.faces) == 2 * 6 + 8 * 2
+    assert (mesh.area, len(mesh.faces)) == (pytest.approx(2 * 7 + 16), 2 * 6 + 8 * 2)
     if kind == "ply with colours":
         assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
 
@@ -151,8 +150,7 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangl
     path = tmp_path / "box.obj"
     path.write_text(BOX + "\n".join(rows) + "\n")
     mesh = cr.load_mesh(path)
-    assert len(mesh.faces) == 12
-    assert abs(mesh.volume) == pytest.approx(1.0)
+    assert (len(mesh.faces), abs(mesh.volume)) == (12, pytest.approx(1.0))
 
 
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 3/1/1 0/1/1 1/1/1", "f 0 1 2 3"])

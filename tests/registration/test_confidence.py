@@ -106,8 +106,7 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
     result = learned_registrar()([image], box[None], camera)[0]
     expected = confidence.registration_confidence(result.confidence_features, exact=camera is not None)
-    assert result.confidence == pytest.approx(expected)
-    assert result.confidence_features["similarity"] == result.score
+    assert (result.confidence, result.confidence_features["similarity"]) == (pytest.approx(expected), result.score)
     assert result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
     assert len(result.probabilities) == len(result.hypotheses)
     assert sum(result.probabilities) + result.none == pytest.approx(1.0)
@@ -133,8 +132,7 @@ def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     one, two = (registrar([image], box[None], CAMERA)[0] for registrar in registrars)
     assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
     assert torch.equal(one.rotation, two.rotation)
-    assert one.confidence_features == two.confidence_features
-    assert one.confidence == two.confidence
+    assert (one.confidence_features, one.confidence) == (two.confidence_features, two.confidence)
 
 
 def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():

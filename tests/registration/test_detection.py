@@ -221,8 +221,7 @@ def test_detector_finds_the_object(seed, corner, scale):
     located = detector()(image)
     assert box_iou(located.boxes, box[None])[:2].max() > 0.6
     assert located.responses.diff().max() <= 0
-    assert len(located.boxes) == 20
-    assert located.boxes.dtype == torch.float32
+    assert (len(located.boxes), located.boxes.dtype) == (20, torch.float32)
     assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
 
 

@@ -81,7 +81,6 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
     registrar = truck_registrar(contours=False)
     results = registrar(paths, torch.stack([box for _, box, _ in scenes]), CAMERA)
     assert all(result.ok for result in results)
-    assert decoded.count(paths[0]) == 1
-    assert len(decoded) == len(paths)
+    assert (decoded.count(paths[0]), len(decoded)) == (1, len(paths))
     assert most[0] <= torch.get_num_threads() + 1
     assert len(alive) <= 1

@@ -186,6 +186,5 @@ def test_boxes_of_landmarks_are_the_first_proposals():
     (found,) = detect(registrar(), [item.image], K)[0]
     assert found.detection.score == LANDMARK_PROBABILITY
     near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
-    assert proposals.by_landmarks == 1
-    assert propose(registrar(), near).by_landmarks == 0
+    assert (proposals.by_landmarks, propose(registrar(), near).by_landmarks) == (1, 0)
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1

@@ -103,10 +103,8 @@ def test_pose_in_words():
 
 def test_verdict_has_three_words():
     """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
-    assert verdict(0.95, 0.03, True) == "likely"
-    assert verdict(0.95, 0.03, False) == "unsure"
-    assert verdict(0.4, 0.39, False) == "unsure"
-    assert verdict(0.4, 0.41, False) == "no match"
+    assert (verdict(0.95, 0.03, True), verdict(0.95, 0.03, False)) == ("likely", "unsure")
+    assert (verdict(0.4, 0.39, False), verdict(0.4, 0.41, False)) == ("unsure", "no match")
     assert verdict(None, None, False) == "unsure"
 
 
@@ -129,8 +127,7 @@ def test_ambiguity():
     hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
     for second, word in ((0.31, "mirror"), (0.29, None)):
         result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
-        assert result.ambiguous == word
-        assert result.none == pytest.approx(0.4 - second)
+        assert (result.ambiguous, result.none) == (word, pytest.approx(0.4 - second))
 
 
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():

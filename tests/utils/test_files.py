@@ -29,8 +29,7 @@ def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     with path.open("rb") as reader:
         files.write_file(path, NEW)
         assert reader.read() == OLD, "who has the file open keeps the old content"
-    assert path.read_bytes() == NEW
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (NEW, [path])
     link = tmp_path / "link"
     link.symlink_to(path)
     files.write_file(link, OLD)
@@ -46,8 +45,7 @@ def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
             files.write_file(path, NEW)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == OLD
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
 
 
 @pytest.mark.parametrize("name", ["file/x", "folder", "null"])
@@ -84,8 +82,7 @@ def test_write_file_keeps_the_old_content_if_interrupted(
             sys.exit(main(["cache"]))
     finally:
         signal.signal(signal.SIGINT, ignored)
-    assert path.read_bytes() == OLD
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
     assert signal.getsignal(signal.SIGTERM) == before
 
 

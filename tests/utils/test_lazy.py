@@ -66,8 +66,7 @@ def test_options_accept_numbers_with_commas():
         ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
     )
     assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == (10.0, 20.0, 30.5, 40.0)
-    assert arguments.camera == (1000.0, 1000.0, -0.5, 2.0)
-    assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
+    assert (arguments.camera, arguments.paths) == ((1000.0, 1000.0, -0.5, 2.0), [Path("a,1.jpg"), Path("5,6")])
 
 
 @pytest.mark.parametrize(

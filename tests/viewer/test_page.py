@@ -58,8 +58,7 @@ def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
         assert shot.box == pytest.approx(box)
     for kind in ("press", "move", "cancel", "release"):
         send(stage, kind, 0.9, 0.9)
-    assert shot.box == pytest.approx((10, 30, 140, 90))
-    assert stage.shapes.content.count("<rect") == 2
+    assert (shot.box, stage.shapes.content.count("<rect")) == (pytest.approx((10, 30, 140, 90)), 2)
     assert "viewBox='-0.5 -0.5 240 180'" in stage.shapes.content
     send(stage, "remove")
     assert shot.box is None
@@ -177,8 +176,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     asyncio.run(posed.refresh())
     assert "disabled" not in posed.undo.props
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
-    assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
-    assert len(shot.answer.edits) == 2
+    assert (centre(), len(shot.answer.edits)) == (pytest.approx([x + 20, y + 10], abs=1e-6), 2)
     send(posed, "undo")
     assert len(shot.answer.edits) == 1
     for kind, values in (("scale", {"factor": 1.1, "roll": 5.0}), ("nudge", {"dx": 1, "dy": 0, "shift": True})):

@@ -82,8 +82,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
         assert document[key] == written[key], key
     assert (document["mesh"], document["inputs"]["rig"]) == ("truck.safetensors", "rig.csv")
     for shot, view in zip((first, second, third), document["views"], strict=True):
-        assert shot.projection[0][:3, :3].tolist() == view["rotation"]
-        assert shot.found_box.tolist() == view["box"]
+        assert (shot.projection[0][:3, :3].tolist(), shot.found_box.tolist()) == (view["rotation"], view["box"])
         assert shot.answer is first.answer
     assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
     assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()

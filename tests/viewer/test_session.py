@@ -109,8 +109,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     calibrated = replace(found, probabilities=(0.95, 0.03))
     session.shot.result = replace(session.shot.result, registration=calibrated)
     assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
-    assert session.document()["probabilities"] == [0.03, 0.95]
-    assert session.document()["none"] == pytest.approx(0.02)
+    assert (session.document()["probabilities"], session.document()["none"]) == ([0.03, 0.95], pytest.approx(0.02))
     assert session.document()["covariance"] is None
     session.shot.choose(0)
     assert session.shot.result.chosen is calibrated
@@ -247,8 +246,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     session.set_camera(Camera(K, size=(360, 480)))
     session.load()
     plain = session.shot.photo
-    assert session.request().camera == pytest.approx((250, 250, 119.5, 89.5))
-    assert plain.notes == ()
+    assert (session.request().camera, plain.notes) == (pytest.approx((250, 250, 119.5, 89.5)), ())
     assert "--camera 250 250 119.5 89.5" in session.command()
     session.shot.set_box((10.0, 20.0, 90.0, 80.0))
     camera, box = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480)), ["--box", "10", "20", "90", "80"]
@@ -272,8 +270,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     session.shot.set_box(tuple(scene(0)[1].tolist()))
     session.register()
     document = session.document()
-    assert document["inputs"]["camera_source"] == "file"
-    assert document["camera"] == camera.at((180, 240)).describe()
+    assert (document["inputs"]["camera_source"], document["camera"]) == ("file", camera.at((180, 240)).describe())
     assert "cr.register(cr.geometry.undistorted(cr.data.read_photo(" in session.python()
     session.set_camera((250.0, 250.0, 119.5, 89.5))
     assert [torch.equal(shot.photo.image, plain.image) for shot in session.shots] == [True, True]

@@ -53,8 +53,7 @@ def test_uploads_find_their_place(workspace, scene):
     for name in ("a.png", "b.png"):
         asyncio.run(upload(workspace, scene / "photo.png", name))
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "b.png")
-    assert session.shot.photo.image.shape == (3, 180, 240)
-    assert workspace.messages == {}
+    assert (session.shot.photo.image.shape, workspace.messages) == ((3, 180, 240), {})
     assert sorted(stored(workspace)) == ["a.png", "b.png", "part.PLY"], "the former mesh is removed"
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
@@ -230,8 +229,7 @@ def test_a_search_that_waits_for_a_mesh_searches_with_it(workspace, scene, searc
 
     asyncio.run(work())
     assert len(search.shots) == 1
-    assert workspace.session.mesh_path == scene / "truck.ply"
-    assert workspace.messages == {}
+    assert (workspace.session.mesh_path, workspace.messages) == (scene / "truck.ply", {})
 
 
 def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, scene, search):
@@ -252,8 +250,7 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
 
     asyncio.run(workspace.load_sample())
     asyncio.run(work())
-    assert ended == [True, True]
-    assert names(workspace) == []
+    assert (ended, names(workspace)) == ([True, True], [])
     assert workspace.messages == {}
 
 
@@ -284,8 +281,7 @@ def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene,
 
 
 def test_file_name_has_no_folders():
-    assert file_name("../../etc/passwd") == "passwd"
-    assert file_name("C:\\a\\b.png") == "b.png"
+    assert (file_name("../../etc/passwd"), file_name("C:\\a\\b.png")) == ("passwd", "b.png")
     assert file_name("a\nb\x1b.png") == "ab.png"
     assert file_name("") == file_name("a/") == file_name("..") == "file"
     assert file_name("ä" * 500 + ".png").endswith("ä.png")
