@@ -28,23 +28,16 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", text.replace("`", "")).replace(" ", "-")
 
 
-def anchors(page: Path) -> set[str]:
-    return {anchor(heading) for heading in re.findall(r"^#+ (.*)$", without_code(page), flags=re.MULTILINE)}
-
-
-def links(page: Path) -> list[str]:
-    return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page)))
-
-
 @by_page
 def test_links_resolve(page: Path) -> None:
-    for link in links(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page))):
         if re.match(r"\w+:", link):
             continue
         path, _, name = link.partition("#")
         target = page.parent / path if path else page
         assert target.exists(), f"{link}: no such file"
-        assert not name or name in anchors(target), f"{link}: no such heading"
+        headings = re.findall(r"^#+ (.*)$", without_code(target), flags=re.MULTILINE) if name else []
+        assert not name or name in map(anchor, headings), f"{link}: no such heading"
 
 
 def resolve(dotted: str) -> object:

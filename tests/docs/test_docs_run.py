@@ -40,11 +40,6 @@ AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg
 SLOW = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}  # 30 s and more on one core
 
 
-def skip_reason(command: str) -> str | None:
-    command = re.sub(r"\s+#.*", "", command)
-    return next((reason for start, reason in SKIPPED.items() if re.match(start, command)), None)
-
-
 def pose(azimuth: float) -> torch.Tensor:
     """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
     points, box = torch.from_numpy(example_mesh().vertices.copy()), torch.tensor([410.0, 220.0, 890.0, 700.0])
@@ -125,12 +120,6 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     return cli.main()
 
 
-def run_blocks(page: Path, blocks: list[str], names: dict[str, Any]) -> dict[str, Any]:
-    for text in blocks:
-        exec(compile(text, page.name, "exec"), names)
-    return names
-
-
 @pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize(
     "page",
@@ -141,8 +130,8 @@ def test_page_runs(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     names: dict[str, Any] = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
-            run_blocks(page, [text], names)
-        elif skip_reason(text) is None:
+            exec(compile(text, page.name, "exec"), names)
+        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
             words = split_command(text)
             expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
             assert run_command(words, monkeypatch) == expected, (text, capsys.readouterr().err)

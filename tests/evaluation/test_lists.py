@@ -18,7 +18,7 @@ from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from tests._support.lists import lines, table
+from tests._support.lists import table
 from tests._support.scenes import SIZE, scene, unrefined, write_photo
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
@@ -61,14 +61,6 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
         for _ in range(2):
             assert register_rows(rows, tmp_path / "out", registrar, settings).ok == 5
         assert done == rows[:4], "equal rows are registered once"
-
-
-def test_rows_follow_the_order_of_the_list(registrar, entry, tmp_path):
-    rows = [replace(entry, cells={"id": "a"}), replace(entry, camera=50.0, cells={"id": "b"})]
-    for some in (rows, rows[::-1]):
-        register_rows(some, tmp_path / "out", registrar)
-        found = [(row["row"], row["columns"]) for row in lines(tmp_path / "out")]
-        assert found == list(enumerate((one.cells for one in some), start=1))
 
 
 def test_register_list_refuses_the_folder_of_an_evaluation(registrar, entry, tmp_path):

@@ -17,13 +17,9 @@ def test_opengl_cameras_look_backward_with_y_up() -> None:
     assert torch.equal(g.opencv_from_opengl(flipped), T)
 
 
-def points() -> torch.Tensor:
-    return torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
-
-
 def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
-    X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
+    X, f, (px, py) = np.random.default_rng(0).uniform(-1, 1, (50, 3)), 3000.0, (70.3, 51.8)
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
         ar, er, tr = (math.radians(v) for v in (a, e, t))
         C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])

@@ -50,15 +50,12 @@ def test_rotation_error_agrees_with_scipy() -> None:
     assert g.rotation_error(torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)).shape == (4, 5)
 
 
-def directions(views: ViewSphere) -> torch.Tensor:
-    return -views.rotations[:, 2].double()
-
-
 @pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
 def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
     probes = torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     probes = torch.nn.functional.normalize(torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1)
-    nearest = torch.cat([(p @ directions(uniform_views(count)).T).amax(1) for p in probes.split(20_000)])
+    directions = -uniform_views(count).rotations[:, 2].double()
+    nearest = torch.cat([(p @ directions.T).amax(1) for p in probes.split(20_000)])
     radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))
     assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
 

@@ -142,18 +142,14 @@ def test_cached_bank_warns_of_an_unwritable_folder(tmp_path):
     assert (list_cache(tmp_path / "file"), clear_cache(tmp_path / "file")) == ([], 0)
 
 
-def needs_fork(test):
-    """Spawned processes would import everything again, some seconds each."""
-    test = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")(test)  # fork beside threads, Python 3.12
-    return pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")(test)
-
-
 def _build_all(folder: str, edges: tuple[float, ...]) -> float:
     torch.set_num_threads(1)
     return sum(float(cached_box(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
-@needs_fork
+# Spawned processes would import everything again, some seconds each. Python 3.12 warns of fork beside threads.
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_cached_bank_in_concurrent_processes(tmp_path):
     edges = (1.0, 2.0, 3.0)
     with multiprocessing.get_context("fork").Pool(2) as pool:

@@ -28,14 +28,11 @@ def test_distinct_poses():
         assert distinct_poses(poses(degrees), torch.tensor(score)).tolist() == expected
 
 
-def ranking(scores: torch.Tensor, allowed: torch.Tensor | None = None) -> Ranking:
-    return Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {}, allowed)
-
-
 def test_best_views_are_distinct_and_ranked_relative_to_the_best():
     scores = torch.full((1, len(truck_bank())), 0.01)
     scores[0, [4, 5, 60]] = torch.tensor([0.8, 0.7, 0.2])  # 4 and 5 are neighbours
-    view, rank = best_views(ranking(scores), truck_bank(), count=2)
+    ranking = Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {}, None)
+    view, rank = best_views(ranking, truck_bank(), count=2)
     assert (view.tolist(), rank.tolist()) == ([4, 60], pytest.approx([0.0, math.log(0.25)], abs=1e-6))
 
 

@@ -127,18 +127,14 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
 DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre
 
 
-def centre_distances(result, registrar):
-    centre = registrar.describer.centre
-    return [float((h.rotation @ centre + h.translation).norm()) for h in result.hypotheses]
-
-
 @pytest.mark.parametrize("pipeline", [{}, {"contours": False}], ids=str)
 @pytest.mark.parametrize("factors", [(0.5, 0.7), (1.4, 2.0)])
 def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     registrar = truck_registrar(**pipeline)
     near, far = (factor * DISTANCE for factor in factors)
     result = registrar(*ONE, prior=PosePrior(distance=(near, far)))[0]
-    for distance in centre_distances(result, registrar):
+    for hypothesis in result.hypotheses:
+        distance = float((hypothesis.rotation @ registrar.describer.centre + hypothesis.translation).norm())
         assert 0.97 * near <= distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
     assert not result.reliable

@@ -267,17 +267,13 @@ def coarse():
     return Registrar(bank), images, torch.stack(boxes)
 
 
-def angle_moved(registrar, hypothesis) -> float:
-    """Degrees from the view that the hypothesis started from."""
-    view = registrar.bank.rotations[hypothesis.view].double()
-    return float(rotation_error(hypothesis.allocentric_rotation, view))
-
-
 def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
     registrar, images, boxes = coarse
     restored = 0
     for result in registrar(images, boxes, CAMERA):
-        is_moved = [angle_moved(registrar, h) > 0.01 for h in result.hypotheses]
+        starts = (registrar.bank.rotations[h.view].double() for h in result.hypotheses)
+        moves = (rotation_error(h.allocentric_rotation, R) for h, R in zip(result.hypotheses, starts, strict=True))
+        is_moved = [float(degrees) > 0.01 for degrees in moves]
         assert is_moved[0]
         assert is_moved == sorted(is_moved, reverse=True)
         assert result.hypotheses[0].covariance is not None

@@ -25,15 +25,6 @@ from tests.viewer.test_workspace import upload
 HEADER = ["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION]
 
 
-def write_rig(folder: Path) -> list[list]:
-    """Write 0.png to 2.png, truck.safetensors and rig.csv, without a box of the second; returns its rows."""
-    rows = write_rig_photos(folder)
-    rows[1][1:5] = [""] * 4
-    write_table(folder / "rig.csv", HEADER, rows)
-    learned_registrar().bank.save(folder / "truck.safetensors")
-    return rows
-
-
 def write_table(path, header, rows):
     with path.open("w", newline="") as file:
         csv.writer(file).writerows([header, *rows])
@@ -41,8 +32,13 @@ def write_table(path, header, rows):
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
+    """Photographs, truck.safetensors, and rig.csv without a box of the second; returns the folder and the rows."""
     folder = tmp_path_factory.mktemp("rig")
-    return folder, write_rig(folder)
+    rows = write_rig_photos(folder)
+    rows[1][1:5] = [""] * 4
+    write_table(folder / "rig.csv", HEADER, rows)
+    learned_registrar().bank.save(folder / "truck.safetensors")
+    return folder, rows
 
 
 def send(workspace, folder, *names):
