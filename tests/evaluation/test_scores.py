@@ -51,11 +51,8 @@ def furniture(tmp_path):
     """Four bottles, a table and four sofas, with flags."""
     root = tmp_path / "pascal"
     flags = [{}, {"truncated": 1}, {"occluded": 1}, {"difficult": 1, "truncated": 1}]
-    objects = {
-        "bottle": [pascal_object("bottle", **f) for f in flags],
-        "diningtable": [pascal_object("diningtable")],
-        "sofa": [pascal_object("sofa", **f) for f in flags],
-    }
+    objects = {name: [pascal_object(name, **f) for f in flags] for name in ("bottle", "sofa")}
+    objects["diningtable"] = [pascal_object("diningtable")]
     for name, entries in objects.items():
         write_record(root / "Annotations" / f"{name}_pascal" / "1.mat", entries)
         write_image(root / "Images" / f"{name}_pascal" / "1.jpg")

@@ -44,16 +44,11 @@ def test_elevation_and_theta_are_limited_each_by_itself():
     assert PosePrior(elevation=(-90, 90)).excess(R).tolist() == [-180.0] * 4
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
-        PosePrior(azimuth=(300, 60)),
-        PosePrior(elevation=(10, 30), theta=(-5, 5)),
-        PosePrior(azimuth=(100, 140), theta=(-15, 15)),
-        PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25.0),
-    ],
-    ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"],
-)
+PRIORS = [PosePrior(azimuth=(300, 60)), PosePrior(elevation=(10, 30), theta=(-5, 5))]
+PRIORS += [PosePrior(azimuth=(100, 140), theta=(-15, 15)), PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25)]
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"])
 def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
     generator = torch.Generator().manual_seed(0)
     a, e, t = torch.rand(3, 4000, generator=generator, dtype=torch.float64)

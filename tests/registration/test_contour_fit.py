@@ -78,12 +78,9 @@ def test_edges_are_measured_to_a_fraction_of_a_pixel(side):
 
 
 def test_edge_support_is_the_mean_strength_near_valid_points():
-    for distances, valid, expected in (
-        (at(8, 0.0), 4, 0.7),
-        (at(8, -3.0), 4, 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)),
-        (torch.tensor([[0.0, 50.0] * 4]).double(), 4, 0.35),
-        (torch.tensor([[0.0, 50.0] * 4]).double(), 0, 0.0),
-    ):
+    half, beside = torch.tensor([[0.0, 50.0] * 4]).double(), 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)
+    cases = (at(8, 0.0), 4, 0.7), (at(8, -3.0), 4, beside), (half, 4, 0.35), (half, 0, 0.0)
+    for distances, valid, expected in cases:
         assert float(problem(distances, [0.7]).edge_support(state(8, valid=valid))) == pytest.approx(expected)
 
 
@@ -145,14 +142,9 @@ def row_of_points(outline: bool, direction: float, *, count: int = 1) -> Contour
 
 def test_mask_weights_within_at_the_border_and_beyond():
     """At 20 px to the left of the border, on it, and at 20 px to the right."""
-    for outline, direction, expected in (
-        (True, 1.0, [0.6, 2.0, 0.6]),
-        (True, -1.0, [0.6, 0.6, 0.6]),  # the object lies outside
-        (False, 1.0, [1.0, 0.3, 0.3]),
-        (False, -1.0, [0.3, 0.3, 1.0]),
-    ):
-        uv = torch.tensor([[[127.5, 90.0]]], dtype=torch.float64)
-        offsets = torch.tensor([-20.0, 0.0, 20.0], dtype=torch.float64)
+    uv, offsets = torch.tensor([[[127.5, 90.0]]]).double(), torch.tensor([-20.0, 0.0, 20.0]).double()
+    outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])  # at the second the object lies outside
+    for outline, direction, expected in (*outlines, (False, 1.0, [1.0, 0.3, 0.3]), (False, -1.0, [0.3, 0.3, 1.0])):
         weights = half_planes(128).weights(uv, row_of_points(outline, direction), offsets, FIRST, 256)
         assert weights[0, 0].tolist() == pytest.approx(expected)
 

@@ -89,11 +89,8 @@ def test_render_depth_refuses_bad_arguments() -> None:
     box = trimesh.creation.box()
     not_finite = T.clone()
     not_finite[1, 0, 3] = torch.nan
-    for arguments, message in (
-        ((not_finite, one, size), "finite"),
-        ((T, one.expand(3, 3, 3), size), "one or 2 matrices"),
-        ((T, one, (0, 5)), "size"),
-    ):
+    calls = [((not_finite, one, size), "finite"), ((T, one.expand(3, 3, 3), size), "one or 2 matrices")]
+    for arguments, message in (*calls, ((T, one, (0, 5)), "size")):
         with pytest.raises(InvalidInputError, match=message):
             cr.render_depth(box, *arguments)
     with pytest.raises(InvalidInputError, match="'embree'"):

@@ -36,9 +36,8 @@ def address(folder):
     (folder / "temporary").mkdir()
     environment["TMPDIR"] = str(folder / "temporary")
     with (folder / "log").open("w") as log:
-        server = subprocess.Popen(
-            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, bufsize=1
-        )
+        pipes = {"stdout": subprocess.PIPE, "stderr": log, "text": True, "bufsize": 1}
+        server = subprocess.Popen(command, cwd=folder, env=environment, **pipes)
     try:
         line = server.stdout.readline()
         assert "http://127.0.0.1:" in line, (folder / "log").read_text()

@@ -101,9 +101,8 @@ def found(rig, tmp_path_factory):
 
 def test_photographs_of_no_row_and_rows_without_photograph_are_named(found):
     _, session = found
-    assert session.rig_gaps() == (
-        "not open: 1.png; drop what is missing here, or go on without; not in the rig: other.png; registered alone"
-    )
+    missing = "not open: 1.png; drop what is missing here, or go on without"
+    assert session.rig_gaps() == f"{missing}; not in the rig: other.png; registered alone"
     other, first, last = session.shots
     assert [shot.result is first.result for shot in (other, first, last)] == [False, True, True]
     assert len(session.document()["views"]) == 2
