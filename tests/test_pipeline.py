@@ -13,6 +13,7 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
 from curvireg_torch.terms import TERMS, Correlation, Repeatability
+from curvireg_torch.utils import choices
 
 
 @pytest.mark.parametrize("name", [*FIELDS, *DEPTH_FIELDS])
@@ -40,6 +41,7 @@ def test_presets_register_and_survive_json(name):
 
 def test_presets_have_the_stated_settings():
     assert preset_named(DEFAULT) == Pipeline()
+    assert (list(PRESETS), choices.DEFAULT) == (list(choices.PRESET_NAMES), DEFAULT)
     with pytest.raises(InvalidInputError, match="'classical'"):
         preset_named("best")
     for name in ("classical", "paper"):  # nothing learned

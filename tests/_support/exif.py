@@ -4,8 +4,6 @@ import struct
 import zlib
 from pathlib import Path
 
-__all__ = ["exif", "with_exif"]
-
 
 def exif(orientation: int, focal: int = 0, order: str = ">") -> bytes:
     """A TIFF block with an orientation and, in its EXIF directory at byte 38, a 35 mm focal length."""

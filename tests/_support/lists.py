@@ -13,9 +13,6 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import learned_registrar, scene, truck_bank, write_photo
 from tests.registration.test_several import EASY, rig_of
 
-__all__ = ["CAMERA", "RESULTS", "bop_poses", "box_of", "check_pose", "lines", "table", "write_files", "written"]
-__all__ += ["quaternion", "write_bop_scene", "write_colmap", "write_rig_photos"]
-
 CAMERA = ["260", "260", "119.5", "89.5"]
 RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
 RESULTS += ["tx", "ty", "tz"]

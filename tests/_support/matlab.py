@@ -2,8 +2,6 @@
 
 import struct
 
-__all__ = ["element", "file"]
-
 
 def element(kind: int, content: bytes) -> bytes:
     return struct.pack("<II", kind, len(content)) + content + b"\0" * (-len(content) % 8)

@@ -9,8 +9,6 @@ import numpy as np
 import scipy.io
 import trimesh
 
-__all__ = ["pascal_object", "write_bop", "write_image", "write_mesh", "write_pascal3d", "write_web"]
-
 HALF = 0.25  # half the edge of the cube that all meshes are
 
 

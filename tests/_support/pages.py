@@ -4,8 +4,6 @@ import re
 import shlex
 from pathlib import Path
 
-__all__ = ["BUILT", "DOCS", "PAGES", "ROOT", "split_command", "steps"]
-
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 BUILT = ("_build", "auto_gallery", "project")

@@ -14,9 +14,6 @@ from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
-__all__ = ["CAMERA", "SIZE", "errors", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar"]
-__all__ += ["unrefined", "write_photo"]
-
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 

@@ -26,16 +26,12 @@ def ids(dataset):
     return [(s["scene_id"], s["image_id"], s["obj_id"], s["instance_index"]) for s in samples]
 
 
-def test_bop_dataset_counts_skipped_items(tree):
+def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
     root, reasons = tree
     dataset = BOPDataset(root, targets=False)
     assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
-
-
-def test_bop_dataset_returns_documented_samples(tree):
-    dataset = BOPDataset(tree[0], targets=False)
     sample = dataset[0]
     assert set(sample) == {
         *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "T_cam_from_world"),
@@ -81,19 +77,16 @@ def test_other_splits_have_no_targets_by_default(tree):
     assert len(BOPDataset(tree[0], "train_pbr")) == 4
 
 
-def test_bop_dataset_reports_missing_files_with_advice(tree, tmp_path):
+def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(tree, tmp_path):
     for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
         with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):
             BOPDataset(root, split)
+    for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"):
+        (tree[0] / "test_targets_bop19.json").write_text(content)
+        with pytest.raises(InvalidInputError, match="test_targets_bop19"):
+            BOPDataset(tree[0])
     (tree[0] / "models" / "models_info.json").unlink()
     with pytest.raises(MissingFileError, match="models_info"):
-        BOPDataset(tree[0])
-
-
-@pytest.mark.parametrize("content", ["[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"])
-def test_bop_dataset_refuses_damaged_target_lists(tree, content):
-    (tree[0] / "test_targets_bop19.json").write_text(content)
-    with pytest.raises(InvalidInputError, match="test_targets_bop19"):
         BOPDataset(tree[0])
 
 

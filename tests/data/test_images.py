@@ -149,21 +149,15 @@ def test_read_image_refuses_truncated_other_and_missing_files(tmp_path, suffix):
             read_image(path)
 
 
-def _bombs():
-    """Small files of huge pictures."""
-    width, height = 20_000, 20_000
-    yield "a.bmp", b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, width, -height, 1, 24, 0) + bytes(20)
-    row = bytes(1 + width // 8)
-    packer = zlib.compressobj(9)
-    body = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", body), (b"IEND", b""))
-    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
-    yield "a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
-
-
 def test_read_photo_counts_pixels_before_it_decodes(tmp_path):
-    for name, content in _bombs():
+    """Small files of huge pictures."""
+    side = 20_000
+    bmp = b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, side, -side, 1, 24, 0) + bytes(20)
+    packer = zlib.compressobj(9)
+    body = b"".join(packer.compress(bytes(1 + side // 8)) for _ in range(side)) + packer.flush()
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", body), (b"IEND", b""))
+    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
+    for name, content in (("a.bmp", bmp), ("a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks))):
         (tmp_path / name).write_bytes(content)
         tracemalloc.start()
         with pytest.raises(ImageError, match=rf"{name}: more than 89,478,485 pixels; scale it down"):

@@ -13,15 +13,11 @@ def tree(tmp_path):
     return tmp_path, write_web(tmp_path)
 
 
-def test_pose_folder_counts_skipped_items(tree):
+def test_pose_folder_counts_skipped_items_and_returns_documented_samples(tree):
     root, reasons = tree
     dataset = PoseFolder(root)
     assert (len(dataset), dict(dataset.skipped)) == (4, reasons)
     assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
-
-
-def test_pose_folder_returns_documented_samples(tree):
-    dataset = PoseFolder(tree[0])
     sample, unknown, level = (dataset[i] for i in range(3))
     names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
     assert (set(sample), sample["image"].shape) == (set(names.split()), (3, 60, 80))

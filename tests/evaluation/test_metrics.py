@@ -51,13 +51,10 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
     assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
     assert math.isnan(metrics.median_error(errors[:0]))
     assert math.isnan(metrics.average_recall(errors[:0], metrics.MSSD_THRESHOLDS))
-
-
-@pytest.mark.parametrize("bad", [torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])])
-def test_averages_refuse_what_is_no_error(bad: Tensor) -> None:
-    for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
-        with pytest.raises(InvalidInputError, match="errors: expected"):
-            average(bad)
+    for bad in (torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])):
+        for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
+            with pytest.raises(InvalidInputError, match="errors: expected"):
+                average(bad)
 
 
 def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
@@ -139,13 +136,11 @@ def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
     assert bool(metrics.mssd_error(behind, GT, POINTS).isfinite().all())
 
 
-PoseError = Callable[[Tensor, Tensor, Tensor], Tensor]
+ERRORS = [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)]
 
 
-@pytest.mark.parametrize(
-    "error", [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)]
-)
-def test_pose_errors_contract(error: PoseError) -> None:
+@pytest.mark.parametrize("error", ERRORS)
+def test_pose_errors_contract(error: Callable[[Tensor, Tensor, Tensor], Tensor]) -> None:
     whole = error(EST, GT, POINTS)
     for value in (math.nan, math.inf):
         missing = EST.clone()

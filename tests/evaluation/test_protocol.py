@@ -12,13 +12,9 @@ BOX = torch.tensor([10.0, 20.0, 110.0, 70.0])
 
 
 def test_parse_and_str_are_inverse():
-    for words, text in (
-        ([], "cad=annotated pose=upright box=annotated"),
-        (["box=0.2", "seed=7"], "cad=annotated pose=upright box=0.2 seed=7"),
-        (["box=annotated"], "cad=annotated pose=upright box=annotated"),
-        (["box=none"], "cad=annotated pose=upright box=none"),
-    ):
-        protocol = Protocol.parse(words)
+    boxes = {"": "annotated", "box=0.2 seed=7": "0.2 seed=7", "box=annotated": "annotated", "box=none": "none"}
+    for words, box in {**boxes, "views=3 seed=2": "annotated views=3 seed=2"}.items():
+        protocol, text = Protocol.parse(words.split()), f"cad=annotated pose=upright box={box}"
         assert (str(protocol), Protocol.parse(text.split())) == (text, protocol)
 
 

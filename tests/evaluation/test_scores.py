@@ -157,10 +157,12 @@ def test_mspd_is_relative_to_the_width_of_the_image(instances, tmp_path):
     assert scores_of(benchmark, tmp_path, rows)["mspd_ar"] == pytest.approx(0.6)
 
 
-def test_cad_any_is_refused_for_objects_with_one_mesh(bop, web):
+def test_cad_any_is_refused_for_objects_with_one_mesh_and_views_without_cameras(bop, web, pascal):
     for benchmark, dataset in ((BOPBenchmark, bop), (PoseFolderBenchmark, web)):
         with pytest.raises(InvalidInputError, match="cad=annotated; got cad=any"):
             benchmark(dataset, Protocol(cad="any"))
+    with pytest.raises(InvalidInputError, match="views needs a dataset with cameras"):
+        Pascal3DBenchmark(pascal, Protocol(views=2))
 
 
 @pytest.mark.parametrize("kind", ["pascal3d", "bop"])

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from curvireg_torch.data import BOPDataset
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation import BOPBenchmark, Protocol
 from curvireg_torch.evaluation.benchmarks import same_instances
 from curvireg_torch.geometry import transform
 from curvireg_torch.mesh import mesh_radius
@@ -130,9 +129,3 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
     assert summary["acc_30_deg"] > 0.5
     assert not run(benchmark, tmp_path / "out")["failed"]
-
-
-def test_views_are_refused_without_cameras(pascal):
-    with pytest.raises(InvalidInputError, match="views needs a dataset with cameras"):
-        Pascal3DBenchmark(pascal, Protocol(views=2))
-    assert Protocol.parse(str(Protocol(views=3, seed=2)).split()) == Protocol(views=3, seed=2)

@@ -15,14 +15,6 @@ TILTED = Camera(MATRIX, (-0.2, 0.05, 0.001, 0.001, 0, 0.1, 0, 0, 0.01, 0.001, 0.
 FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 
 
-def undistorted_points(points, camera):
-    """(N, 2) px by OpenCV."""
-    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(points, np.float64)[:, None]
-    if camera.model == "fisheye":
-        return cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
-    return cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
-
-
 @pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
 def test_photograph_is_undistorted_as_by_opencv(camera):
     image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
@@ -46,7 +38,11 @@ def test_box_is_around_its_undistorted_outline(camera):
     moved = undistorted(torch.zeros(1, *SIZE), camera, box).box
     side = np.linspace(0.0, 1.0, 500)
     outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
-    points = undistorted_points(outline, camera)
+    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(outline, np.float64)[:, None]
+    if camera.model == "fisheye":
+        points = cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
+    else:
+        points = cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
     expected = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
     torch.testing.assert_close(moved, expected, atol=0.01, rtol=0)
     beyond = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-40.0, 8.0, 150.0, 100.0])).box

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.registration import FailedRegistration, Follower, following
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
@@ -172,11 +172,6 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     result = follow(*frames[1][:2])
     assert result.ok == used
     assert not used or result.confidence == confidence
-
-
-def test_follower_refuses_several_meshes():
-    with pytest.raises(InvalidInputError, match="one mesh"):
-        Follower(Registrar([truck_registrar().bank, truck_registrar().bank]), CAMERA)
 
 
 def test_follower_loses_an_absent_object_and_finds_it_again():

@@ -12,11 +12,12 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.inputs import ImageItem, check_crop
+from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
 
@@ -49,6 +50,10 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 5
     with pytest.raises(InvalidInputError, match="empty list"):
         Registrar([])
+    with pytest.raises(InvalidInputError, match="knows one mesh"):
+        Registrar([truck_bank()] * 2, renderer=make_renderer(example_mesh()))
+    with pytest.raises(InvalidInputError, match="one mesh"):
+        Follower(Registrar([truck_bank()] * 2), CAMERA)
 
 
 def test_flat_mesh_without_colours_warns():

@@ -84,7 +84,7 @@ def test_render_is_precise_for_tiny_and_distant_objects(backend: str, scale: flo
     torch.testing.assert_close(depth / scale, render(mesh, backend), rtol=0, atol=2e-5)
 
 
-def test_render_depth_refuses_bad_arguments() -> None:
+def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails() -> None:
     T, one, size = camera(2)
     box = trimesh.creation.box()
     not_finite = T.clone()
@@ -98,8 +98,6 @@ def test_render_depth_refuses_bad_arguments() -> None:
     with pytest.raises(MeshError, match="degenerate"):
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
 
-
-def test_a_renderer_that_fails_is_not_replaced() -> None:
     def fail(*_: object, **__: object) -> None:
         raise MemoryError("out of memory")
 

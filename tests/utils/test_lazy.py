@@ -9,8 +9,6 @@ import pytest
 from curvireg_torch import cli
 from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.utils import choices
 
 HEAVY = {"torch", "numpy", "scipy", "kornia", "trimesh", "cv2", "sklearn", "matplotlib", "safetensors", "tqdm"}
 UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "torchvision", "pandas", "IPython"}
@@ -49,11 +47,6 @@ def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
     )
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & (UNUSED | {"kornia", "sympy"})
-
-
-def test_choices_agree_with_the_presets():
-    assert list(PRESETS) == list(choices.PRESET_NAMES)
-    assert choices.DEFAULT in PRESETS
 
 
 def test_options_accept_numbers_with_commas():

@@ -10,8 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-__all__ = ["MISSING", "Browser", "wait_for"]
-
 PROGRAMS = [next(filter(None, map(shutil.which, names)), None)
             for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))]  # fmt: skip
 MISSING = [name for name in ("nicegui", "selenium") if importlib.util.find_spec(name) is None]

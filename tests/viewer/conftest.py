@@ -83,6 +83,17 @@ def registered(tmp_path_factory):
 
 
 @pytest.fixture
+def session(registered):
+    """The session at its first hypothesis; its options, photographs and result are restored afterwards."""
+    session = registered[0]
+    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
+    shot.choose(0)
+    yield session
+    vars(shot).update(kept)
+    session.options, session.shots, session.shot = options, [shot], shot
+
+
+@pytest.fixture
 def workspace(tmp_path):
     (tmp_path / "uploads").mkdir()
     return Workspace(RegisterOptions(), tmp_path / "uploads")

@@ -127,17 +127,12 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
 
 
 @pytest.fixture
-def shown(registered, tmp_path):
-    """The page of a session with a result, which is restored afterwards."""
-    session = registered[0]
+def shown(session, tmp_path):
+    """The page of a session with a result."""
     workspace = Workspace(session.options, tmp_path)
     workspace.session = session
-    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
-    shot.choose(0)
     with Client(page(""), request=None):
         yield workspace
-    vars(shot).update(kept)
-    session.options, session.shots, session.shot = options, [shot], shot
 
 
 def test_each_remark_has_its_repair(shown, monkeypatch):

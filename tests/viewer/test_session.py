@@ -61,17 +61,6 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
-def session(registered):
-    """The session at its first hypothesis; its options and its result are restored afterwards."""
-    session = registered[0]
-    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
-    shot.choose(0)
-    yield session
-    vars(shot).update(kept)
-    session.options = options
-
-
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
     _, folder, truth = registered
     assert session.command().startswith(f"curvireg register '{folder}/my photo.png' {folder / 'truck.ply'} ")
