@@ -1,5 +1,3 @@
-"""EXIF blocks for pictures that have none."""
-
 import struct
 import zlib
 from pathlib import Path

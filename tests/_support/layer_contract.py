@@ -1,12 +1,5 @@
-"""The contract of every layer, as one base class of tests.
-
-A test module defines its layers and inherits the tests::
-
-    class TestFilters(LayerContract):
-        cases = [LayerCase("ig", image_gradient, photos, ImageGradient), ...]
-
-A subclass disables a test that does not apply with ``test_gradcheck = None``.
-"""
+"""The contract of every layer, as one base class of tests: a test module defines ``cases`` and inherits the tests; it
+disables one that does not apply with ``test_gradcheck = None``."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,5 +1,3 @@
-"""Parts of MATLAB 5 files."""
-
 import struct
 
 

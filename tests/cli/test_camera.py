@@ -38,8 +38,8 @@ def register(folder, capsys):
     return run
 
 
-def test_exif_camera_gives_a_translation_without_covariance(register):
-    known, _ = register("exif.png", "--camera", *CAMERA)
+def test_guessed_cameras_give_a_translation_without_covariance(register):
+    known, _ = register("photos/0.png", "--camera", *CAMERA)
     assert known["inputs"]["camera_source"] == "given"
     assert known["covariance"] is not None
     guessed, printed = register("exif.png", "--camera", "exif")
@@ -49,13 +49,9 @@ def test_exif_camera_gives_a_translation_without_covariance(register):
     assert guessed["covariance"] is guessed["standard_deviations"] is None
     assert f"camera guessed, focal length {focal:.0f} px" in printed
     check_pose(guessed, scene(0)[2], 15.0, 0.1)
-
-
-def test_fov_is_the_horizontal_field_of_view(register):
-    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))
+    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))  # horizontal
     assert guessed["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "fov"
-    known, _ = register("photos/0.png", "--camera", *CAMERA)
     torch.testing.assert_close(torch.tensor(guessed["rotation"]), torch.tensor(known["rotation"]), atol=1e-3, rtol=0)
 
 

@@ -1,6 +1,7 @@
-"""``curvireg demo``, ``bank``, ``cache`` and ``plot``."""
+"""``curvireg demo``, ``bank``, ``cache`` and ``plot``; and the wrong inputs of scripts/robustness/wrong_inputs.txt."""
 
 import json
+import shlex
 import warnings
 from dataclasses import replace
 
@@ -15,8 +16,10 @@ from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
-from curvireg_torch.pipeline import PRESETS, ViewPolicy
+from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
+from scripts.robustness.wrong_inputs import cases
 from tests._support.scenes import truck_bank
+from tests.evaluation.small import SMALL
 from tests.viewer.test_session import write_scene
 
 
@@ -88,3 +91,19 @@ def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
     files = [str(tmp_path / "photo.png"), str(tmp_path / "truck.ply")]
     assert main(["plot", kind, *files, "--out", str(out), *words]) == 0
     assert cv2.imread(str(out)).std() > 10
+
+
+def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    wrong = []
+    for line, expected in cases(tmp_path):
+        try:
+            code = main([*shlex.split(line), *([] if line.startswith(("view", "frobnicate")) else ["--quiet"])])
+        except SystemExit as stop:  # of argparse
+            code = stop.code
+        printed = capsys.readouterr().err.splitlines()
+        if code != 2 or expected not in printed[-1]:
+            wrong.append((line, code, printed[-1:], expected))
+    assert not wrong, "\n".join(map(str, wrong))

@@ -1,5 +1,3 @@
-"""``curvireg follow``: poses and a video."""
-
 import json
 import re
 
@@ -130,7 +128,6 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
 def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
     """Ctrl-C is the usual end of a live video."""
-
     drawn, add = [] if source == "shots" else ["nothing"], OverlayVideo.add
 
     def interrupted(*arguments):

@@ -1,5 +1,3 @@
-"""``curvireg register`` of one photograph."""
-
 import json
 from dataclasses import replace
 
@@ -114,22 +112,17 @@ def test_register_limits_the_pose(register_one, document):
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
 
 
-@pytest.fixture
-def start(folder):
-    def write(shift=0.0):
-        T = scene(0)[2]
-        pose = {"rotation": T[:3, :3].tolist(), "translation": [float(T[0, 3]) + shift, *T[1:3, 3].tolist()]}
-        (folder / "start.json").write_text(json.dumps(pose))
-        return "--start", str(folder / "start.json"), "--camera", *map(str, CAMERA)
-
-    return write
-
-
-def test_register_refines_a_start_or_writes_that_the_object_is_lost(register_one, document, start, capsys):
-    assert register_one(*start(), box=()) == 0
+def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, register_one, document, capsys):
+    T, path = scene(0)[2], folder / "start.json"
+    pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
+    path.write_text(json.dumps(pose))
+    words = "--start", str(path), "--camera", *CAMERA
+    assert register_one(*words, box=()) == 0
     result = document()
     assert float(rotation_error(rotation(result), scene(0)[2][:3, :3])) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
-    assert register_one(*start(shift=100.0), box=()) == 2
+    pose["translation"][0] += 100.0
+    path.write_text(json.dumps(pose))
+    assert register_one(*words, box=()) == 2
     assert document()["status"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err

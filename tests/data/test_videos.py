@@ -1,5 +1,3 @@
-"""Frames of videos: their numbers, colours and sizes, and files that are none."""
-
 import cv2
 import numpy as np
 import pytest

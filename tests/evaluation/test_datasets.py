@@ -1,5 +1,3 @@
-"""Evaluation of datasets, from files to files."""
-
 import json
 from dataclasses import replace
 

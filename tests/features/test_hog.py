@@ -1,5 +1,3 @@
-"""HOG against its definition."""
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Cameras with distortion: undistortion against OpenCV's, validity of polynomials, and other resolutions."""
-
 import cv2
 import numpy as np
 import pytest

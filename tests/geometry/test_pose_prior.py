@@ -1,5 +1,3 @@
-"""Limits on the pose: angles that wrap, tolerances about a rotation, and moves into the limits."""
-
 import math
 
 import pytest

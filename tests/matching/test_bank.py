@@ -1,5 +1,3 @@
-"""Banks in memory and on disk."""
-
 import os
 import stat
 from dataclasses import replace
@@ -24,11 +22,6 @@ UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 
 def build(mesh, views=None, **options) -> ViewBank:
     return ViewBank.build(mesh, views, progress=False, image_size=64, **options)
-
-
-@pytest.fixture(scope="module")
-def upright(truck) -> ViewBank:
-    return build(truck, pipeline=Pipeline(views=UPRIGHT))
 
 
 @pytest.fixture
@@ -61,7 +54,8 @@ def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypa
     assert torch.equal(other.points_at(torch.tensor([3, 0])), small_bank.points_at(slice(None))[[3, 0]])
 
 
-def test_check_compatible_refuses_another_view_policy(upright):
+def test_check_compatible_refuses_another_view_policy(truck):
+    upright = build(truck, pipeline=Pipeline(views=UPRIGHT))
     for change, message in (
         ({"pose": "any"}, "pose upright, expected any"),
         ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, expected 60\.0"),

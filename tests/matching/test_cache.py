@@ -1,5 +1,3 @@
-"""The cache of banks: hits, keys, trimming, foreign files, concurrent processes."""
-
 import multiprocessing
 import os
 import time

@@ -45,7 +45,7 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     assert tied.order[0].tolist() == list(range(len(bank)))
 
 
-def test_matcher_is_batch_independent(matcher):
+def test_matcher_is_batch_independent_and_takes_bytes_and_mixed_channels(matcher):
     images, boxes = batch(0, 1, 2)
     together = matcher(images, boxes)
     assert torch.equal(matcher(list(images), boxes).scores, together.scores)
@@ -53,9 +53,6 @@ def test_matcher_is_batch_independent(matcher):
         alone = matcher(images[i : i + 1], boxes[i : i + 1])
         torch.testing.assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
-
-
-def test_matcher_takes_bytes_and_mixed_channels(matcher):
     images, boxes = batch(0, 1)
     exact = (images * 255).round() / 255
     pixels = (images * 255).round().to(torch.uint8)

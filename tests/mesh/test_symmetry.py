@@ -1,5 +1,3 @@
-"""Symmetries of the shape of meshes."""
-
 import numpy as np
 import pytest
 import torch

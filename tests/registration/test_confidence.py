@@ -1,5 +1,3 @@
-"""Confidence: closed forms, what raises it, and results that have none."""
-
 import json
 import math
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""The contour fit against closed forms and scenes of known truth."""
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

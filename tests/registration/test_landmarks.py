@@ -1,5 +1,3 @@
-"""Poses and boxes from landmarks of a mesh's print."""
-
 from dataclasses import replace
 from functools import cache
 

@@ -19,11 +19,6 @@ ONE, TRUTH = ([IMAGE], BOX[None], CAMERA), T[:3, :3]
 AZIMUTH = float(viewpoint_from_rotation(TRUTH)[0])
 
 
-@pytest.fixture(scope="module")
-def registrar():
-    return truck_registrar()
-
-
 def around(azimuth, tolerance):
     return PosePrior(azimuth=((azimuth - tolerance) % 360, (azimuth + tolerance) % 360))
 
@@ -37,7 +32,8 @@ def test_every_hypothesis_lies_within_hard_limits(pipeline):
     assert result.prior_contradiction == "better outside"
 
 
-def test_each_photograph_has_its_own_prior_which_may_leave_no_view(registrar):
+def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
+    registrar = truck_registrar()
     priors = [None, around(AZIMUTH + 180.0, 40.0), PosePrior(elevation=(85, 90), theta=(90, 91))]
     free, limited, failed = registrar([IMAGE] * 3, BOX.repeat(3, 1), CAMERA, prior=priors)
     assert float(rotation_error(free.rotation, TRUTH)) < 5.0

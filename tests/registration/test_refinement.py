@@ -55,7 +55,7 @@ def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     assert result.ok or (isinstance(result.error, LostObjectError) and "image 0" in str(result.error))
 
 
-def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar):
+def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(registrar):
     for move, message in (
         ((0.0, 0.0, -100.0), "outside the photograph"),
         ((50.0, 0.0, 0.0), "outside the photograph"),
@@ -67,9 +67,6 @@ def test_refine_refuses_a_start_that_does_not_show_the_mesh(registrar):
         result = registrar.refine([image], CAMERA, [T])[0]
         assert isinstance(result.error, LostObjectError)
         assert message in str(result.error)
-
-
-def test_refine_checks_its_arguments(registrar):
     for poses, camera, message in (
         ([torch.eye(4)], None, "camera matrix"),
         ([torch.eye(4)] * 2, CAMERA, "starts of 1 photographs, got 2"),

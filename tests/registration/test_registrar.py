@@ -152,7 +152,7 @@ def test_origin_of_the_mesh_may_be_far_away():
     assert float((position - TRUTH[:3, 3]).norm() / TRUTH[:3, 3].norm()) < 0.02
 
 
-def test_registrar_accepts_tensors_arrays_and_paths(tmp_path):
+def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_path):
     pixels = (IMAGE * 255).round().byte()
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
@@ -160,9 +160,6 @@ def test_registrar_accepts_tensors_arrays_and_paths(tmp_path):
     first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
     for result in others:
         torch.testing.assert_close(result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4)
-
-
-def test_registrar_rejects_bad_calls():
     registrar = truck_registrar(contours=False)
     with pytest.raises(InvalidInputError, match="focal"):
         _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[0].rotation
@@ -257,9 +254,7 @@ def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
 AZIMUTHS = (15.0, 45.0, 75.0, 225.0)  # Half-way between two views of a coarse bank, so that both lead to the same pose
 
 
-@pytest.fixture(scope="module")
-def coarse():
-    """A registrar with views 30 degrees apart, photographs and boxes."""
+def test_hypotheses_that_merge_are_put_back_and_come_last():
     mesh, images, boxes = example_mesh(), [], []
     for azimuth in AZIMUTHS:
         R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
@@ -268,14 +263,9 @@ def coarse():
         images.append(image)
         boxes.append(box)
     views = sample_views(azimuth_step=30, elevations=[20])
-    bank = ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
-    return Registrar(bank), images, torch.stack(boxes)
-
-
-def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
-    registrar, images, boxes = coarse
+    registrar = Registrar(ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False))
     restored = 0
-    for result in registrar(images, boxes, CAMERA):
+    for result in registrar(images, torch.stack(boxes), CAMERA):
         starts = (registrar.bank.rotations[h.view].double() for h in result.hypotheses)
         moves = (rotation_error(h.allocentric_rotation, R) for h, R in zip(result.hypotheses, starts, strict=True))
         is_moved = [float(degrees) > 0.01 for degrees in moves]

@@ -87,7 +87,7 @@ def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels(
     assert line.endswith(": 1 3 30 41")
 
 
-def test_pose_in_words():
+def test_pose_and_verdict_in_words():
     for viewpoint, words in (
         ((0, 0, 0), "seen from the front (azimuth 0°), level"),
         ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
@@ -99,10 +99,7 @@ def test_pose_in_words():
         assert pose_in_words(R) == words
         for up, front in (("y", None), ("-x", None), ("z", "x")):
             assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
-
-
-def test_verdict_has_three_words():
-    """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
+    # A high confidence that is not reliable, because of a questionable camera, is no reason to be sure.
     assert (verdict(0.95, 0.03, True), verdict(0.95, 0.03, False)) == ("likely", "unsure")
     assert (verdict(0.4, 0.39, False), verdict(0.4, 0.41, False)) == ("unsure", "no match")
     assert verdict(None, None, False) == "unsure"

@@ -121,13 +121,9 @@ def test_fit_must_find_enough_corners(monkeypatch, renderer, coarse, fine, count
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
-@pytest.fixture(scope="module")
-def registrar():
-    return cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
-
-
-def test_label_does_not_pull_a_pose_out_of_its_limits(registrar):
+def test_label_does_not_pull_a_pose_out_of_its_limits():
     """They are 10 degrees away from the true rotation."""
+    registrar = cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
     prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     free, limited = (registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior))

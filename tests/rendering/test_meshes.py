@@ -26,16 +26,12 @@ def assert_same_depth(found: torch.Tensor, expected: torch.Tensor, *, atol: floa
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("flipped", [slice(None), slice(0, None, 2)])
-def test_render_ignores_face_orientation(backend: str, flipped: slice) -> None:
+def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backend: str) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2)
-    faces = mesh.faces.copy()
-    faces[flipped] = faces[flipped, ::-1]
-    assert_same_depth(render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend), render(mesh, backend))
-
-
-def test_render_ignores_doubled_and_degenerate_faces(backend: str) -> None:
-    mesh = trimesh.creation.icosphere(subdivisions=2)
+    for flipped in (slice(None), slice(0, None, 2)):
+        faces = mesh.faces.copy()
+        faces[flipped] = faces[flipped, ::-1]
+        assert_same_depth(render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend), render(mesh, backend))
     inner = mesh.copy().apply_scale(0.5)
     vertices = np.concatenate([mesh.vertices, inner.vertices, [[np.nan] * 3]])  # no face uses the last one
     bridge = [[0, 1, len(mesh.vertices) + 5], [0, 1, len(mesh.vertices) + 9]]  # a hidden edge with four faces

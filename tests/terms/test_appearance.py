@@ -24,11 +24,6 @@ def large(**options) -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def large_bank(truck) -> ViewBank:
-    return ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
-
-
-@pytest.fixture(scope="module")
 def matcher(small_bank) -> ViewMatcher:
     return ViewMatcher(small_bank, pipeline=PIPELINE)
 
@@ -52,7 +47,8 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
 
 
-def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, matcher):
+def test_large_bank_compares_the_best_distinct_views(small_bank, truck, matcher):
+    large_bank = ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
     before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(*photograph(2))
     assert large_bank.appearance is None
     reranking = ViewMatcher(large_bank, pipeline=large(top=5, min_angle=40.0))

@@ -1,5 +1,3 @@
-"""Scores of descriptors, feature points and box shapes, and jittered copies of a box."""
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,5 +1,3 @@
-"""A headless browser that shows a page of the viewer."""
-
 import importlib.util
 import os
 import shutil

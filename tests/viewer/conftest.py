@@ -1,5 +1,3 @@
-"""A viewer and a browser that shows it."""
-
 import os
 import re
 import shutil

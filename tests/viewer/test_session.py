@@ -340,7 +340,7 @@ def seen(T, K, point):
     return at[:2] / at[2]
 
 
-def test_the_centre_follows_the_mouse_on_the_mesh_and_the_near_side_one_beside_it(pose):
+def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     result, T, K, describer = pose
     moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
@@ -352,12 +352,8 @@ def test_the_centre_follows_the_mouse_on_the_mesh_and_the_near_side_one_beside_i
     assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
     assert 3 < shift[1] < 6
     torch.testing.assert_close(seen(turned, K, describer.centre), seen(T, K, describer.centre))
-
-
-def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
-    result, T, K, describer = pose
     moved = result.scaled(T, 1.25, roll=30.0)
-    centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (T, moved)]
+    centres = [P[:3, :3] @ describer.centre + P[:3, 3] for P in (T, moved)]
     torch.testing.assert_close(centres[1], centres[0] / 1.25)
     assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
     # Clockwise on the screen: what is right of the centre goes down.

@@ -1,5 +1,3 @@
-"""The picture of a result: photograph, caption, close-up, fields and rivals."""
-
 from dataclasses import replace
 
 import numpy as np
