@@ -15,7 +15,6 @@ from .._support.pages import DOCS, PAGES, ROOT
 SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
 PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"
-by_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 
 
 def without_code(page: Path) -> str:
@@ -28,7 +27,7 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", text.replace("`", "")).replace(" ", "-")
 
 
-@by_page
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_resolve(page: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page))):
         if re.match(r"\w+:", link):

@@ -12,6 +12,7 @@ from torch import nn
 
 from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
+from tests._support.scenes import scene
 
 
 def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():
@@ -41,8 +42,8 @@ def test_ledoit_wolf_equals_scikit_learn(count):
     torch.testing.assert_close(mean, x.mean(dim=0))
 
 
-def test_matcher_ranks_by_whitened_correlation(bank, photographs):
-    images, boxes = photographs[0][:1], photographs[1][:1]
+def test_matcher_ranks_by_whitened_correlation(bank):
+    images, boxes = [scene(0)[0]], scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes).descriptors[:, 0]

@@ -191,12 +191,6 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
     assert browser.messages() == []
 
 
-def test_dark_colours_follow_the_system(browser):
-    browser.emulate(1440, 900, dark=True)
-    body = browser.driver.find_element("css selector", "body")
-    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
-
-
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
 def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
     browser.emulate(*size)
@@ -211,7 +205,7 @@ def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
     assert viewport.rect["width"] > 0.5 * size[0]
 
 
-def test_a_small_screen_stacks_everything(browser):
+def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(browser):
     browser.emulate(390, 844)
     wide = """
         const all = [...document.querySelectorAll('*:not(.preview *)')];
@@ -221,6 +215,9 @@ def test_a_small_screen_stacks_everything(browser):
     parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
+    browser.emulate(1440, 900, dark=True)
+    body = browser.driver.find_element("css selector", "body")
+    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
