@@ -87,9 +87,8 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
         Pipeline.read(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_read_names_the_file_and_the_mistake(tmp_path):
+    for text, message in (
         ("{", "not JSON"),
         ('{"version": 99}', "version 2"),
         ('{"field": "nope"}', "field: expected one of 'learned'"),
@@ -108,14 +107,12 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
         ('{"bank": {"image_size": [64]}}', "image_size"),
         ('{"terms": {"repeatability": {}}}', "each term once, and 'hog'"),
         ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
-    ],
-)
-def test_read_names_the_file_and_the_mistake(tmp_path, text, message):
-    path = tmp_path / "mine.json"
-    path.write_text(text)
-    with pytest.raises(InvalidInputError, match=message) as caught:
-        Pipeline.read(path)
-    assert "mine.json" in str(caught.value)
+    ):
+        path = tmp_path / "mine.json"
+        path.write_text(text)
+        with pytest.raises(InvalidInputError, match=message) as caught:
+            Pipeline.read(path)
+        assert "mine.json" in str(caught.value)
 
 
 def test_photograph_field_refuses_other_weights():

@@ -14,12 +14,6 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
 from tests._support.scenes import scene
 
-BOX = [float(v) for v in box_of(0)]
-
-
-def rotation(document):
-    return torch.tensor(document["rotation"], dtype=torch.float64)
-
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
@@ -57,7 +51,8 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
     T[:3, :3] = up_rotation(up).numpy().T
     example_mesh().apply_transform(T).export(folder / name)
     assert register_one("--pose", "upright", "--no-refine", *options, mesh=name) == 0
-    assert float(rotation_error(rotation(document()), scene(0)[2][:3, :3] @ up_rotation(up))) < 15
+    found = torch.tensor(document()["rotation"]).double()
+    assert float(rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up))) < 15
 
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
@@ -94,7 +89,8 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     assert register_one("--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply") == 0
     written = document()
     registrar = Registrar(str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json"))
-    result = registrar([folder / "photos/0.png"], torch.tensor([BOX]), camera_matrix(*map(float, CAMERA)))[0]
+    photo, box = folder / "photos/0.png", torch.tensor([[float(v) for v in box_of(0)]])
+    result = registrar([photo], box, camera_matrix(*map(float, CAMERA)))[0]
     for name in ("rotation", "translation"):
         assert written[name] == getattr(result, name).tolist()
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
@@ -119,7 +115,7 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, regi
     words = "--start", str(path), "--camera", *CAMERA
     assert register_one(*words, box=()) == 0
     result = document()
-    assert float(rotation_error(rotation(result), scene(0)[2][:3, :3])) < 3.0
+    assert float(rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3])) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
     pose["translation"][0] += 100.0
     path.write_text(json.dumps(pose))

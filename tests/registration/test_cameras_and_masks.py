@@ -114,22 +114,19 @@ def test_masks_in_any_form(tmp_path):
         assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
 
 
-@pytest.mark.parametrize(
-    ("mask", "box", "words"),
-    [
+def test_unusable_masks_are_named():
+    for mask, box, words in (
         (torch.zeros(40, 60, dtype=torch.bool), None, "mask: no white pixel; expected the object white"),
         (torch.eye(40, 60), [50.0, 0.0, 58.0, 9.0], "mask: no white pixel in the box"),
         (torch.ones(60, 40), None, r"mask: expected shape \(40, 60\), that of the photograph, got \(60, 40\)"),
         (torch.ones(40, 60, dtype=torch.int64), None, "mask: expected bool, uint8 or floating"),
         (torch.full((40, 60), 255.0), None, "mask: expected values from 0 to 1"),
         ("no.png", None, "no.png: no such file"),
-    ],
-)
-def test_unusable_masks_are_named(mask, box, words):
-    (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
-    assert isinstance(result, FailedRegistration)
-    with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
-        raise result.error
+    ):
+        (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
+        assert isinstance(result, FailedRegistration)
+        with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
+            raise result.error
 
 
 def test_camera_is_scaled_to_each_photograph():

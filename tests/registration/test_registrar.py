@@ -224,13 +224,10 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
 WRONG = BOX + torch.tensor([-0.1, 0.2, 0.1, 0.15]) * (BOX[2:] - BOX[:2]).repeat(2)
 
 
-def uncorrected(box):
-    return truck_registrar(box_jitter=0.0)([IMAGE], box[None], CAMERA)[0]
-
-
 def test_wrong_box_is_corrected():
     registrar = truck_registrar()
-    result, before = registrar([IMAGE], WRONG[None], CAMERA)[0], uncorrected(WRONG)
+    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    before = truck_registrar(box_jitter=0.0)([IMAGE], WRONG[None], CAMERA)[0]
     assert before.corrected_box is None
     assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
     assert result.score > before.score
@@ -242,7 +239,7 @@ def test_wrong_box_is_corrected():
 @pytest.mark.parametrize("better", [True, False])
 def test_corrected_result_is_kept_if_its_score_is_higher(monkeypatch, better):
     registrar = truck_registrar()
-    first = uncorrected(BOX)
+    first = truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
     other = replace(first, hypotheses=(replace(first.hypotheses[0], score=first.score + (0.01 if better else -0.01)),))
     answers = iter([first, other])
     monkeypatch.setattr(registrar, "_register_box", lambda _: next(answers))
