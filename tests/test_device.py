@@ -1,5 +1,3 @@
-"""Registration on a GPU gives the results of the CPU."""
-
 import copy
 
 import pytest

@@ -79,15 +79,12 @@ def test_json_contains_every_setting():
         base.box_jitter = 0.0  # type: ignore[misc]
 
 
-def test_read_completes_a_partial_file_with_defaults(tmp_path):
+def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}}))
     assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
     with pytest.raises(MissingFileError, match="no such pipeline"):
         Pipeline.read(tmp_path / "none.json")
-
-
-def test_read_names_the_file_and_the_mistake(tmp_path):
     for text, message in (
         ("{", "not JSON"),
         ('{"version": 99}', "version 2"),

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -82,10 +83,8 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
 @pytest.mark.parametrize("n", [1, 2], ids=["one thread", "two threads"])
 @pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
 def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, threads, draws, file, n):
-    def fail(*_, **__):
-        raise InvalidInputError("it cannot be drawn")
-
     threads(n)
+    fail = Mock(side_effect=InvalidInputError("it cannot be drawn"))
     monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
     words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
     assert register(*words) == 2

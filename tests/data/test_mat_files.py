@@ -51,7 +51,7 @@ def test_read_mat_agrees_with_scipy(tmp_path, compress):
     assert read_mat(path, "other") == [1.0]
 
 
-def test_read_mat_refuses_false_claims(tmp_path):
+def test_read_mat_refuses_false_claims_and_bounds_all_variables_together(tmp_path):
     for content, message in (
         (array(6, (1 << 15, 1 << 15), element(9, b"\0" * 8)), "claims 1073741824 numbers"),
         (array(2, (1 << 15, 1 << 15), FIELD_A), "struct array claims"),
@@ -76,9 +76,6 @@ def test_read_mat_refuses_false_claims(tmp_path):
         tracemalloc.stop()
         (tmp_path / "a.mat").write_bytes(file(nested(10)))
         assert isinstance(read_mat(tmp_path / "a.mat", "record"), list)
-
-
-def test_read_mat_bounds_all_variables_together(tmp_path):
     packed = zlib.compress(array(6, (1, 100_000), element(2, bytes(100_000)), b"other"), 9)
     for count in (10, 11):
         (tmp_path / "a.mat").write_bytes(file((struct.pack("<II", 15, len(packed)) + packed) * count))

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -83,9 +84,7 @@ def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path
 
 
 def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
-    def broken(*_, **__):
-        raise RenderingError("no renderer")
-
+    broken = Mock(side_effect=RenderingError("no renderer"))
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
     with pytest.raises(RenderingError):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")

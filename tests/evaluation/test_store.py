@@ -1,3 +1,5 @@
+from unittest.mock import Mock
+
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
@@ -73,10 +75,7 @@ def test_other_files_are_refused(tmp_path, content):
 
 
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    def full_disk(*_):
-        raise OSError(28, "No space left on device")
-
     store = ResultStore(tmp_path)
-    monkeypatch.setattr("os.fsync", full_disk)
+    monkeypatch.setattr("os.fsync", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(OutputError, match="No space left"):
         store.append(row("x"))

@@ -53,7 +53,7 @@ CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
 HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
 
 
-def test_symmetry_transforms_reads_matrices_row_by_row_and_refuses_malformed_input() -> None:
+def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input() -> None:
     assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
@@ -66,9 +66,6 @@ def test_symmetry_transforms_reads_matrices_row_by_row_and_refuses_malformed_inp
     ):
         with pytest.raises(InvalidInputError, match=match):
             g.symmetry_transforms(info, max_step_fraction=step)
-
-
-def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
     transforms = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0

@@ -147,7 +147,7 @@ PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
 
-def test_load_mesh_refuses_false_claims(tmp_path: Path) -> None:
+def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, content, match in (
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
@@ -160,9 +160,6 @@ def test_load_mesh_refuses_false_claims(tmp_path: Path) -> None:
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
     ):
         refused(tmp_path / name, content, match)
-
-
-def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)

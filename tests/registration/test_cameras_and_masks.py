@@ -104,7 +104,7 @@ def test_mask_decides_which_edges_are_the_outline():
     assert register.object_mask(query, [image_item(image, box, CAMERA)]) is None
 
 
-def test_masks_in_any_form(tmp_path):
+def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
     mask = torch.zeros(40, 60, dtype=torch.bool)
     mask[10:30, 20:50] = True
     Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
@@ -112,9 +112,6 @@ def test_masks_in_any_form(tmp_path):
         item = image_item(torch.rand(3, 40, 60), None, mask=form)
         assert torch.equal(item.mask, mask.float())
         assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
-
-
-def test_unusable_masks_are_named():
     for mask, box, words in (
         (torch.zeros(40, 60, dtype=torch.bool), None, "mask: no white pixel; expected the object white"),
         (torch.eye(40, 60), [50.0, 0.0, 58.0, 9.0], "mask: no white pixel in the box"),

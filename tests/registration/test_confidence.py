@@ -37,12 +37,17 @@ def test_concentration_in_closed_form():
     assert confidence.concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
 
 
-def test_logistic_model():
+def test_logistic_model_and_probabilities_of_hypotheses_in_closed_form():
     model = confidence.LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
     assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
     assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
     assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, "bounded without a rival"
     assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (1.0, 0.0)
+    constants = confidence.CALIBRATION["instance"]
+    found = confidence.hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 0.0]), exact=True)
+    weights = [1.0, math.exp(-constants["slope"]), math.exp(constants["none"])]
+    assert found == pytest.approx((0.6, *(0.4 * w / sum(weights) for w in weights[:2])))
+    assert confidence.hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -66,14 +71,6 @@ def test_confidence_features():
         assert margin == math.copysign(confidence.MAX_MARGIN, factor)
     alone = confidence.confidence_features(evidence[:1], scores[:1], None)
     assert alone["margin"] is alone["concentration"] is None
-
-
-def test_probabilities_of_hypotheses_in_closed_form():
-    constants = confidence.CALIBRATION["instance"]
-    found = confidence.hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 0.0]), exact=True)
-    weights = [1.0, math.exp(-constants["slope"]), math.exp(constants["none"])]
-    assert found == pytest.approx((0.6, *(0.4 * w / sum(weights) for w in weights[:2])))
-    assert confidence.hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
 def test_only_the_default_pipeline_is_calibrated():

@@ -138,17 +138,14 @@ def row_of_points(outline: bool, direction: float, *, count: int = 1) -> Contour
     return ContourPoints(torch.zeros(count, 1, 3, dtype=torch.float64), normals, there, there & outline)
 
 
-def test_mask_weights_within_at_the_border_and_beyond():
+def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose():
     """At 20 px to the left of the border, on it, and at 20 px to the right."""
     uv, offsets = torch.tensor([[[127.5, 90.0]]]).double(), torch.tensor([-20.0, 0.0, 20.0]).double()
     outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])  # at the second the object lies outside
     for outline, direction, expected in (*outlines, (False, 1.0, [1.0, 0.3, 0.3]), (False, -1.0, [0.3, 0.3, 1.0])):
         weights = half_planes(128).weights(uv, row_of_points(outline, direction), offsets, FIRST, 256)
         assert weights[0, 0].tolist() == pytest.approx(expected)
-
-
-def test_each_pose_has_the_mask_of_its_crop_at_any_size():
-    """Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both sides there."""
+    # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both sides there.
     uv = torch.tensor([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]], dtype=torch.float64)
     here, index = torch.zeros(1, dtype=torch.float64), torch.tensor([0, 0, 1])
     found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), here, index, 128)

@@ -1,6 +1,7 @@
 """Following: generated sequences with bounded errors, frames without the object, and starts that are wrong."""
 
 import json
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -12,6 +13,8 @@ from curvireg_torch.registration import FailedRegistration, Follower, following
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
+
+LOST = Mock(side_effect=LostObjectError("lost"))
 
 
 def test_follower_keeps_the_object_over_a_sequence():
@@ -43,10 +46,6 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
         assert torch.equal(result.transform[:3, 3], result.translation)
         assert set(result.confidence_features) == {"edge_support", "region", "flow", "keyframe"}
         json.dumps(result.to_dict(), allow_nan=False)
-
-
-def lost(*_, **__):
-    raise LostObjectError("lost")
 
 
 def answering(monkeypatch, registrar, answers):
@@ -109,15 +108,15 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
     follow.start(frames[0][0], frames[0][2])
     with monkeypatch.context() as patch:
         patch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.3)
-        patch.setattr(following, "refine_item", lost)
+        patch.setattr(following, "refine_item", LOST)
         assert follow(frames[1][0]).confidence == pytest.approx(0.3)
     with monkeypatch.context() as patch:
-        patch.setattr(following, "refine_item", lost)
+        patch.setattr(following, "refine_item", LOST)
         assert follow(frames[2][0]).confidence <= 0.3
     confirmed = follow(frames[3][0])
     assert confirmed.confidence > BELIEVED_CONFIDENCE
     assert errors(confirmed, frames[3][2])[0] < 4.0
-    monkeypatch.setattr(following, "refine_item", lost)
+    monkeypatch.setattr(following, "refine_item", LOST)
     assert follow(frames[4][0]).confidence > BELIEVED_CONFIDENCE, "tracked from the confirmed pose"
 
 
@@ -154,7 +153,7 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked)
-    monkeypatch.setattr(following, "refine_item", lost)
+    monkeypatch.setattr(following, "refine_item", LOST)
     monkeypatch.setattr(Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))])
     result = follow(frames[1][0])
     assert result.ok == kept
@@ -167,7 +166,7 @@ def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, 
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.1)
-    monkeypatch.setattr(following, "refine_item", lost)
+    monkeypatch.setattr(following, "refine_item", LOST)
     answering(monkeypatch, registrar, [confidence])
     result = follow(*frames[1][:2])
     assert result.ok == used

@@ -13,7 +13,7 @@ from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_
 VGA = (480, 640)
 
 
-def test_camera_warnings_name_the_likely_mistake():
+def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
     for camera, size, parts in (
         ((325, 325, 572, 573), VGA, ["(572, 573) lies outside", "640 x 480", "seem to be swapped"]),
         ((572, 700, 573, 650), VGA, ["near the centre"]),  # inside the picture, but no swapped camera
@@ -30,9 +30,6 @@ def test_camera_warnings_name_the_likely_mistake():
         assert bool(warnings) == bool(parts)
         for part in parts:
             assert part in text
-
-
-def test_boxes_that_show_few_pixels_are_refused_or_questioned():
     for box, refused, warned in (
         ([10, 10, 21.9, 200], True, True),
         ([10, 10, 22, 200], False, True),

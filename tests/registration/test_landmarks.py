@@ -166,14 +166,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmar
         assert [len(found) for found in one.landmark_poses(seen)] == [0, 0]
 
 
-def test_a_second_place_with_landmarks_makes_the_first_less_certain():
-    """As two objects with similar prints do."""
-    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
-    assert alone == LANDMARK_PROBABILITY
-    assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
-
-
-def test_boxes_of_landmarks_are_the_first_proposals():
+def test_boxes_of_landmarks_are_the_first_proposals_less_certain_with_a_rival():
     T = pose(65.0, 0.4, 4.0)
     item = image_items([photograph(T)], None, K)[0]
     proposals = propose(registrar(), item)
@@ -184,3 +177,7 @@ def test_boxes_of_landmarks_are_the_first_proposals():
     near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
     assert (proposals.by_landmarks, propose(registrar(), near).by_landmarks) == (1, 0)
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
+    # As two objects with similar prints do.
+    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
+    assert alone == LANDMARK_PROBABILITY
+    assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))

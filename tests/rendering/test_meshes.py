@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -93,10 +94,7 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
         cr.render_depth(box, T, one, size, renderer="opengl")
     with pytest.raises(MeshError, match="degenerate"):
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
-
-    def fail(*_: object, **__: object) -> None:
-        raise MemoryError("out of memory")
-
+    fail = Mock(side_effect=MemoryError("out of memory"))
     with pytest.raises(RenderingError, match="out of memory"):
         cr.render_depth(trimesh.creation.box(), *camera(2), renderer=SimpleNamespace(name="mine", render=fail))
 

@@ -78,14 +78,11 @@ def box_score(shapes, boxes, **options):
     return terms.BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
 
 
-def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio():
+def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_border():
     boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 10, 10], [0, 0, 10, 20]]) + 3.0
     expected = [math.exp(-((k * math.log(2)) ** 2) / (2 * 0.5**2)) for k in (0, 1, 2)]
     assert box_score(terms.box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(expected, rel=1e-5)
     assert box_score(torch.tensor([-9.0]), boxes)[0, 2] == 1.0
-
-
-def test_whole_box_shapes_are_nan_at_the_border():
     for box, whole in (
         ([10, 10, 60, 40], True),
         ([-0.5, 10, 60, 40], False),

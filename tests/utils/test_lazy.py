@@ -34,10 +34,7 @@ def test_imports_are_only_those_of_what_is_used():
     loaded = imported_by("import curvireg_torch.evaluation.result_files")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED
-
-
-def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
-    """kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation."""
+    # kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation.
     loaded = imported_by(
         "import numpy, trimesh, curvireg_torch as cr; from curvireg_torch.geometry import sample_views; "
         "views = sample_views(azimuth_step=90, elevations=[20]); "

@@ -1,5 +1,3 @@
-"""``curvireg follow --show``: a page with the latest frame."""
-
 import itertools
 import json
 import threading

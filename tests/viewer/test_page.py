@@ -1,5 +1,3 @@
-"""The photograph, the steps and the fields of the page, without a browser."""
-
 import asyncio
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,5 +1,3 @@
-"""The server of the viewer, without a browser."""
-
 import asyncio
 import re
 import socket

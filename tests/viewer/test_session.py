@@ -265,7 +265,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert [torch.equal(shot.photo.image, plain.image) for shot in session.shots] == [True, True]
 
 
-def test_command_contains_inputs_and_options(folder):
+def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
     session.open_photo(Path("photo.png"))
     assert not session.has_exif
@@ -285,9 +285,6 @@ def test_command_contains_inputs_and_options(folder):
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
-
-
-def test_command_contains_the_limits_on_the_pose():
     words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2", "--fov", "65"]
     session = new_session(*words)
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))

@@ -8,6 +8,7 @@ import threading
 import warnings
 import zipfile
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -144,9 +145,6 @@ def test_warnings_and_defects_become_messages(workspace, capsys):
     def warn():
         warnings.warn(CurviregWarning("small", subject="a.obj"), stacklevel=1)
 
-    def fail():
-        raise KeyError("x")
-
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show_warning
@@ -154,7 +152,7 @@ def test_warnings_and_defects_become_messages(workspace, capsys):
     assert workspace.messages == {"mesh": "a.obj: small"}
     assert asyncio.run(workspace.run("mesh", lambda: 5)) == 5
     assert workspace.messages == {}
-    assert asyncio.run(workspace.run("pose", fail)) is None
+    assert asyncio.run(workspace.run("pose", Mock(side_effect=KeyError("x")))) is None
     assert workspace.messages["pose"].startswith("KeyError: 'x'")
     assert "Traceback" in capsys.readouterr().err
 

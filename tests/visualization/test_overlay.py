@@ -1,5 +1,3 @@
-"""Pictures show the pose with the camera of the registration."""
-
 from dataclasses import replace
 
 import pytest
