@@ -44,11 +44,12 @@ def small_bank(truck: trimesh.Trimesh) -> ViewBank:
     return ViewBank.build(truck, views, image_size=64, progress=False)
 
 
-@pytest.fixture(scope="session")
-def photographs() -> tuple[list[torch.Tensor], torch.Tensor]:
-    """Three photographs (3, 180, 240) of the truck and their boxes (3, 4); camera ``scenes.CAMERA``."""
-    images, boxes, _ = zip(*(scenes.scene(seed) for seed in range(3)), strict=True)
-    return list(images), torch.stack(boxes)
+@pytest.fixture
+def threads():
+    """``torch.set_num_threads``, undone after the test."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -1,5 +1,3 @@
-"""Registration on a GPU gives the results of the CPU."""
-
 import copy
 
 import pytest
@@ -10,17 +8,9 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
-LAYERS = [
-    cr.AnisotropicDiffusion(iterations=3),
-    cr.ApparentRidges(),
-    cr.AverageShadingGradient(),
-    cr.DepthCurvilinearSaliency(),
-    cr.EdgeBlur(),
-    cr.HessianFrobeniusNorm(),
-    cr.ImageCurvilinearSaliency(),
-    cr.LearnedCurvilinearSaliency(),
-    cr.MultiScaleFocusCurves(),
-]
+MODULES = [cr.ApparentRidges, cr.AverageShadingGradient, cr.DepthCurvilinearSaliency, cr.EdgeBlur]
+MODULES += [cr.HessianFrobeniusNorm, cr.ImageCurvilinearSaliency, cr.LearnedCurvilinearSaliency]
+LAYERS = [cr.AnisotropicDiffusion(iterations=3), cr.MultiScaleFocusCurves(), *(make() for make in MODULES)]
 
 
 @pytest.mark.cuda

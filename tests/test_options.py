@@ -1,4 +1,4 @@
-"""Every optional argument of the public surface is keyword-only, and every Module repeats its function's options."""
+"""Public names are documented, their options keyword-only, and every Module repeats its function's options."""
 
 import inspect
 
@@ -10,13 +10,15 @@ import curvireg_torch as cr
 # The documented API passes these by position.
 POSITIONAL = {"mask", "views", "thetas", "theta", "camera_matrices", "unit"}
 FUNCTIONS = [n for n in cr.__all__ if inspect.isfunction(getattr(cr, n))]
-MODULES = {
-    n.lower(): n for n in cr.__all__ if inspect.isclass(getattr(cr, n)) and issubclass(getattr(cr, n), nn.Module)
-}
+CLASSES = [n for n in cr.__all__ if inspect.isclass(getattr(cr, n))]
+MODULES = {n.lower(): n for n in CLASSES if issubclass(getattr(cr, n), nn.Module)}
 TWINS = {MODULES[n.replace("_", "")]: n for n in FUNCTIONS if n.replace("_", "") in MODULES}
 
 
-def test_every_filter_has_a_twin():
+def test_public_names_are_documented_and_every_filter_has_a_twin():
+    assert "Registrar" in cr.__all__
+    for name in cr.__all__:
+        assert getattr(cr, name).__doc__, name
     assert len(TWINS) >= 12
 
 

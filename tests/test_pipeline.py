@@ -13,6 +13,7 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
 from curvireg_torch.terms import TERMS, Correlation, Repeatability
+from curvireg_torch.utils import choices
 
 
 @pytest.mark.parametrize("name", [*FIELDS, *DEPTH_FIELDS])
@@ -40,6 +41,7 @@ def test_presets_register_and_survive_json(name):
 
 def test_presets_have_the_stated_settings():
     assert preset_named(DEFAULT) == Pipeline()
+    assert (list(PRESETS), choices.DEFAULT) == (list(choices.PRESET_NAMES), DEFAULT)
     with pytest.raises(InvalidInputError, match="'classical'"):
         preset_named("best")
     for name in ("classical", "paper"):  # nothing learned
@@ -54,16 +56,9 @@ def test_presets_have_the_stated_settings():
 
 def test_json_contains_every_setting():
     base = Pipeline()
-    changed = [
-        replace(base, field="focus", weights=""),
-        base.with_pose_prior("upright"),
-        replace(base, terms=base.terms[:2]),
-        replace(base, box_jitter=0.2),
-        replace(base, weights="0123"),
-        replace(base, hypotheses=6),
-        replace(base, search=True),
-        replace(base, contours=False),
-    ]
+    settings = [{"field": "focus", "weights": ""}, {"terms": base.terms[:2]}, {"box_jitter": 0.2}, {"weights": "0123"}]
+    settings += [{"hypotheses": 6}, {"search": True}, {"contours": False}]
+    changed = [base.with_pose_prior("upright"), *(replace(base, **setting) for setting in settings)]
     for part, names in {
         "views": ("directions", "theta_step", "azimuth_step", "distance"),
         "bank": ("image_size", "sigma", "margin", "bins"),
@@ -84,17 +79,13 @@ def test_json_contains_every_setting():
         base.box_jitter = 0.0  # type: ignore[misc]
 
 
-def test_read_completes_a_partial_file_with_defaults(tmp_path):
+def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_mistake(tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({"box_jitter": 0.0, "terms": {"hog": {"weight": 2.0}}}))
     assert Pipeline.read(path) == Pipeline(box_jitter=0.0, terms=(Correlation(weight=2.0),))
     with pytest.raises(MissingFileError, match="no such pipeline"):
         Pipeline.read(tmp_path / "none.json")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+    for text, message in (
         ("{", "not JSON"),
         ('{"version": 99}', "version 2"),
         ('{"field": "nope"}', "field: expected one of 'learned'"),
@@ -113,14 +104,12 @@ def test_read_completes_a_partial_file_with_defaults(tmp_path):
         ('{"bank": {"image_size": [64]}}', "image_size"),
         ('{"terms": {"repeatability": {}}}', "each term once, and 'hog'"),
         ('{"terms": {"hog": {}, "appearance": {"weights": "0"}}}', "expected weights 0"),
-    ],
-)
-def test_read_names_the_file_and_the_mistake(tmp_path, text, message):
-    path = tmp_path / "mine.json"
-    path.write_text(text)
-    with pytest.raises(InvalidInputError, match=message) as caught:
-        Pipeline.read(path)
-    assert "mine.json" in str(caught.value)
+    ):
+        path = tmp_path / "mine.json"
+        path.write_text(text)
+        with pytest.raises(InvalidInputError, match=message) as caught:
+            Pipeline.read(path)
+        assert "mine.json" in str(caught.value)
 
 
 def test_photograph_field_refuses_other_weights():

@@ -4,17 +4,15 @@ import numpy as np
 import pytest
 import torch
 
-from curvireg_torch import Registrar, camera_matrix, rotation_error
+from curvireg_torch import Registrar, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import demo_scene, example_mesh, random_pose, synthesize_photograph
-
-SIZE = (180, 240)
-CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
+from tests._support.scenes import CAMERA, SIZE
 
 
-def test_photograph_shows_the_colours_of_the_mesh_at_its_pose():
+def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():
     generator, mesh = torch.Generator().manual_seed(3), example_mesh()
     mesh.visual.face_colors = np.tile(np.array([255, 0, 255, 255], np.uint8), (len(mesh.faces), 1))
     T = random_pose(mesh, CAMERA, SIZE, generator, elevations=(15.0, 45.0))
@@ -26,9 +24,6 @@ def test_photograph_shows_the_colours_of_the_mesh_at_its_pose():
     rows, columns = expected.nonzero().unbind(dim=1)
     inside = torch.stack([columns.min(), rows.min(), columns.max(), rows.max()])
     assert float((box - inside).abs().max()) < 1
-
-
-def test_photograph_refuses_a_pose_that_does_not_show_the_object():
     behind = torch.eye(4, dtype=torch.float64)
     behind[2, 3] = -1.0
     with pytest.raises(InvalidInputError, match="no pixel"):

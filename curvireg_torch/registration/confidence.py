@@ -27,13 +27,7 @@ COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
 # generated shelves 28 of 29. It is less where other objects have a similar print
 MIN_LANDMARKS, LANDMARK_PROBABILITY = 12, 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
-CONFIDENCE_FEATURES = (
-    "similarity",
-    "margin",
-    "edge_support",
-    "concentration",
-    "landmarks",
-)  # See :func:`confidence_features`
+CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
 RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals

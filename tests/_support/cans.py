@@ -9,8 +9,6 @@ from PIL import Image
 from curvireg_torch.rendering import render_colour
 from tests._support.scenes import CAMERA, SIZE
 
-__all__ = ["can", "photograph"]
-
 
 def can(word: str = "BEANS") -> trimesh.Trimesh:
     """A closed cylinder about y with a label."""

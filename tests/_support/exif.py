@@ -1,10 +1,6 @@
-"""EXIF blocks for pictures that have none."""
-
 import struct
 import zlib
 from pathlib import Path
-
-__all__ = ["exif", "with_exif"]
 
 
 def exif(orientation: int, focal: int = 0, order: str = ">") -> bytes:

@@ -1,12 +1,5 @@
-"""The contract of every layer, as one base class of tests.
-
-A test module defines its layers and inherits the tests::
-
-    class TestFilters(LayerContract):
-        cases = [LayerCase("ig", image_gradient, photos, ImageGradient), ...]
-
-A subclass disables a test that does not apply with ``test_gradcheck = None``.
-"""
+"""The contract of every layer, as one base class of tests: a test module defines ``cases`` and inherits the tests; it
+disables one that does not apply with ``test_gradcheck = None``."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -94,8 +87,7 @@ class LayerContract:
         assert torch.equal(x, before)
         assert type(twin).__name__ in repr(twin)
         for y in tensors(want):
-            assert y.device == x.device
-            assert len(y) == len(x)
+            assert (y.device, len(y)) == (x.device, len(x))
             assert torch.isfinite(y).all()
 
     def test_batched_equals_one_by_one(self, case: LayerCase) -> None:

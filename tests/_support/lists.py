@@ -1,4 +1,4 @@
-"""Lists of photographs on disk, and the results of a list."""
+"""Lists and rigs of photographs on disk, and the results of a list."""
 
 import csv
 import json
@@ -6,12 +6,12 @@ import json
 import cv2
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
-from tests._support.scenes import learned_registrar, scene, truck_bank
-
-__all__ = ["CAMERA", "RESULTS", "bop_poses", "box_of", "check_pose", "lines", "table", "write_files", "written"]
+from tests._support.scenes import learned_registrar, scene, truck_bank, write_photo
+from tests.registration.test_several import EASY, rig_of
 
 CAMERA = ["260", "260", "119.5", "89.5"]
 RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
@@ -22,8 +22,7 @@ def write_files(folder):
     """Three photographs, files that are none, a mesh, and two banks: "truck", without confidence, and "learned"."""
     (folder / "photos").mkdir()
     for seed in range(3):
-        picture = (scene(seed)[0].permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-        cv2.imwrite(str(folder / "photos" / f"{seed}.png"), picture)
+        write_photo(folder / "photos" / f"{seed}.png", scene(seed)[0])
     cv2.imwrite(str(folder / "flat.png"), np.full((60, 80, 3), 90, np.uint8))
     (folder / "text.jpg").write_text("not a picture")
     example_mesh().export(folder / "truck.ply")
@@ -70,3 +69,37 @@ def check_pose(document, T, degrees, share):
 
 def lines(folder):
     return [json.loads(line) for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def write_rig_photos(folder):
+    """Write 0.png to 2.png; returns the rows of their rig: photo, box, camera, rotation and translation."""
+    rows = []
+    for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
+        write_photo(folder / f"{k}.png", image)
+        rows.append([f"{k}.png", *box.tolist(), *CAMERA, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()])
+    return rows
+
+
+def quaternion(row):
+    """QW, QX, QY, QZ of the rotation in a row of a rig."""
+    x, y, z, w = Rotation.from_matrix(torch.tensor(row[9:18]).view(3, 3).numpy()).as_quat()
+    return [w, x, y, z]
+
+
+def write_colmap(folder, rows, points=""):
+    """Write images.txt, with that line of points behind each image, and cameras.txt."""
+    lines = ["# Image list"]
+    for k, row in enumerate(rows, start=1):
+        lines += [" ".join(map(str, [k, *quaternion(row), *row[18:], 1, row[0]])), points]
+    (folder / "images.txt").write_text("\n".join(lines))
+    (folder / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
+
+
+def write_bop_scene(folder, rows, objects, boxes):
+    """Write the three files of a scene, with the objects of each photograph and the boxes of all."""
+    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+    cameras = {k: {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]} for k, row in enumerate(rows)}
+    truth = {k: [{"obj_id": number} for number in some] for k, some in enumerate(objects)}
+    info = {k: [{"bbox_obj": box} for box in boxes] for k in range(len(rows))}
+    for name, content in (("camera", cameras), ("gt", truth), ("gt_info", info)):
+        (folder / f"scene_{name}.json").write_text(json.dumps(content))

@@ -1,8 +1,4 @@
-"""Parts of MATLAB 5 files."""
-
 import struct
-
-__all__ = ["element", "file"]
 
 
 def element(kind: int, content: bytes) -> bytes:

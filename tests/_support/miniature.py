@@ -9,8 +9,6 @@ import numpy as np
 import scipy.io
 import trimesh
 
-__all__ = ["pascal_object", "write_bop", "write_image", "write_mesh", "write_pascal3d", "write_web"]
-
 HALF = 0.25  # half the edge of the cube that all meshes are
 
 
@@ -160,20 +158,11 @@ def write_web(root: Path) -> dict[str, int]:
     write_mesh(root / "cup" / "mesh.off")
     for i, size in enumerate([(60, 80), (50, 50)]):
         write_image(root / "cup" / f"{i}.jpg", size, seed=i)
-    lines = [
-        "0.jpg,10,5,70,55,30,10,-5,3",
-        "1.jpg,10,5,40,45,,,,",
-        "1.jpg,10,5,40,45,90,0,,",
-        "2.jpg,10,5,40,45,,,,",
-        "0.jpg,10,5,10,45,,,,",
-        "0.jpg,,,,,,,,",
-        "0.jpg,a,5,10,45,,,,",
-        "0.jpg,1,5,10,45,30,,,",
-        "0.jpg,1,5",
-        "../cup/0.jpg,10,5,40,45,,,,",
-        "0.jpg,1,5,inf,45,,,,",
-    ]
-    root.joinpath("cup", "views.csv").write_text("\ufeff" + header + "\n".join(lines) + "\n", encoding="utf-8")
+    lines = """0.jpg,10,5,70,55,30,10,-5,3 1.jpg,10,5,40,45,,,, 1.jpg,10,5,40,45,90,0,, 2.jpg,10,5,40,45,,,,
+        0.jpg,10,5,10,45,,,, 0.jpg,,,,,,,, 0.jpg,a,5,10,45,,,, 0.jpg,1,5,10,45,30,,, 0.jpg,1,5
+        ../cup/0.jpg,10,5,40,45,,,, 0.jpg,1,5,inf,45,,,,"""
+    table = header + "\n".join(lines.split()) + "\n"
+    root.joinpath("cup", "views.csv").write_text("\ufeff" + table, encoding="utf-8")
     write_mesh(root / "shoe" / "mesh.ply")
     write_image(root / "shoe" / "a.png")
     root.joinpath("shoe", "views.csv").write_text(header + "a.png,0,0,79,59,,,,\n")

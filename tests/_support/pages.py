@@ -4,8 +4,6 @@ import re
 import shlex
 from pathlib import Path
 
-__all__ = ["BUILT", "DOCS", "PAGES", "ROOT", "split_command", "steps"]
-
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 BUILT = ("_build", "auto_gallery", "project")
@@ -27,11 +25,8 @@ STEP = re.compile(
 
 
 def steps(page: Path) -> list[tuple[str, str]]:
-    """The steps of a page in order: ("python", a block) and ("command", a line).
-
-    Commands are the lines of bash blocks, lines of plain blocks that start with a program, and inline commands that
-    have an ``--out`` or run a script.
-    """
+    """The steps of a page in order: ("python", a block) and ("command", a line): lines of bash blocks, lines of plain
+    blocks that start with a program, and inline commands that have an ``--out`` or run a script."""
     found: list[tuple[str, str]] = []
     for block in STEP.finditer(page.read_text(encoding="utf-8")):
         kind, code = block["kind"], block["code"]

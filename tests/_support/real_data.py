@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["real_data"]
-
 
 def real_data(name: str) -> Path:
     """The folder ``name`` of the shared data; skips the test where it is absent."""

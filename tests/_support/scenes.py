@@ -2,17 +2,17 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS, Pipeline
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-
-__all__ = ["CAMERA", "SIZE", "learned_registrar", "scene", "sequence", "truck_bank", "truck_registrar", "unrefined"]
 
 SIZE = (180, 240)
 CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
@@ -40,6 +40,12 @@ def scene(seed: int) -> tuple[Tensor, Tensor, Tensor]:
     return image, box, T
 
 
+def errors(result: Any, T: Tensor) -> tuple[float, float]:
+    """Degrees, and the error of the position as a fraction of the distance."""
+    away = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
+    return float(rotation_error(result.rotation, T[:3, :3])), away
+
+
 def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to frame."""
     T = scene(0)[2]
@@ -62,3 +68,8 @@ def unrefined(bank: ViewBank, **changes: Any) -> Pipeline:
 def truck_registrar(**changes: Any) -> Registrar:
     """A registrar of the truck, with changed fields of its pipeline."""
     return Registrar(truck_bank(), pipeline=replace(truck_bank().pipeline, **changes))
+
+
+def write_photo(path: Path, image: Tensor) -> None:
+    """Write a photograph (3, H, W) in [0, 1]."""
+    assert cv2.imwrite(str(path), (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy())

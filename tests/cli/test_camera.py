@@ -2,29 +2,26 @@
 
 import json
 import math
-import re
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
+from curvireg_torch import Camera, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
-from curvireg_torch.rendering import render_depth
-from curvireg_torch.synthetic import example_mesh
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, check_pose, lines, written
-from tests._support.scenes import scene
+from tests._support.scenes import scene, write_photo
+from tests.registration.test_cameras_and_masks import distorted
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _exif_photographs(folder):
     """The scenes have a focal length of 260 px at 240 x 180: 37.5 mm over the diagonal, 49.55 degrees across."""
-    for suffix in ("jpg", "png"):
-        cv2.imwrite(str(folder / f"exif.{suffix}"), cv2.imread(str(folder / "photos" / "0.png")))
-        with_exif(folder / f"exif.{suffix}", exif(1, 38))
+    cv2.imwrite(str(folder / "exif.png"), cv2.imread(str(folder / "photos" / "0.png")))
+    with_exif(folder / "exif.png", exif(1, 38))
 
 
 @pytest.fixture
@@ -40,8 +37,8 @@ def register(folder, capsys):
     return run
 
 
-def test_exif_camera_gives_a_translation_without_covariance(register):
-    known, _ = register("exif.png", "--camera", *CAMERA)
+def test_guessed_cameras_give_a_translation_without_covariance(register):
+    known, _ = register("photos/0.png", "--camera", *CAMERA)
     assert known["inputs"]["camera_source"] == "given"
     assert known["covariance"] is not None
     guessed, printed = register("exif.png", "--camera", "exif")
@@ -51,13 +48,9 @@ def test_exif_camera_gives_a_translation_without_covariance(register):
     assert guessed["covariance"] is guessed["standard_deviations"] is None
     assert f"camera guessed, focal length {focal:.0f} px" in printed
     check_pose(guessed, scene(0)[2], 15.0, 0.1)
-
-
-def test_fov_is_the_horizontal_field_of_view(register):
-    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))
+    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))  # horizontal
     assert guessed["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "fov"
-    known, _ = register("photos/0.png", "--camera", *CAMERA)
     torch.testing.assert_close(torch.tensor(guessed["rotation"]), torch.tensor(known["rotation"]), atol=1e-3, rtol=0)
 
 
@@ -76,77 +69,49 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     assert [line["inputs"]["camera_source"] for line in lines(tmp_path)] == ["given", "fov", "fov"]
 
 
-CALIBRATION = """%YAML:1.0
----
-image_width: 240
-image_height: 180
-camera_matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: [260., 0., 119.5, 0., 260., 89.5, 0., 0., 1.]
-distortion_coefficients: !!opencv-matrix
-   rows: 1
-   cols: 5
-   dt: d
-   data: [-0.25, 0.1, 0., 0., 0.]
-"""
-
-
 @pytest.fixture(scope="module")
-def distorted(folder):
-    """The first photograph as a lens with distortion shows it, its calibration, its box there, and a mask."""
-    (folder / "cam.yaml").write_text(CALIBRATION)
-    D = np.array([-0.25, 0.1, 0.0, 0.0, 0.0])
-    K = np.array([[260.0, 0.0, 119.5], [0.0, 260.0, 89.5], [0.0, 0.0, 1.0]])
-    v, u = np.mgrid[:180, :240].astype(np.float64)
-    straight = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, D, P=K).reshape(180, 240, 2)
-    maps = straight.astype(np.float32)
-    picture = cv2.imread(str(folder / "photos" / "0.png"))
-    cv2.imwrite(str(folder / "distorted.png"), cv2.remap(picture, maps, None, cv2.INTER_CUBIC))
-    depth = render_depth(example_mesh(), scene(0)[2], torch.from_numpy(K), (180, 240))[0, 0].numpy()
-    mask = cv2.remap((depth > 0).astype(np.uint8) * 255, maps, None, cv2.INTER_LINEAR)
-    cv2.imwrite(str(folder / "mask.png"), mask)
-    rows, columns = np.nonzero(mask > 127)
-    return [str(v) for v in (columns.min(), rows.min(), columns.max(), rows.max())]
+def lens(folder):
+    """A photograph that a lens with distortion took, its calibration and mask; returns its box and the true pose."""
+    camera = Camera(camera_matrix(260.0, 260.0, 20.0, 30.0), (-0.25, 0.1, 0.0, 0.0, 0.0), size=(180, 240))
+    calibration = {"mtx": camera.matrix.tolist(), "dist": camera.distortion, "image_size": [240, 180]}
+    _, photo, box, mask, T = distorted(camera, 1)
+    write_photo(folder / "distorted.png", photo)
+    cv2.imwrite(str(folder / "mask.png"), (255 * mask).round().byte().numpy())
+    (folder / "cam.json").write_text(json.dumps(calibration))
+    return [str(v) for v in box.tolist()], T
 
 
-def test_calibration_file_removes_the_distortion(folder, distorted, tmp_path, capsys):
-    out, camera = tmp_path / "out", str(folder / "cam.yaml")
+def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys):
+    (box, T), out, camera = lens, tmp_path / "out", str(folder / "cam.json")
     files = [str(folder / "distorted.png"), str(folder / "learned.safetensors"), "--camera", camera]
-    words = ["--box", *distorted, "--out", str(out), "--quiet", "--format", "ros"]
+    words = ["--box", *box, "--out", str(out), "--quiet", "--format", "ros"]
     assert main(["register", *files, *words]) == 0
     assert "distortion of the lens removed" in capsys.readouterr().out
     document = json.loads((out / "result.json").read_text())
-    check_pose(document, scene(0)[2], 3.0, 0.03)
+    check_pose(document, T, 3.0, 0.03)
     camera = document["camera"]
     assert (camera["distortion"][0], camera["size"], document["inputs"]["camera_source"]) == (-0.25, [180, 240], "file")
-    assert document["inputs"]["box"] != [float(v) for v in distorted]
+    assert document["inputs"]["box"] != [float(v) for v in box]
     assert np.array(document["T_cam_from_model"])[:3, 3].tolist() == document["translation"]
-    # The pose for ROS, in metres: the bank's unit.
-    stamped = (out / "pose.yaml").read_text()
-    position = [float(v) for v in re.findall(r"position: {x: (\S+), y: (\S+), z: (\S+)}", stamped)[0]]
-    orientation = [float(v) for v in re.findall(r"orientation: {x: (\S+), y: (\S+), z: (\S+), w: (\S+)}", stamped)[0]]
-    assert position == pytest.approx(document["translation"], rel=1e-6)
-    assert [orientation[3], *orientation[:3]] == pytest.approx(document["quaternion"])
-    assert Rotation.from_quat(orientation).as_matrix().tolist() == pytest.approx(np.array(document["rotation"]))
+    assert "frame_id: camera_optical_frame" in (out / "pose.yaml").read_text()
 
 
-def test_lists_take_calibration_files_and_masks(folder, distorted, tmp_path):
-    rows = [["distorted.png", *distorted, "cam.yaml", ""], ["distorted.png", *[""] * 4, "cam.yaml", "mask.png"]]
-    rows += [["distorted.png", *distorted, "none.yaml", ""], ["distorted.png", *distorted, "", "none.png"]]
+def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
+    box, T = lens
+    rows = [["distorted.png", *box, "cam.json", ""], ["distorted.png", *[""] * 4, "cam.json", "mask.png"]]
+    rows += [["distorted.png", *box, "none.yaml", ""], ["distorted.png", *box, "", "none.png"]]
     path = written(folder / "calibrated.csv", "photo,x0,y0,x1,y1,camera,mask", *rows)
     words = ["register", "--list", str(path), str(folder / "learned.safetensors"), "--quiet", "--out", str(tmp_path)]
     assert main([*words, "--strict"]) == SOME_FAILED
     boxed, masked, *failed = lines(tmp_path)
     for row in (boxed, masked):
-        check_pose(row, scene(0)[2], 3.0, 0.03)
+        check_pose(row, T, 3.0, 0.03)
     assert masked["inputs"]["box"] == pytest.approx(boxed["inputs"]["box"], abs=3.0)
     assert "none.yaml: no such file" in failed[0]["message"]
     assert "none.png" in failed[1]["message"]
 
 
-@pytest.mark.usefixtures("distorted")
+@pytest.mark.usefixtures("lens")
 def test_masks_and_calibrations_that_do_not_fit_are_refused(folder, refused, tmp_path):
     cv2.imwrite(str(folder / "black.png"), np.zeros((180, 240), np.uint8))
     cv2.imwrite(str(folder / "small.png"), np.full((90, 120), 255, np.uint8))
@@ -154,7 +119,7 @@ def test_masks_and_calibrations_that_do_not_fit_are_refused(folder, refused, tmp
     for photo, words, message in (
         ("photos/0.png", ["--mask", "black.png"], "no white pixel"),
         ("photos/0.png", ["--mask", "small.png"], "that of the photograph"),
-        ("tall.png", ["--camera", "cam.yaml"], "turn the photograph by 90 degrees"),
+        ("tall.png", ["--camera", "cam.json"], "turn the photograph by 90 degrees"),
         ("photos/0.png", ["--camera", "photos/1.png"], "not a text file"),
     ):
         words[1] = str(folder / words[1])

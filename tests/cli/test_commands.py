@@ -1,8 +1,7 @@
-"""``curvireg demo``, ``bank``, ``cache`` and ``plot``."""
+"""``curvireg demo``, ``bank``, ``cache`` and ``plot``; and the wrong inputs of scripts/robustness/wrong_inputs.txt."""
 
 import json
-import subprocess
-import sys
+import shlex
 import warnings
 from dataclasses import replace
 
@@ -17,8 +16,10 @@ from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
-from curvireg_torch.pipeline import PRESETS, ViewPolicy
+from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
+from scripts.robustness.wrong_inputs import cases
 from tests._support.scenes import truck_bank
+from tests.evaluation.small import SMALL
 from tests.viewer.test_session import write_scene
 
 
@@ -41,15 +42,6 @@ def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypat
     assert "2 banks" in listed
     assert main(["cache", "--clear"]) == 0
     assert list((tmp_path / "banks").iterdir()) == []
-
-
-def test_demo_runs_as_a_module(tmp_path, monkeypatch):
-    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
-    command = [sys.executable, "-m", "curvireg_torch", "demo", "--out", str(tmp_path / "demo"), "--quiet"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert json.loads((tmp_path / "demo" / "result.json").read_text())["rotation_error_deg"] < 2
-    assert "error against the truth" in done.stdout
-    assert (tmp_path / "demo" / "overlay.png").stat().st_size > 10_000
 
 
 def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
@@ -83,7 +75,9 @@ def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     photo = cv2.imread(str(tmp_path / "photo.png"))
     assert (photo.shape, result["inputs"]["seed"]) == ((720, 960, 3), 2)
     assert photo.max() > 150
+    assert (tmp_path / "overlay.png").stat().st_size > 10_000
     printed = capsys.readouterr().out
+    assert "error against the truth" in printed
     assert f"rotation {result['rotation_error_deg']:.1f} degrees" in printed
     assert f"translation: {', '.join(f'{v:.4g}' for v in result['translation'])} m\n" in printed
 
@@ -97,3 +91,19 @@ def test_plot_draws_a_registration(tmp_path, monkeypatch, kind):
     files = [str(tmp_path / "photo.png"), str(tmp_path / "truck.ply")]
     assert main(["plot", kind, *files, "--out", str(out), *words]) == 0
     assert cv2.imread(str(out)).std() > 10
+
+
+def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, DEFAULT, SMALL)
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    wrong = []
+    for line, expected in cases(tmp_path):
+        try:
+            code = main([*shlex.split(line), *([] if line.startswith(("view", "frobnicate")) else ["--quiet"])])
+        except SystemExit as stop:  # of argparse
+            code = stop.code
+        printed = capsys.readouterr().err.splitlines()
+        if code != 2 or expected not in printed[-1]:
+            wrong.append((line, code, printed[-1:], expected))
+    assert not wrong, "\n".join(map(str, wrong))

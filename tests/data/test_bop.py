@@ -26,16 +26,12 @@ def ids(dataset):
     return [(s["scene_id"], s["image_id"], s["obj_id"], s["instance_index"]) for s in samples]
 
 
-def test_bop_dataset_counts_skipped_items(tree):
+def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
     root, reasons = tree
     dataset = BOPDataset(root, targets=False)
     assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (2, 7, 1, 0)]
     assert dict(dataset.skipped) == reasons
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
-
-
-def test_bop_dataset_returns_documented_samples(tree):
-    dataset = BOPDataset(tree[0], targets=False)
     sample = dataset[0]
     assert set(sample) == {
         *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "T_cam_from_world"),
@@ -46,8 +42,7 @@ def test_bop_dataset_returns_documented_samples(tree):
     assert sample["box_visible"].tolist() == [0, 4, 25, 24]
     assert sample["camera_matrix"].tolist() == [[300, 0, 40], [0, 310, 30], [0, 0, 1]]
     assert sample["rotation"].tolist() == [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "row by row"
-    assert sample["translation"].tolist() == [1, 2, 400]
-    assert sample["visib_fract"] == 0.8
+    assert (sample["translation"].tolist(), sample["visib_fract"]) == ([1, 2, 400], 0.8)
     assert sample["model_path"].endswith("models/obj_000001.ply")
     assert sample["model_info"] == dataset.models_info[1]
     assert "symmetries_discrete" in sample["model_info"]
@@ -82,19 +77,16 @@ def test_other_splits_have_no_targets_by_default(tree):
     assert len(BOPDataset(tree[0], "train_pbr")) == 4
 
 
-def test_bop_dataset_reports_missing_files_with_advice(tree, tmp_path):
+def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(tree, tmp_path):
     for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
         with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):
             BOPDataset(root, split)
+    for content in ("[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"):
+        (tree[0] / "test_targets_bop19.json").write_text(content)
+        with pytest.raises(InvalidInputError, match="test_targets_bop19"):
+            BOPDataset(tree[0])
     (tree[0] / "models" / "models_info.json").unlink()
     with pytest.raises(MissingFileError, match="models_info"):
-        BOPDataset(tree[0])
-
-
-@pytest.mark.parametrize("content", ["[", "[" * 100000, "[1]", '[{"scene_id": 1}]', "{}"])
-def test_bop_dataset_refuses_damaged_target_lists(tree, content):
-    (tree[0] / "test_targets_bop19.json").write_text(content)
-    with pytest.raises(InvalidInputError, match="test_targets_bop19"):
         BOPDataset(tree[0])
 
 
@@ -113,10 +105,7 @@ def test_bop_dataset_refuses_damaged_target_lists(tree, content):
     ],
 )
 def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change, match):
-    path = tree[0] / "models" / "models_info.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
+    edit(tree, "../../models/models_info.json", change)
     with pytest.raises(InvalidInputError, match=rf"models_info\.json: .*{match}") as caught:
         BOPDataset(tree[0])
     assert len(str(caught.value)) < 500
@@ -125,9 +114,10 @@ def test_damaged_models_info_is_refused_when_the_dataset_is_opened(tree, change,
 MIRRORED = [-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    "value", [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
-)
+INVALID = [None, "x", {"a": 1}, [1, 2], ["1"] * 9, [True] * 9, [1e400] * 9, [10**400] * 9, MIRRORED]
+
+
+@pytest.mark.parametrize("value", INVALID)
 def test_bop_dataset_counts_invalid_rotations(tree, value):
     edit(tree, "scene_gt.json", lambda content: content["0"][0].update(cam_R_m2c=value))
     dataset = BOPDataset(tree[0], targets=False)
@@ -144,13 +134,10 @@ def test_bop_dataset_skips_invalid_cameras(tree, place, value):
     assert after.skipped["corrupt_annotation"] == before.skipped["corrupt_annotation"] + lost
 
 
-def test_bop_dataset_prefers_colour_to_grey(tree):
+def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(tree):
     scene = tree[0] / "test" / "000001"
     (scene / "gray").mkdir()
     (scene / "gray" / "000000.tif").write_bytes(b"")
     assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
-
-
-def test_targets_take_instances_of_unknown_visibility_last(tree):
     edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
     assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible

@@ -19,8 +19,7 @@ def test_read_image_returns_rgb_floats_in_0_to_1(tmp_path):
     bgr[..., 0], bgr[1, 2, 2] = 51, 255  # blue everywhere, red at x = 2, y = 1
     cv2.imwrite(str(tmp_path / "a.png"), bgr)
     image = read_image(tmp_path / "a.png")
-    assert image.shape == (3, 4, 6)
-    assert image.dtype == torch.float32
+    assert (image.shape, image.dtype) == ((3, 4, 6), torch.float32)
     assert image.is_contiguous()
     assert image[0, 1, 2] == 1
     torch.testing.assert_close(image[2], torch.full((4, 6), 0.2))
@@ -33,24 +32,20 @@ def test_read_image_reads_grey_alpha_and_16_bits(tmp_path, dtype, top, channels)
     pixels[0, 0] = top
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     image = read_image(str(tmp_path / "a.png"))
-    assert image.shape == (3, 5, 7)
-    assert image.max() == 1
+    assert (image.shape, image.max()) == ((3, 5, 7), 1)
     torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
 
 
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (b"P5 3 1 4095\n" + np.array([0, 819, 4095], ">u2").tobytes(), [0, 51, 255]),  # 12 bits
-        (b"P5 3 1 100\n" + bytes([0, 20, 100]), [0, 51, 255]),
-        (b"P2 3 1 10 0 2 10\n", [0, 51, 255]),
-        (b"P6 1 1 4095\n" + np.array([0, 819, 4095], ">u2").tobytes(), None),
-    ],
-)
-def test_read_photo_scales_by_the_largest_value_of_pgm(tmp_path, content, expected):
-    (tmp_path / "a.pgm").write_bytes(content)
-    image = read_photo(tmp_path / "a.pgm").image
-    assert (image[0, 0] if expected else image[:, 0, 0]).tolist() == (expected or [0, 51, 255])
+def test_read_photo_scales_by_the_largest_value_of_pgm(tmp_path):
+    for content in (
+        b"P5 3 1 4095\n" + np.array([0, 819, 4095], ">u2").tobytes(),  # 12 bits
+        b"P5 3 1 100\n" + bytes([0, 20, 100]),
+        b"P2 3 1 10 0 2 10\n",
+        b"P6 1 1 4095\n" + np.array([0, 819, 4095], ">u2").tobytes(),  # one pixel in colour
+    ):
+        (tmp_path / "a.pgm").write_bytes(content)
+        image = read_photo(tmp_path / "a.pgm").image
+        assert (image[:, 0, 0] if content[:2] == b"P6" else image[0, 0]).tolist() == [0, 51, 255]
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -105,12 +100,9 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
-def test_read_photo_rounds_16_bits(tmp_path):
+def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(tmp_path):
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
     assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]
-
-
-def test_read_photo_notes_changes_of_channels(tmp_path):
     notes = {1: ("grey: three equal channels",), 3: (), 4: ("alpha channel dropped",)}
     for name, channels in {"png": (1, 4), "webp": (3, 4), "tiff": (1,), "bmp": (3,), "pgm": (1,)}.items():
         for count in channels:
@@ -119,14 +111,11 @@ def test_read_photo_notes_changes_of_channels(tmp_path):
     colour = Image.new("RGB", (8, 8))  # phones add previews to photographs
     colour.save(tmp_path / "phone.jpg", format="MPO", save_all=True, append_images=[colour])
     assert read_photo(tmp_path / "phone.jpg").notes == ()
-
-
-@pytest.mark.parametrize("name", ["a.jpg", "a.tif"])
-def test_read_photo_converts_cmyk(tmp_path, name):
-    Image.new("RGB", (8, 8), (250, 10, 30)).convert("CMYK").save(tmp_path / name, quality=95)
-    photo = read_photo(tmp_path / name)
-    assert photo.notes == ("CMYK converted to RGB without a colour profile",)
-    assert (photo.image[:, 4, 4].int() - torch.tensor([250, 10, 30])).abs().max() <= 4
+    for name in ("a.jpg", "a.tif"):
+        Image.new("RGB", (8, 8), (250, 10, 30)).convert("CMYK").save(tmp_path / name, quality=95)
+        photo = read_photo(tmp_path / name)
+        assert photo.notes == ("CMYK converted to RGB without a colour profile",)
+        assert (photo.image[:, 4, 4].int() - torch.tensor([250, 10, 30])).abs().max() <= 4
 
 
 def test_read_photo_refuses_cielab_floating_pixels_and_other_formats(tmp_path):
@@ -140,7 +129,7 @@ def test_read_photo_refuses_cielab_floating_pixels_and_other_formats(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_read_image_refuses_truncated_and_other_files(tmp_path, suffix):
+def test_read_image_refuses_truncated_other_and_missing_files(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_image(path, (64, 64))
     data = path.read_bytes()
@@ -149,23 +138,20 @@ def test_read_image_refuses_truncated_and_other_files(tmp_path, suffix):
         path.write_bytes(content)
         with pytest.raises(ImageError, match=r"a\.\w+: (damaged or truncated|not an image)"):
             read_image(path)
-
-
-def _bombs():
-    """Small files of huge pictures."""
-    width, height = 20_000, 20_000
-    yield "a.bmp", b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, width, -height, 1, 24, 0) + bytes(20)
-    row = bytes(1 + width // 8)
-    packer = zlib.compressobj(9)
-    body = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", body), (b"IEND", b""))
-    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
-    yield "a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    for path in (tmp_path / "nothing.jpg", tmp_path):
+        with pytest.raises(MissingFileError, match="no such file; check the path of the photograph"):
+            read_image(path)
 
 
 def test_read_photo_counts_pixels_before_it_decodes(tmp_path):
-    for name, content in _bombs():
+    """Small files of huge pictures."""
+    side = 20_000
+    bmp = b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, side, -side, 1, 24, 0) + bytes(20)
+    packer = zlib.compressobj(9)
+    body = b"".join(packer.compress(bytes(1 + side // 8)) for _ in range(side)) + packer.flush()
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", body), (b"IEND", b""))
+    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
+    for name, content in (("a.bmp", bmp), ("a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks))):
         (tmp_path / name).write_bytes(content)
         tracemalloc.start()
         with pytest.raises(ImageError, match=rf"{name}: more than 89,478,485 pixels; scale it down"):
@@ -187,12 +173,6 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)
     with pytest.raises(ImageError, match="larger than 100 bytes"):
         read_photo(path)
-
-
-def test_read_image_reports_missing_files(tmp_path):
-    for path in (tmp_path / "nothing.jpg", tmp_path):
-        with pytest.raises(MissingFileError, match="no such file; check the path of the photograph"):
-            read_image(path)
 
 
 @pytest.mark.filterwarnings("ignore:Corrupt EXIF")

@@ -17,8 +17,7 @@ def tree(tmp_path):
 def test_pascal3d_counts_skipped_items(tree):
     root, reasons = tree
     dataset = Pascal3DPlus(root)
-    assert dataset.categories == ["car", "sofa"]
-    assert len(dataset) == 5
+    assert (dataset.categories, len(dataset)) == (["car", "sofa"], 5)
     assert dict(dataset.skipped) == reasons
     assert {k: len(v) for k, v in dataset.skipped_items.items()} == reasons
     assert dataset.skipped_items["missing_image"] == ["car_pascal/2008_000009"]
@@ -28,8 +27,7 @@ def test_pascal3d_counts_skipped_items(tree):
 def test_pascal3d_reads_the_imagenet_part(tmp_path):
     reasons = write_pascal3d(tmp_path, part="imagenet")
     dataset = Pascal3DPlus(tmp_path, part="imagenet")
-    assert len(dataset) == 5
-    assert dict(dataset.skipped) == reasons
+    assert (len(dataset), dict(dataset.skipped)) == (5, reasons)
     assert dataset[0]["image_path"].endswith("car_imagenet/2008_000001.JPEG")
     with pytest.raises(MissingFileError, match="no pascal image list"):
         Pascal3DPlus(tmp_path)
@@ -53,8 +51,7 @@ def test_pascal3d_returns_documented_samples(tree):
     assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
     assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
     shifted = Pascal3DPlus(tree[0], pixel_origin=0)[0]
-    assert shifted["box"].tolist() == [11, 6, 71, 56]
-    assert shifted["camera_matrix"][:2, 2].tolist() == [41, 31]
+    assert (shifted["box"].tolist(), shifted["camera_matrix"][:2, 2].tolist()) == ([11, 6, 71, 56], [41, 31])
 
 
 def test_pascal3d_camera_projects_the_model_into_the_box(tree):
@@ -82,59 +79,40 @@ def test_pascal3d_reads_image_sets_with_invalid_entries(tree):
     lists.mkdir()
     lists.joinpath("car_pascal_tiny.txt").write_text("2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n")
     dataset = Pascal3DPlus(root, "tiny")
-    assert len(dataset) == 1
-    assert dict(dataset.skipped) == {"missing_annotation": 2}
+    assert (len(dataset), dict(dataset.skipped)) == (1, {"missing_annotation": 2})
 
 
-def test_pascal3d_defaults_of_missing_camera_fields(tree):
-    entry = pascal_object("car")
-    entry["viewpoint"] = {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}
-    write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(tree):
+    record = tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat"
+    write_record(record, [{**pascal_object("car"), "viewpoint": {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}}])
     sample = Pascal3DPlus(tree[0], categories=["car"])[0]
     assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
     assert sample["viewpoint"].tolist() == [10, 20, 0]
-
-
-def test_pascal3d_skips_invalid_cad_indices(tree):
     for cad_index in (-1.0, 0.0, 1e300, math.nan, math.inf, "one"):
-        entry = pascal_object("car", cad_index=cad_index)
-        write_record(tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat", [entry])
+        write_record(record, [pascal_object("car", cad_index=cad_index)])
         assert Pascal3DPlus(tree[0], categories=["car"]).skipped["missing_mesh"] == 3
 
 
-def test_pascal3d_reports_missing_files_with_advice(tree, tmp_path):
+def test_pascal3d_reports_missing_files_with_advice_and_refuses_invalid_options(tree, tmp_path):
     with pytest.raises(MissingFileError, match=r"datasets/pascal3d/README\.md"):
         Pascal3DPlus(tmp_path / "nothing")
     with pytest.raises(MissingFileError, match=r"train.*README"):
         Pascal3DPlus(tree[0], "train")
     with pytest.raises(MissingFileError, match=r"boat_val\.txt"):
         Pascal3DPlus(tree[0], categories=["boat"])
+    wrong = [({"part": "voc"}, "part"), ({"pixel_origin": 2}, "pixel_origin"), ({"categories": "car"}, "list of names")]
+    wrong += [({"categories": ["../car"]}, "plain names"), ({"split": "../val", "categories": []}, "plain names")]
+    for options, message in wrong:
+        with pytest.raises(InvalidInputError, match=message):
+            Pascal3DPlus(tree[0], **options)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"part": "voc"}, "part"),
-        ({"pixel_origin": 2}, "pixel_origin"),
-        ({"categories": "car"}, "list of names"),
-        ({"categories": ["../car"]}, "plain names"),
-        ({"split": "../val", "categories": []}, "plain names"),
-    ],
-)
-def test_pascal3d_refuses_invalid_options(tree, options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        Pascal3DPlus(tree[0], **options)
-
-
-def test_annotation_has_no_image(tree):
-    dataset = Pascal3DPlus(tree[0])
+def test_annotation_has_no_image(pascal):
+    dataset = pascal
     assert set(dataset[0]) - set(dataset.annotation(0)) == {"image"}
     dataset.annotation(0)["box"].zero_()
     assert dataset.annotation(0)["box"].sum() > 0, "a sample is a copy"
     with pytest.raises(IndexError):
         dataset[len(dataset)]
-
-
-def test_pascal3d_reports_damaged_photographs_on_access(pascal):
     with pytest.raises(ImageError, match="2008_000003"):
-        [pascal[i] for i in range(len(pascal))]
+        [dataset[i] for i in range(len(dataset))]

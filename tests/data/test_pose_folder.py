@@ -13,25 +13,17 @@ def tree(tmp_path):
     return tmp_path, write_web(tmp_path)
 
 
-def test_pose_folder_counts_skipped_items(tree):
+def test_pose_folder_counts_skipped_items_and_returns_documented_samples(tree):
     root, reasons = tree
     dataset = PoseFolder(root)
-    assert len(dataset) == 4
-    assert dict(dataset.skipped) == reasons
+    assert (len(dataset), dict(dataset.skipped)) == (4, reasons)
     assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
-
-
-def test_pose_folder_returns_documented_samples(tree):
-    dataset = PoseFolder(tree[0])
     sample, unknown, level = (dataset[i] for i in range(3))
     names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
-    assert set(sample) == set(names.split())
-    assert sample["image"].shape == (3, 60, 80)
-    assert sample["box"].tolist() == [10, 5, 70, 55]
-    assert sample["viewpoint"].tolist() == [30, 10, -5]
+    assert (set(sample), sample["image"].shape) == (set(names.split()), (3, 60, 80))
+    assert (sample["box"].tolist(), sample["viewpoint"].tolist()) == ([10, 5, 70, 55], [30, 10, -5])
     torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
-    assert sample["distance"] == 3
-    assert sample["category"] == "cup"
+    assert (sample["distance"], sample["category"]) == (3, "cup")
     assert sample["mesh_path"].endswith("mesh.off")
     assert unknown["viewpoint"].isnan().all()
     assert unknown["rotation"].isnan().all()

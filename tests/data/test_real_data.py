@@ -27,8 +27,7 @@ def test_pascal3d_counts():
     dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0)
     samples = [dataset.annotation(i) for i in range(len(dataset))]
     assert not dataset.skipped
-    assert sum(s["truncated"] for s in samples) == 21
-    assert sum(s["difficult"] for s in samples) == 19
+    assert (sum(s["truncated"] for s in samples), sum(s["difficult"] for s in samples)) == (21, 19)
     assert sum(not s["truncated"] and not s["difficult"] for s in samples) == 64
     assert len(list(dataset.root.glob("CAD/*/*.off"))) == 63
     assert len(Pascal3DPlus(dataset.root, pixel_origin=0, truncated=False, difficult=False)) == 64

@@ -1,5 +1,3 @@
-"""Frames of videos: their numbers, colours and sizes, and files that are none."""
-
 import cv2
 import numpy as np
 import pytest
@@ -30,12 +28,9 @@ def test_video_yields_rgb_frames_and_their_numbers(five):
         assert (tuple(image.shape), image.dtype) == ((3, 48, 64), torch.uint8)
         assert abs(float(image[0].float().mean()) - 40 * k) < 4
         assert float(image[1:].float().mean()) < 4
-
-
-def test_video_skips_frames(five):
-    frames = dict(Video(five, every=2))
-    assert list(frames) == [0, 2, 4]
-    assert abs(float(frames[4][0].float().mean()) - 160) < 4
+    some = dict(Video(five, every=2))
+    assert list(some) == [0, 2, 4]
+    assert torch.equal(some[4], frames[4])
     with pytest.raises(InvalidInputError, match="every"):
         Video(five, every=0)
 
@@ -52,17 +47,12 @@ def test_video_reads_other_containers(tmp_path, suffix):
     assert len(list(Video(path))) == 3
 
 
-@pytest.mark.parametrize(
-    "text", ["ffconcat version 1.0\nfile {}\n", "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"]
-)
-def test_video_refuses_playlists(five, text):
-    playlist = five.with_name("list.mp4")
-    playlist.write_text(text.format(five.name))
-    with pytest.raises(ImageError, match="not a video"):
-        Video(playlist)
-
-
-def test_video_refuses_other_files_and_too_many_pixels(five, tmp_path, monkeypatch):
+def test_video_refuses_playlists_other_files_and_too_many_pixels(five, tmp_path, monkeypatch):
+    stream = "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\n{}\n#EXT-X-ENDLIST\n"
+    for text in ("ffconcat version 1.0\nfile {}\n", stream):
+        five.with_name("list.mp4").write_text(text.format(five.name))
+        with pytest.raises(ImageError, match="not a video"):
+            Video(five.with_name("list.mp4"))
     (tmp_path / "no.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(500))
     with pytest.raises(ImageError, match=r"no\.mp4: not a video"):
         Video(tmp_path / "no.mp4")

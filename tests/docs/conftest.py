@@ -1,5 +1,3 @@
-"""Fixtures of the documentation's tests."""
-
 import pytest
 
 from curvireg_torch import evaluation, pipeline, terms

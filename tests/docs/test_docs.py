@@ -1,5 +1,6 @@
-"""Links, names, options and commands on the documentation's pages exist."""
+"""Links, names, options and commands on the documentation's pages exist, and the page of messages is made."""
 
+import importlib.util
 import inspect
 import re
 from importlib import import_module
@@ -14,7 +15,6 @@ from .._support.pages import DOCS, PAGES, ROOT
 SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
 PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"
-by_page = pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 
 
 def without_code(page: Path) -> str:
@@ -27,23 +27,16 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", text.replace("`", "")).replace(" ", "-")
 
 
-def anchors(page: Path) -> set[str]:
-    return {anchor(heading) for heading in re.findall(r"^#+ (.*)$", without_code(page), flags=re.MULTILINE)}
-
-
-def links(page: Path) -> list[str]:
-    return re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page)))
-
-
-@by_page
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_resolve(page: Path) -> None:
-    for link in links(page):
+    for link in re.findall(r"\]\(([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", without_code(page))):
         if re.match(r"\w+:", link):
             continue
         path, _, name = link.partition("#")
         target = page.parent / path if path else page
         assert target.exists(), f"{link}: no such file"
-        assert not name or name in anchors(target), f"{link}: no such heading"
+        headings = re.findall(r"^#+ (.*)$", without_code(target), flags=re.MULTILINE) if name else []
+        assert not name or name in map(anchor, headings), f"{link}: no such heading"
 
 
 def resolve(dotted: str) -> object:
@@ -78,3 +71,13 @@ def test_reference_lists_every_public_name() -> None:
     assert {name for name, _ in listed} == public - {"__version__"}
     for name, dotted in listed:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
+
+
+def test_messages_are_listed_with_what_to_do():
+    spec = importlib.util.spec_from_file_location("messages", DOCS / "messages.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    photographs, meshes = module.page(ROOT / "curvireg_torch").split("## Meshes")
+    assert "| frame … cannot be read | save the video again |" in photographs  # an f-string
+    assert "| every face is degenerate (area 0) | repair the mesh |" in meshes
+    assert "give --camera FX FY CX CY, --camera FILE (a calibration)" in meshes, "a constant of another module"

@@ -19,16 +19,8 @@ from curvireg_torch.geometry import rotation_error, transform
 from curvireg_torch.geometry.cameras import pose_from_box
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 
+from .._support import miniature
 from .._support.exif import exif, with_exif
-from .._support.miniature import (
-    pascal_object,
-    write_bop,
-    write_image,
-    write_mesh,
-    write_pascal3d,
-    write_record,
-    write_web,
-)
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 
 # Commands that are not run here, and the reason
@@ -46,11 +38,6 @@ SKIPPED = {
 DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
 AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
 SLOW = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}  # 30 s and more on one core
-
-
-def skip_reason(command: str) -> str | None:
-    command = re.sub(r"\s+#.*", "", command)
-    return next((reason for start, reason in SKIPPED.items() if re.match(start, command)), None)
 
 
 def pose(azimuth: float) -> torch.Tensor:
@@ -85,18 +72,18 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mesh.apply_scale(1000.0).export(folder / "part.stl")
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
-    write_image(folder / "photo.png", (128, 128))
+    miniature.write_image(folder / "photo.png", (128, 128))
     cv2.imwrite(str(folder / "depth.png"), cv2.imread(str(folder / "photo.png"), cv2.IMREAD_GRAYSCALE))
-    write_pascal3d(folder / DEFECTIVE[0])
-    write_bop(folder / DEFECTIVE[1])
-    write_web(folder / DEFECTIVE[2])
+    miniature.write_pascal3d(folder / DEFECTIVE[0])
+    miniature.write_bop(folder / DEFECTIVE[1])
+    miniature.write_web(folder / DEFECTIVE[2])
     net = folder / "data" / "ObjectNet3D"
     for split in ("train", "val"):
-        write_record(net / "Annotations" / f"{split}.mat", [pascal_object("ashtray")])
-        write_image(net / "Images" / f"{split}.JPEG")
+        miniature.write_record(net / "Annotations" / f"{split}.mat", [miniature.pascal_object("ashtray")])
+        miniature.write_image(net / "Images" / f"{split}.JPEG")
         net.joinpath("Image_sets").mkdir(exist_ok=True)
         net.joinpath("Image_sets", f"{split}.txt").write_text(f"{split}\n")
-    write_mesh(net / "CAD" / "off" / "ashtray" / "01.off")
+    miniature.write_mesh(net / "CAD" / "off" / "ashtray" / "01.off")
     return folder
 
 
@@ -133,12 +120,6 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     return cli.main()
 
 
-def run_blocks(page: Path, blocks: list[str], names: dict[str, Any]) -> dict[str, Any]:
-    for text in blocks:
-        exec(compile(text, page.name, "exec"), names)
-    return names
-
-
 @pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize(
     "page",
@@ -149,8 +130,8 @@ def test_page_runs(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     names: dict[str, Any] = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
-            run_blocks(page, [text], names)
-        elif skip_reason(text) is None:
+            exec(compile(text, page.name, "exec"), names)
+        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
             words = split_command(text)
             expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
             assert run_command(words, monkeypatch) == expected, (text, capsys.readouterr().err)

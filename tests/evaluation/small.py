@@ -31,10 +31,6 @@ def rows_of(benchmark, out):
     return {entry.key: rows[entry.key] for entry in benchmark.entries if entry.key in rows}
 
 
-def without_seconds(rows):
-    return {key: {name: v for name, v in row.items() if name != "seconds"} for key, row in rows.items()}
-
-
 def kill_in_write(count: int) -> None:
     """Kill this process in its ``count``-th write of a file that is neither a bank nor a picture."""
     sync, writes = os.fsync, 0

@@ -1,7 +1,6 @@
-"""Evaluation of datasets, from files to files."""
-
 import json
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -15,27 +14,23 @@ from curvireg_torch.registration import Registrar
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
-from .small import SMALL, rows_of, run, without_seconds
+from .small import SMALL, rows_of, run
 
 
 def test_evaluate_pascal3d(pascal, tmp_path):
     benchmark = Pascal3DBenchmark(pascal, Protocol())
+    assert [benchmark.selection(count) for count in (2, 9)] == [[0, 2], [0, 1, 2, 3, 4]], "spread"
     summary = run(benchmark, tmp_path / "out")
     assert summary["n"] == 3
-    assert {k: summary["skipped"][k] for k in ("unreadable_image", "unreadable_mesh")} == {
-        "unreadable_image": 1, "unreadable_mesh": 1,
-    }  # fmt: skip
-    assert summary["skipped"]["missing_image"] == 1, "objects that the dataset leaves out are counted"
-    assert "other_class" not in summary["skipped"], "objects of other classes are not"
-    assert summary["failed"] == 0
+    skipped = summary["skipped"]
+    assert (skipped["unreadable_image"], skipped["unreadable_mesh"], summary["failed"]) == (1, 1, 0)
+    assert skipped["missing_image"] == 1, "objects that the dataset leaves out are counted"
+    assert "other_class" not in skipped, "objects of other classes are not"
     rows = rows_of(benchmark, tmp_path / "out")
-    assert {k: (r.get("skipped"), r["status"]) for k, r in rows.items()} == {
-        "car/2008_000001/0": (None, "ok"),
-        "car/2008_000002/1": (None, "ok"),
-        "car/2008_000002/2": (None, "ok"),
-        "car/2008_000003/8": ("unreadable_image", "failed"),
-        "sofa/2008_000002/0": ("unreadable_mesh", "failed"),
-    }
+    found = {key: (row.get("skipped"), row["status"]) for key, row in rows.items()}
+    scored = dict.fromkeys(("car/2008_000001/0", "car/2008_000002/1", "car/2008_000002/2"), (None, "ok"))
+    broken = {"car/2008_000003/8": "unreadable_image", "sofa/2008_000002/0": "unreadable_mesh"}
+    assert found == {**scored, **{key: (reason, "failed") for key, reason in broken.items()}}
     good = rows["car/2008_000001/0"]
     assert good["translation"] is None, "no camera was given"
     assert good["mesh"].endswith("car/01.off")
@@ -73,48 +68,37 @@ def test_objects_fail_alone(bop, tmp_path):
     assert summary["failed"] == 2
 
 
-def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path):
-    benchmark, before = Pascal3DBenchmark(pascal, Protocol()), torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        run(benchmark, tmp_path / "one")
-        torch.set_num_threads(2)
-        run(benchmark, tmp_path / "two", limit=2)
-        first = rows_of(benchmark, tmp_path / "two")
-        run(benchmark, tmp_path / "two")
-    finally:
-        torch.set_num_threads(before)
+def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path, threads):
+    benchmark = Pascal3DBenchmark(pascal, Protocol())
+    threads(1)
+    run(benchmark, tmp_path / "one")
+    threads(2)
+    run(benchmark, tmp_path / "two", limit=2)
+    first = rows_of(benchmark, tmp_path / "two")
+    run(benchmark, tmp_path / "two")
     one, two = (rows_of(benchmark, tmp_path / name) for name in ("one", "two"))
-    assert without_seconds(one) == without_seconds(two)
+    timeless = [{key: {**row, "seconds": None} for key, row in rows.items()} for rows in (one, two)]
+    assert timeless[0] == timeless[1]
     assert len(first) == 2
     assert {key: two[key] for key in first} == first, "seconds included: nothing was registered twice"
 
 
 def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
-    def broken(*_, **__):
-        raise RenderingError("no renderer")
-
+    broken = Mock(side_effect=RenderingError("no renderer"))
     monkeypatch.setattr("curvireg_torch.evaluation.datasets.cached_bank", broken)
     with pytest.raises(RenderingError):
         run(Pascal3DBenchmark(pascal, Protocol()), tmp_path / "out")
 
 
-@pytest.fixture
-def two_cars(pascal):
-    """A second CAD of a car, of another shape."""
-    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")
-    return pascal
-
-
-def test_protocol_and_pipeline_reach_the_registrar(two_cars, tmp_path, monkeypatch):
+def test_protocol_and_pipeline_reach_the_registrar(pascal, tmp_path, monkeypatch):
+    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")  # a second CAD of a car
     registrars, init = [], Registrar.__init__
     monkeypatch.setattr(Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k))
-    benchmark = Pascal3DBenchmark(two_cars, Protocol(cad="any"))
+    benchmark = Pascal3DBenchmark(pascal, Protocol(cad="any"))
     run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
     assert len(registrars[0].others or registrars[-1].others) == 1
     for registrar in registrars:
-        assert registrar.pipeline.box_jitter == 0.05
-        assert registrar.pipeline.views.pose == "upright"
+        assert (registrar.pipeline.box_jitter, registrar.pipeline.views.pose) == (0.05, "upright")
 
 
 def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
@@ -151,12 +135,6 @@ def test_every_dataset_opens_and_names_its_groups(kind, tmp_path):
     assert [str(path) for path in benchmark.entries[0].meshes] == [str(sample[benchmark.mesh])]
 
 
-def test_selection_is_spread(pascal):
-    benchmark = Pascal3DBenchmark(pascal, Protocol())
-    assert benchmark.selection(2) == [0, 2]
-    assert benchmark.selection(9) == [0, 1, 2, 3, 4]
-
-
 @pytest.fixture
 def evaluate(tmp_path):
     """Run ``curvireg evaluate``; returns the summary."""
@@ -169,7 +147,7 @@ def evaluate(tmp_path):
     return run
 
 
-def test_evaluate_prints_the_headline_of_some_categories(pascal, evaluate, capsys):
+def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_file(pascal, evaluate, capsys, tmp_path):
     words = ("pascal3d", pascal.root, "--categories", "car")
     assert evaluate(*words, "--limit", "2")["limit"] == 2
     summary = evaluate(*words)
@@ -179,12 +157,14 @@ def test_evaluate_prints_the_headline_of_some_categories(pascal, evaluate, capsy
     assert lines[-3].startswith("3 objects, 0 failed, ")
     numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
     assert lines[-2].startswith(numbers)
+    (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
+    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
+    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
-    assert summary["protocol"] == "cad=annotated pose=any box=0.1 seed=3"
-    assert summary["settings"]["dataset"] == "bop"
+    assert (summary["protocol"], summary["settings"]["dataset"]) == ("cad=annotated pose=any box=0.1 seed=3", "bop")
     views = summary["settings"]["pipeline"]["views"]
     assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 
@@ -208,9 +188,3 @@ def test_evaluate_reports_when_nothing_was_scored(pascal, evaluate, tmp_path):
     with pytest.raises(InvalidInputError, match=r"nothing was scored .*unreadable_image"):
         evaluate("pascal3d", pascal.root)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["n"] == 0
-
-
-def test_evaluate_takes_a_pipeline_file(pascal, evaluate, tmp_path):
-    (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
-    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
-    assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)

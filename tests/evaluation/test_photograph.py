@@ -28,7 +28,7 @@ def result(folder):
     return cr.register(str(photo), str(folder / "learned.safetensors"), box=box, camera=[float(v) for v in CAMERA])
 
 
-def test_register_equals_the_command_to_the_last_digit(folder, result, tmp_path):
+def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(folder, result, tmp_path):
     words = [str(folder / "photos" / "0.png"), str(folder / "learned.safetensors"), "--box", *box_of(0)]
     assert main(["register", *words, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet"]) == 0
     document = json.loads((tmp_path / "result.json").read_text())
@@ -36,6 +36,10 @@ def test_register_equals_the_command_to_the_last_digit(folder, result, tmp_path)
         assert getattr(result, name).tolist() == document[name]
     assert result.confidence == document["confidence"]
     assert cr.camera_matrix(*map(float, CAMERA)).dtype == torch.float64
+    result.save(tmp_path / "out")
+    files = {path.name for path in (tmp_path / "out").iterdir()}
+    assert files == {path.name for path in tmp_path.iterdir()} - {"out"} == {"result.json", "overlay.png", "pose.glb"}
+    assert json.loads((tmp_path / "out" / "result.json").read_text())["rotation"] == result.rotation.tolist()
 
 
 def test_register_takes_pictures_of_other_kinds(folder, result):
@@ -85,9 +89,3 @@ def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
     w, x, y, z = result.quaternion.tolist()
     np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), result.rotation.numpy(), atol=1e-9)
     assert result.T_cam_from_model[:3, 3].equal(result.translation)
-
-
-def test_result_is_saved_as_the_command_does(result, tmp_path):
-    result.save(tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"}
-    assert json.loads((tmp_path / "out" / "result.json").read_text())["rotation"] == result.rotation.tolist()

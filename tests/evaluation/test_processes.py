@@ -1,5 +1,3 @@
-"""Evaluations and lists in several processes, and in processes that are killed."""
-
 import json
 import os
 import signal

@@ -17,8 +17,9 @@ from curvireg_torch.evaluation.store import Workers, run_processes
 
 
 @pytest.fixture
-def entries(tmp_path):
+def entries(tmp_path, threads):
     """Four entries: two photographs, each with two meshes in turn; one mesh has a texture."""
+    threads(1)
     for name in ("0.png", "1.png", "skin.png"):
         (tmp_path / name).write_text(name)
     (tmp_path / "a.stl").write_text("a")
@@ -46,8 +47,6 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         raise MeshError(meshes[0].name)
 
     options = {"settings": settings or {}, "label": "", "progress": False}
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     try:
         with (
             patch.object(runner, "workers", lambda: nullcontext(workers or Workers())),
@@ -56,8 +55,6 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
             registered.store = run_entries(entries, folder, open_registrar, **options)
     except KeyboardInterrupt:
         assert stop_after is not None
-    finally:
-        torch.set_num_threads(threads)
     return labels
 
 
@@ -71,20 +68,14 @@ def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
         assert size == 8 or len(parts[0]) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "again"),
-    [
-        ("0.png", ["0a", "0b"]),
-        ("a.stl", ["0a", "1a"]),
-        ("b.obj", ["0b", "1b"]),
-        ("skin.mtl", ["0b", "1b"]),
-        ("skin.png", ["0b", "1b"]),
-    ],
-)
+AGAIN = {"0.png": "0a 0b", "a.stl": "0a 1a", "b.obj": "0b 1b", "skin.mtl": "0b 1b", "skin.png": "0b 1b"}
+
+
+@pytest.mark.parametrize(("name", "again"), AGAIN.items())
 def test_changed_files_are_registered_again(entries, tmp_path, name, again):
     registered(entries, tmp_path / "out")
     (tmp_path / name).write_text((tmp_path / name).read_text() + "\n# changed\n")
-    assert registered(entries, tmp_path / "out") == again
+    assert registered(entries, tmp_path / "out") == again.split()
     assert registered(entries, tmp_path / "out") == []
 
 
@@ -113,43 +104,24 @@ def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
     assert registered(entries, tmp_path / "out") == ["0b", "1b"]
 
 
-ENTRY = Entry(
-    {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=Camera(torch.eye(3))
-)
+CAMERA = Camera(torch.eye(3))
+ENTRY = Entry({"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA)
+VIEWS = (View("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
+OTHERS = {"name": "y.png", "instances": 2, "start_confidence": 0.5, "as_stored": True, "views": VIEWS}
+OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": ((1.0, 0.0, 0.0, 0.0),)}
+BOXES, CAMERAS = ((1.0, 2.0, 3.0, 4.25), None), (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
 
 
-VIEWS = (View("z.png", Path("z.png"), None, Camera(torch.eye(3)), torch.eye(4)),)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"name": "y.png"},
-        {"box": (1.0, 2.0, 3.0, 4.25)},
-        {"box": None},
-        {"camera": replace(Camera(torch.eye(3)), size=(5, 6))},
-        {"camera": None},
-        {"camera": "exif"},
-        {"camera": 50.0},
-        {"instances": 2},
-        {"prior": PosePrior(distance=(1.0, 2.0))},
-        {"start": ((1.0, 0.0, 0.0, 0.0),)},
-        {"start_confidence": 0.5},
-        {"as_stored": True},
-        {"views": VIEWS},
-    ],
-)
-def test_request_covers_every_option(changes):
-    changed = replace(ENTRY, **changes)
-    assert changed.request() != ENTRY.request() == replace(ENTRY).request()
-    assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key
-
-
-@pytest.mark.parametrize("name", ["box", "camera", "T_cam_from_world"])
-def test_request_covers_other_views(name):
+def test_request_covers_every_option_and_other_views():
+    changes = [*OTHERS.items(), *(("box", box) for box in BOXES), *(("camera", camera) for camera in CAMERAS)]
+    for name, value in changes:
+        changed = replace(ENTRY, **{name: value})
+        assert changed.request() != ENTRY.request() == replace(ENTRY).request(), (name, value)
+        assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key, (name, value)
     values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
-    other = replace(VIEWS[0], **{name: values.get(name, 2.0 * torch.eye(4))})
-    assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request()
+    for name, value in {**values, "T_cam_from_world": 2.0 * torch.eye(4)}.items():
+        other = replace(VIEWS[0], **{name: value})
+        assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request(), name
 
 
 def test_run_processes(monkeypatch, capfd):

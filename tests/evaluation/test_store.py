@@ -1,9 +1,9 @@
-import json
+from unittest.mock import Mock
 
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
-from curvireg_torch.evaluation.store import ResultStore, Workers, to_json
+from curvireg_torch.evaluation.store import ResultStore, Workers
 
 DIGESTS = {"request": "a", "photo": "b"}
 
@@ -18,9 +18,10 @@ def test_rows_are_read_again(tmp_path):
     for i, key in enumerate(keys):
         with pytest.raises(InvalidInputError, match=r"no result for .*; run again"):
             store.read(key)
-        store.append(row(key, i=i, value=float("nan")))
+        store.append(row(key, i=i, value=float("nan"), values=[float("inf"), 1.5]))
     for again in (store, ResultStore(tmp_path / "new")):
-        assert [again.read(key) for key in keys] == [row(key, i=i, value=None) for i, key in enumerate(keys)]
+        expected = [row(key, i=i, value=None, values=[None, 1.5]) for i, key in enumerate(keys)]
+        assert [again.read(key) for key in keys] == expected
         assert again.is_complete(dict.fromkeys(keys, DIGESTS))
         assert not again.is_complete(dict.fromkeys([*keys, "b"], DIGESTS))
 
@@ -63,8 +64,7 @@ def test_cut_line_is_removed(tmp_path, cut):
     reader, store = ResultStore(tmp_path), ResultStore(tmp_path)
     assert [reader.is_current(key, DIGESTS) for key in "abc"] == [True, True, False]
     store.append(row("c"))
-    assert store.path.read_bytes() == whole
-    assert store.read("c") == row("c")
+    assert (store.path.read_bytes(), store.read("c")) == (whole, row("c"))
 
 
 @pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])
@@ -75,14 +75,7 @@ def test_other_files_are_refused(tmp_path, content):
 
 
 def test_folder_that_cannot_be_written(tmp_path, monkeypatch):
-    def full_disk(*_):
-        raise OSError(28, "No space left on device")
-
     store = ResultStore(tmp_path)
-    monkeypatch.setattr("os.fsync", full_disk)
+    monkeypatch.setattr("os.fsync", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(OutputError, match="No space left"):
         store.append(row("x"))
-
-
-def test_to_json_writes_null_for_nan():
-    assert json.loads(to_json({"a": float("nan"), "b": [float("inf"), 1.5]})) == {"a": None, "b": [None, 1.5]}

@@ -2,38 +2,27 @@
 
 import json
 from collections import Counter
-from functools import cache
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from curvireg_torch.data import BOPDataset
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation import BOPBenchmark, Protocol
 from curvireg_torch.evaluation.benchmarks import same_instances
-from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint, transform
-from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE
+from curvireg_torch.geometry import transform
+from curvireg_torch.mesh import mesh_radius
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import CAMERA, write_photo
+from tests.registration.test_several import WORLD, photograph
 
 from .small import rows_of, run
 
-WORLD = transform(rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double()), torch.ones(3).double())
-"""``T_world_from_model``."""
 
-
-@cache
-def photograph(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def photograph_in_mm(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Picture, box and ``T_cam_from_model`` of the truck."""
-    mesh, generator = example_mesh(), torch.Generator().manual_seed(int(azimuth))
-    R = rotation_from_viewpoint(azimuth, 10.0, 0.0).double()
-    ahead = torch.tensor([0.0, 0.0, 6.0 * mesh_radius(mesh)], dtype=torch.float64)
-    T = transform(R, ahead - R @ mesh_centre(mesh))
-    image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, texture=0.6)
-    T[:3, 3] *= 1000.0  # BOP is in mm
-    return image, box, T
+    image, box, T = photograph(azimuth, int(azimuth), 0.0)
+    return image, box, transform(T[:3, :3], 1000.0 * T[:3, 3])
 
 
 @pytest.fixture
@@ -44,9 +33,8 @@ def trucks(tmp_path):
         folder, gt, info, cameras = root / "test" / f"{scene:06d}", {}, {}, {}
         (folder / "rgb").mkdir(parents=True)
         for number, azimuth in enumerate(azimuths):
-            image, box, T = photograph(azimuth)
-            pixels = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-            cv2.imwrite(str(folder / "rgb" / f"{number:06d}.png"), pixels)
+            image, box, T = photograph_in_mm(azimuth)
+            write_photo(folder / "rgb" / f"{number:06d}.png", image)
             x0, y0, x1, y1 = box.tolist()
             gt[number] = [{"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}]
             info[number] = [{"bbox_obj": [x0, y0, x1 - x0, y1 - y0], "visib_fract": 1.0}]
@@ -97,7 +85,7 @@ def test_poses_of_the_cameras_come_first(trucks):
     content["0"][0]["cam_t_m2c"][2] *= 1.001
     path.write_text(json.dumps(content))
     benchmark = BOPBenchmark(BOPDataset(trucks.root), Protocol(pose="any", views=4))
-    truths = [photograph(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
+    truths = [photograph_in_mm(azimuth)[2] for azimuth in (30.0, 70.0, 110.0, 150.0)]
     for view in benchmark.entries[0].views:
         expected = truths[int(view.photo.stem)] @ torch.linalg.inv(truths[0])
         torch.testing.assert_close(view.T_cam_from_world, expected, atol=1e-3, rtol=0)
@@ -141,9 +129,3 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
     assert summary["acc_30_deg"] > 0.5
     assert not run(benchmark, tmp_path / "out")["failed"]
-
-
-def test_views_are_refused_without_cameras(pascal):
-    with pytest.raises(InvalidInputError, match="views needs a dataset with cameras"):
-        Pascal3DBenchmark(pascal, Protocol(views=2))
-    assert Protocol.parse(str(Protocol(views=3, seed=2)).split()) == Protocol(views=3, seed=2)

@@ -36,15 +36,11 @@ def network():
     return Backbone()
 
 
-def picture(height=64, width=75):
-    """(1, 3, H, W): waves, the same on every machine."""
-    y, x = torch.meshgrid(torch.arange(height) / 7.0, torch.arange(width) / 11.0, indexing="ij")
-    return torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
-
-
 def test_backbone_equals_stored_features_of_timm(network):
-    """Every 9th channel at the centre of the map, from timm 1.0.31."""
-    for features, numbers in zip(network(picture()), (FINE, COARSE), strict=True):
+    """Every 9th channel at the centre of the map, from timm 1.0.31; the picture is the same on every machine."""
+    y, x = torch.meshgrid(torch.arange(64) / 7.0, torch.arange(75) / 11.0, indexing="ij")
+    waves = torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
+    for features, numbers in zip(network(waves), (FINE, COARSE), strict=True):
         H, W = features.shape[-2:]
         torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
 
@@ -65,20 +61,15 @@ def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkey
         Backbone()
 
 
-def images(n, size=64, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.stack([procedural_background((size, size), generator) for _ in range(n)])
-
-
 def test_similarity_is_the_mean_cosine_of_the_cells(network):
-    pictures = images(3)
+    generator = torch.Generator().manual_seed(0)
+    pictures = torch.stack([procedural_background((64, 64), generator) for _ in range(3)])
     expected = torch.zeros(3, 3)
     for features, spread in zip(network(pictures), network.spreads, strict=True):
         cells = features - features.mean(dim=(2, 3), keepdim=True)
         cells = F.normalize(cells / spread.view(1, -1, 1, 1), dim=1)
         expected += torch.einsum("achw,bchw->abhw", cells, cells).mean(dim=(2, 3)) / 2
     d = describe(pictures, network)
-    assert d.dtype == torch.float16
-    assert d.shape == (3, 40 * 8 * 8 + 112 * 4 * 4)
+    assert (d.dtype, d.shape) == (torch.float16, (3, 40 * 8 * 8 + 112 * 4 * 4))
     torch.testing.assert_close(similarity(d, d), expected, atol=2e-3, rtol=0)
     torch.testing.assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)

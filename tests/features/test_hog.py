@@ -1,5 +1,3 @@
-"""HOG against its definition."""
-
 import math
 
 import numpy as np
@@ -90,17 +88,14 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
     assert float(out.min()) >= 0.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_hog_rejects_wrong_weights_and_grids() -> None:
+    for options, message in (
         *(({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0") for w in (-1e-3, math.nan)),
         ({"bin_weights": torch.ones(8)}, r"bin_weights: expected shape \(9\)"),
         ({"grid": 32}, "at least 32 x 32 px"),
-    ],
-)
-def test_hog_rejects_wrong_weights_and_grids(options: dict[str, object], message: str) -> None:
-    with pytest.raises(InvalidInputError, match=message):
-        hog(torch.zeros(1, 2, 16, 16), **options)
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            hog(torch.zeros(1, 2, 16, 16), **options)
 
 
 def _line(angle: float) -> torch.Tensor:

@@ -7,9 +7,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+import curvireg_torch as cr
+from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
-from curvireg_torch.features.backbone import Backbone
+from curvireg_torch.features.backbone import Backbone, describe
 from curvireg_torch.features.learned_field import save_weights
 
 from .._support.layer_contract import LayerCase, LayerContract
@@ -93,3 +95,20 @@ def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
     field.network.forward = Mock(side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2))
     assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
     assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128
+
+
+def test_fields_fill_missing_pixels() -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 3, 64, 64, generator=generator)
+    lost = image.clone()
+    lost[0, :, 30:34, 30:34], lost[0, 2, 5, 5] = math.nan, math.inf
+    where = filters.operations.missing_mask(lost).any(dim=1, keepdim=True)
+    learned = cr.LearnedCurvilinearSaliency()
+    field = learned(lost)
+    assert bool(field.isfinite().all())
+    assert not bool(field.masked_select(where).any())
+    assert bool(field.masked_select(~where).any())
+    assert bool(learned.mask(lost).isfinite().all())
+    appearance_scores = describe(torch.cat([image, lost]), Backbone())
+    assert bool(appearance_scores.isfinite().all())
+    assert 0.5 < float((appearance_scores[0].float() * appearance_scores[1].float()).sum()) < 0.9999

@@ -13,9 +13,8 @@ from curvireg_torch.filters.operations import fill_missing, to_grey
 from .._support.layer_contract import LayerCase
 from .layer_cases import LAYERS, colour_photos, photos
 
-every_photo_layer = pytest.mark.parametrize(
-    "layer", [x for x in LAYERS.values() if x.inputs is photos], ids=lambda x: x.name
-)
+PHOTO_LAYERS = [layer for layer in LAYERS.values() if layer.inputs is photos]
+every_photo_layer = pytest.mark.parametrize("layer", PHOTO_LAYERS, ids=lambda layer: layer.name)
 
 
 def missing_value(layer: LayerCase) -> float:

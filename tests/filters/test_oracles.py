@@ -122,29 +122,17 @@ def test_central_derivatives_and_gaussian_against_scipy() -> None:
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)
 
 
-def matrices() -> torch.Tensor:
+def test_dominant_eigenvector_against_lapack() -> None:
     """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between branches."""
     g = torch.Generator().manual_seed(0)
     slope, h = (2 * torch.randn(500, n, generator=g, dtype=torch.float64) for n in (2, 3))
     across = torch.stack([slope[:, 1], -slope[:, 0]], dim=1)
     adjugate = torch.eye(2, dtype=torch.float64) + across[:, :, None] * across[:, None]
     general = adjugate @ h[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    special = [
-        [[-1, 2], [2, -1]],  # equal diagonal, negative trace: a diagonal ridge
-        [[1, 2], [2, 1]],
-        [[-1, 2], [2, 1]],  # trace 0
-        [[1, -2], [-2, -1]],
-        [[0, 3], [0, 1]],  # triangular
-        [[0, 0], [3, -1]],
-        [[2, 3], [0, -1]],
-        [[0, 0], [0, -5]],
-        [[-5, 0], [0, 0]],
-    ]
-    return torch.cat([general, torch.tensor(special, dtype=torch.float64)])
-
-
-def test_dominant_eigenvector_against_lapack() -> None:
-    m = matrices()
+    symmetric = [-1, 2, 2, -1], [1, 2, 2, 1], [-1, 2, 2, 1], [1, -2, -2, -1]  # equal diagonal (a ridge), or trace 0
+    triangular = [0, 3, 0, 1], [0, 0, 3, -1], [2, 3, 0, -1], [0, 0, 0, -5], [-5, 0, 0, 0]
+    special = torch.tensor([*symmetric, *triangular], dtype=torch.float64)
+    m = torch.cat([general, special.view(-1, 2, 2)])
     planes = [m[:, i, j].view(-1, 1, 1, 1) for i in range(2) for j in range(2)]
     vx, vy, half_gap = dominant_eigenvector(*planes)
     v = torch.cat(scaled_direction(torch.ones_like(vx), vx, vy), dim=1)[:, :, 0, 0]

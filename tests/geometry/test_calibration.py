@@ -1,5 +1,3 @@
-"""Cameras with distortion: undistortion against OpenCV's, validity of polynomials, and other resolutions."""
-
 import cv2
 import numpy as np
 import pytest
@@ -13,14 +11,6 @@ MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
 RADIAL = Camera(MATRIX, (-0.3, 0.1, 0.003, -0.002, 0.01), size=SIZE)
 TILTED = Camera(MATRIX, (-0.2, 0.05, 0.001, 0.001, 0, 0.1, 0, 0, 0.01, 0.001, 0.02, 0.003, 0.01, -0.02), size=SIZE)
 FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
-
-
-def undistorted_points(points, camera):
-    """(N, 2) px by OpenCV."""
-    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(points, np.float64)[:, None]
-    if camera.model == "fisheye":
-        return cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
-    return cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
 
 
 @pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
@@ -46,7 +36,11 @@ def test_box_is_around_its_undistorted_outline(camera):
     moved = undistorted(torch.zeros(1, *SIZE), camera, box).box
     side = np.linspace(0.0, 1.0, 500)
     outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
-    points = undistorted_points(outline, camera)
+    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(outline, np.float64)[:, None]
+    if camera.model == "fisheye":
+        points = cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
+    else:
+        points = cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
     expected = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
     torch.testing.assert_close(moved, expected, atol=0.01, rtol=0)
     beyond = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-40.0, 8.0, 150.0, 100.0])).box
@@ -68,12 +62,20 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
     assert float(folded[beyond.numpy()].min()) < 0.05  # the centre again
 
 
-def test_box_outside_of_what_is_shown_is_refused():
+def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (0.0,) * 4, "fisheye")
     with pytest.raises(InvalidInputError, match=r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([0.0, 0, 15, 15]))
     with pytest.raises(InvalidInputError, match="entirely outside the 160 x 120 image"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
+    for arguments, words in (
+        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
+        ({"model": "fisheye"}, "expected 4 finite coefficients"),
+        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
+        ({"size": (0, 640)}, "size of the image"),
+    ):
+        with pytest.raises(InvalidInputError, match=words):
+            Camera(**{"matrix": MATRIX, **arguments})
 
 
 def test_camera_of_a_resized_photograph():
@@ -88,17 +90,3 @@ def test_camera_of_a_resized_photograph():
         RADIAL.at((90, 160))
     with pytest.raises(InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"):
         RADIAL.at((160, 120))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"distortion": (0.1, 0.2)}, "expected 0 or 4 or 5 or 8 or 12 or 14 finite coefficients"),
-        ({"model": "fisheye"}, "expected 4 finite coefficients"),
-        ({"matrix": torch.eye(4)}, r"camera matrix: expected shape \(3, 3\)"),
-        ({"size": (0, 640)}, "size of the image"),
-    ],
-)
-def test_unusable_cameras_are_refused(arguments, words):
-    with pytest.raises(InvalidInputError, match=words):
-        Camera(**{"matrix": MATRIX, **arguments})

@@ -17,13 +17,9 @@ def test_opengl_cameras_look_backward_with_y_up() -> None:
     assert torch.equal(g.opencv_from_opengl(flipped), T)
 
 
-def points() -> torch.Tensor:
-    return torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 1
-
-
 def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> None:
     # p = diag(f, f, -1) Rx(e - 90) Rz(-a) (X - C), rotated by theta; v = py - y.
-    X, f, (px, py) = points().numpy(), 3000.0, (70.3, 51.8)
+    X, f, (px, py) = np.random.default_rng(0).uniform(-1, 1, (50, 3)), 3000.0, (70.3, 51.8)
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
         ar, er, tr = (math.radians(v) for v in (a, e, t))
         C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])
@@ -57,15 +53,19 @@ CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
 HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
 
 
-def test_symmetry_transforms_reads_matrices_row_by_row() -> None:
+def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input() -> None:
     assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
     np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
-
-
-def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
+    for info, step, match in (
+        ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
+        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
+        *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
+    ):
+        with pytest.raises(InvalidInputError, match=match):
+            g.symmetry_transforms(info, max_step_fraction=step)
     transforms = g.symmetry_transforms(CONTINUOUS, max_step_fraction=0.1).numpy()
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
@@ -74,16 +74,3 @@ def test_symmetry_transforms_agrees_with_scipy_and_fixes_the_axis() -> None:
         for along in (-5.0, 0.0, 2.0):
             point = np.array(OFFSET) + along * unit
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("info", "step", "match"),
-    [
-        ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
-        ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
-        *[({}, step, "max_step_fraction") for step in (0.0, 1.5, -0.1)],
-    ],
-)
-def test_symmetry_transforms_refuses_malformed_input(info: dict[str, object], step: float, match: str) -> None:
-    with pytest.raises(InvalidInputError, match=match):
-        g.symmetry_transforms(info, max_step_fraction=step)

@@ -1,5 +1,3 @@
-"""Limits on the pose: angles that wrap, tolerances about a rotation, and moves into the limits."""
-
 import math
 
 import pytest
@@ -14,16 +12,10 @@ def rotations(azimuth, elevation=0.0, theta=0.0):
     return rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta)))
 
 
-@pytest.mark.parametrize(
-    ("limits", "azimuth", "missed"),
-    [
-        ((300, 60), 0, 0),
-        ((300, 60), 290, 10),
-        ((300, 60), 180, 120),
-        ((60, 300), 0, 60),
-        ((0, 360), 123, 0),
-    ],
-)
+WRAPPED = [((300, 60), 0, 0), ((300, 60), 290, 10), ((300, 60), 180, 120), ((60, 300), 0, 60), ((0, 360), 123, 0)]
+
+
+@pytest.mark.parametrize(("limits", "azimuth", "missed"), WRAPPED)
 def test_azimuth_limits_wrap_around_zero(limits, azimuth, missed):
     excess = PosePrior(azimuth=limits).excess(rotations(float(azimuth)))
     assert float(excess.clamp(min=0.0)) == pytest.approx(min(missed, 90), abs=1e-5)
@@ -50,16 +42,11 @@ def test_elevation_and_theta_are_limited_each_by_itself():
     assert PosePrior(elevation=(-90, 90)).excess(R).tolist() == [-180.0] * 4
 
 
-@pytest.mark.parametrize(
-    "prior",
-    [
-        PosePrior(azimuth=(300, 60)),
-        PosePrior(elevation=(10, 30), theta=(-5, 5)),
-        PosePrior(azimuth=(100, 140), theta=(-15, 15)),
-        PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25.0),
-    ],
-    ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"],
-)
+PRIORS = [PosePrior(azimuth=(300, 60)), PosePrior(elevation=(10, 30), theta=(-5, 5))]
+PRIORS += [PosePrior(azimuth=(100, 140), theta=(-15, 15)), PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25)]
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"])
 def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
     generator = torch.Generator().manual_seed(0)
     a, e, t = torch.rand(3, 4000, generator=generator, dtype=torch.float64)
@@ -108,9 +95,8 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
         assert torch.det(R) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_pose_prior_refuses_what_it_cannot_mean():
+    for options, message in (
         ({}, "at least one limit"),
         ({"azimuth": (1, 2, 3)}, "azimuth: expected 2 finite"),
         ({"elevation": (50, 40)}, "elevation: expected -90 <= low"),
@@ -118,9 +104,6 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
         ({"rotation": torch.eye(3), "within": 0.0}, r"within: expected degrees in \(0, 180\]"),
         ({"rotation": 2 * torch.eye(3), "within": 5.0}, "rotation"),
         ({"azimuth": (0, 9), "front": "w"}, "front"),
-    ],
-    ids=str,
-)
-def test_pose_prior_refuses_what_it_cannot_mean(options, message):
-    with pytest.raises(InvalidInputError, match=message):
-        PosePrior(**options)
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            PosePrior(**options)

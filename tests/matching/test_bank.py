@@ -1,5 +1,3 @@
-"""Banks in memory and on disk."""
-
 import os
 import stat
 from dataclasses import replace
@@ -26,11 +24,6 @@ def build(mesh, views=None, **options) -> ViewBank:
     return ViewBank.build(mesh, views, progress=False, image_size=64, **options)
 
 
-@pytest.fixture(scope="module")
-def upright(truck) -> ViewBank:
-    return build(truck, pipeline=Pipeline(views=UPRIGHT))
-
-
 @pytest.fixture
 def saved(small_bank, tmp_path):
     small_bank.save(tmp_path / "bank.safetensors")
@@ -52,32 +45,26 @@ def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
     assert a.settings == b.settings
 
 
-def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch):
-    before = torch.get_num_threads()
+def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch, threads):
     monkeypatch.setattr(bank_module, "VIEWS_AT_A_TIME", 5)
-    try:
-        torch.set_num_threads(3)
-        other = build(truck, small_bank.views)
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(before)
+    threads(3)
+    other = build(truck, small_bank.views)
+    assert torch.get_num_threads() == 3
     assert_same(other, small_bank, atol=1e-5)
     assert torch.equal(other.points_at(torch.tensor([3, 0])), small_bank.points_at(slice(None))[[3, 0]])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_check_compatible_refuses_another_view_policy(truck):
+    upright = build(truck, pipeline=Pipeline(views=UPRIGHT))
+    for change, message in (
         ({"pose": "any"}, "pose upright, expected any"),
         ({"azimuth_step": 60.0}, r"azimuth_step 120\.0, expected 60\.0"),
         ({"distance": 6.0}, r"distance 5\.0, expected 6\.0"),
-    ],
-)
-def test_check_compatible_refuses_another_view_policy(upright, change, message):
-    other = replace(upright.pipeline, views=replace(UPRIGHT, **change))
-    for constructor in (ViewMatcher, Registrar):
-        with pytest.raises(BankError, match=message):
-            constructor(upright, pipeline=other)
+    ):
+        other = replace(upright.pipeline, views=replace(UPRIGHT, **change))
+        for constructor in (ViewMatcher, Registrar):
+            with pytest.raises(BankError, match=message):
+                constructor(upright, pipeline=other)
 
 
 def test_save_and_load(small_bank, tmp_path):
@@ -87,15 +74,14 @@ def test_save_and_load(small_bank, tmp_path):
     assert_same(loaded, small_bank, atol=5e-4)
     np.testing.assert_array_equal(loaded.mesh.vertices, small_bank.mesh.vertices)
     np.testing.assert_array_equal(loaded.mesh.faces, small_bank.mesh.faces)
-    assert loaded.mesh.units == "m"
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    assert (loaded.mesh.units, [p.name for p in path.parent.iterdir()]) == ("m", [path.name])
     if os.name == "posix":
         mask = os.umask(0)
         os.umask(mask)
         assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~mask
 
 
-def test_load_detects_changed_bits(saved):
+def test_load_refuses_changed_bits_and_truncated_and_missing_files(saved):
     content = bytearray(saved.read_bytes())
     for position in torch.linspace(len(content) // 3, len(content) - 1, 12).long().tolist():
         content[position] ^= 1
@@ -103,6 +89,11 @@ def test_load_detects_changed_bits(saved):
         with pytest.raises(BankError, match="checksum"):
             ViewBank.load(saved)
         content[position] ^= 1
+    saved.write_bytes(saved.read_bytes()[:-100])
+    with pytest.raises(BankError, match="truncated"):
+        ViewBank.load(saved)
+    with pytest.raises(MissingFileError, match="no such bank"):
+        ViewBank.load(saved.with_name("none"))
 
 
 @pytest.mark.parametrize(
@@ -142,14 +133,6 @@ def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
     rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
     with pytest.raises(BankError, match=message):
         ViewBank.load(saved)
-
-
-def test_load_refuses_truncated_and_missing_files(saved):
-    saved.write_bytes(saved.read_bytes()[:-100])
-    with pytest.raises(BankError, match="truncated"):
-        ViewBank.load(saved)
-    with pytest.raises(MissingFileError, match="no such bank"):
-        ViewBank.load(saved.with_name("none"))
 
 
 def test_float16_storage_changes_no_ranking(small_bank, saved):

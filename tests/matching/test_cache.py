@@ -1,5 +1,3 @@
-"""The cache of banks: hits, keys, trimming, foreign files, concurrent processes."""
-
 import multiprocessing
 import os
 import time
@@ -75,8 +73,7 @@ def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
         again = cached_bank(mesh, VIEWS, **options)
         assert torch.equal(again.descriptors, bank.descriptors)
         found, given = again.mesh.metadata, as_mesh(mesh).metadata
-        assert found["up"] == given["up"]
-        assert ("colours" in found) == ("colours" in given)
+        assert (found["up"], "colours" in found) == (given["up"], "colours" in given)
         if "colours" in given:
             np.testing.assert_array_equal(found["colours"].uv, given["colours"].uv)
             np.testing.assert_array_equal(found["colours"].textures[0], given["colours"].textures[0])
@@ -126,13 +123,8 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
     cached_box(None)
     (bank,) = list_cache()
     assert bank.size == bank.path.stat().st_size > 1000
-    foreign = [
-        tmp_path / "model.safetensors",
-        tmp_path / bank.path.name,  # a bank in another folder
-        bank.path.with_name("my bank.safetensors"),
-        bank.path.with_name(f"{bank.path.name}.orig"),
-        bank.path.with_name("notes.txt"),
-    ]
+    foreign = [tmp_path / "model.safetensors", tmp_path / bank.path.name]  # the second is a bank in another folder
+    foreign += map(bank.path.with_name, ("my bank.safetensors", f"{bank.path.name}.orig", "notes.txt"))
     for path in foreign:
         path.write_bytes(b"notes")
     assert list_cache() == [bank]
@@ -148,18 +140,14 @@ def test_cached_bank_warns_of_an_unwritable_folder(tmp_path):
     assert (list_cache(tmp_path / "file"), clear_cache(tmp_path / "file")) == ([], 0)
 
 
-def needs_fork(test):
-    """Spawned processes would import everything again, some seconds each."""
-    test = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")(test)  # fork beside threads, Python 3.12
-    return pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")(test)
-
-
 def _build_all(folder: str, edges: tuple[float, ...]) -> float:
     torch.set_num_threads(1)
     return sum(float(cached_box(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
-@needs_fork
+# Spawned processes would import everything again, some seconds each. Python 3.12 warns of fork beside threads.
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_cached_bank_in_concurrent_processes(tmp_path):
     edges = (1.0, 2.0, 3.0)
     with multiprocessing.get_context("fork").Pool(2) as pool:

@@ -17,9 +17,8 @@ def test_describer_renders_quarter_turns_once(truck, camera):
     rotations, distances = views.rotations, views.distance * describe.radius
     describe.view_renderer = Mock(wraps=describe.view_renderer)
     together = describe(rotations, distances)
-    assert [len(call.args[0]) for call in describe.view_renderer.render.call_args_list] == [
-        4
-    ]  # two directions, 0 and 35
+    (call,) = describe.view_renderer.render.call_args_list
+    assert len(call.args[0]) == 4, "two directions, 0 and 35"
     for i in range(len(rotations)):
         alone = describe(rotations[i : i + 1], distances[i : i + 1])
         assert (together["descriptors"][i] - alone["descriptors"][0]).norm() < 0.02 * alone["descriptors"][0].norm()

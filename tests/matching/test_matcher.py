@@ -41,9 +41,11 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
     parts = Correlation().log_score(ranking.hog), Repeatability().log_score(ranking.repeatability), box
     torch.testing.assert_close(ranking.scores, sum(parts).exp())
     assert ranking.top(3).equal(ranking.order[:, :3])
+    tied = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
+    assert tied.order[0].tolist() == list(range(len(bank)))
 
 
-def test_matcher_is_batch_independent(matcher):
+def test_matcher_is_batch_independent_and_takes_bytes_and_mixed_channels(matcher):
     images, boxes = batch(0, 1, 2)
     together = matcher(images, boxes)
     assert torch.equal(matcher(list(images), boxes).scores, together.scores)
@@ -51,9 +53,6 @@ def test_matcher_is_batch_independent(matcher):
         alone = matcher(images[i : i + 1], boxes[i : i + 1])
         torch.testing.assert_close(alone.scores[0], together.scores[i], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(alone.hog[0], together.hog[i], rtol=1e-5, atol=1e-5)
-
-
-def test_matcher_takes_bytes_and_mixed_channels(matcher):
     images, boxes = batch(0, 1)
     exact = (images * 255).round() / 255
     pixels = (images * 255).round().to(torch.uint8)
@@ -64,23 +63,15 @@ def test_matcher_takes_bytes_and_mixed_channels(matcher):
     torch.testing.assert_close(mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5)
 
 
-def test_ranking_breaks_ties_in_the_order_of_the_bank(bank, matcher):
-    ranking = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
-    assert ranking.order[0].tolist() == list(range(len(bank)))
-
-
-@pytest.mark.parametrize(
-    ("image", "boxes", "message"),
-    [
+def test_matcher_refuses_unusable_input(matcher):
+    for image, boxes, message in (
         (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
         (torch.rand(1, 3, 64, 64), [[500.0, 5, 600, 50]], "outside"),
         (torch.rand(2, 3, 64, 64), [[5.0, 5, 50, 50]] * 3, r"shape \(2, 4\), one for each image, got \(3, 4\)"),
         (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
-    ],
-)
-def test_matcher_refuses_unusable_input(matcher, image, boxes, message):
-    with pytest.raises(InvalidInputError, match=message):
-        matcher(image, torch.tensor(boxes))
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            matcher(image, torch.tensor(boxes))
 
 
 @pytest.mark.parametrize("channels", [3, 1])

@@ -11,14 +11,10 @@ from curvireg_torch.mesh import load_mesh
 from curvireg_torch.mesh.files import mesh_digest, mesh_files
 from tests.mesh.test_hostile_meshes import tree
 
-EXPECTED = {
-    "gltf": {"part.gltf", "picture.png", "points.bin"},
-    "obj": {"part.obj", "part.mtl", "picture.png"},
-    "ply": {"part.ply", "picture.png"},
-    "glb": {"part.glb"},
-    "stl": {"part.stl"},
-    "off": {"part.off"},
-}
+EXPECTED = {suffix: {f"part.{suffix}"} for suffix in ("gltf", "obj", "ply", "glb", "stl", "off")}
+EXPECTED["gltf"] |= {"picture.png", "points.bin"}
+EXPECTED["obj"] |= {"part.mtl", "picture.png"}
+EXPECTED["ply"] |= {"picture.png"}
 
 
 def picture(path: Path, shade: int = 0) -> None:

@@ -60,10 +60,12 @@ def refused(path: Path, content: bytes, match: str, *, seconds: float = 5.0, meg
     assert path.name in str(caught.value)
 
 
-def test_load_mesh_reads_the_valid_gltf_and_glb(tmp_path: Path) -> None:
+def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text(json.dumps(tree()))
     (tmp_path / "a.glb").write_bytes(glb(tree()))
     assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
+    for damaged in (b"glTF", glb(tree())[:60], glb(tree())[:-5], glb(tree()).replace(b"JSON", b"TEXT")):
+        refused(tmp_path / "a.glb", damaged, "cannot be read")
 
 
 def zeros(**changes: Any) -> dict[str, Any]:
@@ -78,9 +80,8 @@ def required(name: str) -> dict[str, Any]:
 INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
+def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path) -> None:
+    for changes, match in (
         ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
         ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
         ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
@@ -99,17 +100,10 @@ INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
         (required("KHR_texture_transform"), "KHR_texture_transform.*export without it"),
         ({"asset": {"version": "1.0"}}, "version 2"),
         ({"meshes": 5}, "valid glTF"),
-    ],
-)
-def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path, changes: dict[str, Any], match: str) -> None:
-    refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
-    if "buffers" not in changes:
-        refused(tmp_path / "a.glb", glb(tree(**changes)), match)
-
-
-@pytest.mark.parametrize("data", [b"glTF", glb(tree())[:60], glb(tree())[:-5], glb(tree()).replace(b"JSON", b"TEXT")])
-def test_load_mesh_refuses_damaged_glb(tmp_path: Path, data: bytes) -> None:
-    refused(tmp_path / "a.glb", data, "cannot be read")
+    ):
+        refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+        if "buffers" not in changes:
+            refused(tmp_path / "a.glb", glb(tree(**changes)), match)
 
 
 def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,15 +124,9 @@ def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.Mo
     decode = Mock(wraps=colours._texture)
     monkeypatch.setattr(colours, "_texture", decode)
     found = cr.load_mesh(tmp_path / "a.gltf").metadata["colours"]
-    assert decode.call_count == 1
-    assert len(found) == 40
+    assert (decode.call_count, len(found)) == (1, 40)
     (texture,) = found.textures
     assert texture[9, 9].tolist() == [200, 100, 50]
-
-
-def test_check_gltf_counts_every_copy_of_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_MESH_FACES", 100)
-    refused(tmp_path / "a.gltf", json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode(), "more than 100 faces")
 
 
 OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
@@ -159,9 +147,8 @@ PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "match"),
-    [
+def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, content, match in (
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
         ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
@@ -171,17 +158,15 @@ PLY += b"property list uchar int vertex_indices\nend_header\n"
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
         ("a.obj", b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n", "only 9e-07 units across; scale it up"),
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
-    ],
-)
-def test_load_mesh_refuses_false_claims(tmp_path: Path, name: str, content: bytes, match: str) -> None:
-    refused(tmp_path / name, content, match)
-
-
-def test_load_mesh_bounds_faces_and_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ):
+        refused(tmp_path / name, content, match)
     trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
     content = (tmp_path / "a.stl").read_bytes()
     monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
     refused(tmp_path / "a.stl", content, "1,280 faces")
+    copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode()
+    monkeypatch.setattr(files, "MAX_MESH_FACES", 100)
+    refused(tmp_path / "a.gltf", copies, "more than 100 faces")
     monkeypatch.setattr(files, "MAX_MESH_BYTES", 1000)
     refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
 

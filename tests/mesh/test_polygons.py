@@ -15,25 +15,6 @@ from curvireg_torch.mesh.files import divide_faces, obj_with_triangles
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
 
-def divide(polygon: np.ndarray) -> np.ndarray:
-    return np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])
-
-
-def areas(polygon: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    a, b, c = np.moveaxis(polygon[triangles], 1, 0)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-
-
-def true_area(flat: np.ndarray) -> float:
-    x, y = flat.T
-    return 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
-
-
-def star(n: int, rng: np.random.Generator) -> np.ndarray:
-    angle, radius = np.sort(rng.uniform(0, 2 * np.pi, n)), rng.uniform(0.2, 1, n)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
-
-
 def square_with_hole(n: int) -> np.ndarray:
     square = np.array([[0, 0], [10, 0], [10, 10], [0, 10.0]])
     angle = -np.linspace(0, 2 * np.pi, n, endpoint=False) - 3 * np.pi / 4
@@ -45,11 +26,15 @@ def square_with_hole(n: int) -> np.ndarray:
 @pytest.mark.parametrize("sign", [1, -1])
 def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
     rng = np.random.default_rng(0)
-    stars = [star(n, rng) for n in (4, 5, 6, 9, 60)]
+    turns = [np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n) for n in (4, 5, 6, 9, 60)]
+    stars = [np.stack([turn.real, turn.imag], axis=-1) for turn in turns]
     for flat in (U, *map(square_with_hole, (3, 8, 40)), *stars):
         polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)  # in a tilted plane
         # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that none overlap.
-        assert areas(polygon, divide(polygon)).sum() == pytest.approx(true_area(flat) * 1.18**0.5, rel=1e-9)
+        a, b, c = np.moveaxis(polygon[np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])], 1, 0)
+        (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
+        expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
+        assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
 
 
 def prism() -> tuple[np.ndarray, list[list[int]]]:
@@ -103,8 +88,7 @@ def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: s
     mesh = cr.load_mesh(path)
     fans = [[f[0], f[i], f[i + 1]] for f in faces for i in range(1, len(f) - 1)]
     assert silhouette(trimesh.Trimesh(vertices, fans, process=False)) - silhouette(mesh) > 150
-    assert mesh.area == pytest.approx(2 * 7 + 16)
-    assert len(mesh.faces) == 2 * 6 + 8 * 2
+    assert (mesh.area, len(mesh.faces)) == (pytest.approx(2 * 7 + 16), 2 * 6 + 8 * 2)
     if kind == "ply with colours":
         assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
 
@@ -151,8 +135,7 @@ def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangl
     path = tmp_path / "box.obj"
     path.write_text(BOX + "\n".join(rows) + "\n")
     mesh = cr.load_mesh(path)
-    assert len(mesh.faces) == 12
-    assert abs(mesh.volume) == pytest.approx(1.0)
+    assert (len(mesh.faces), abs(mesh.volume)) == (12, pytest.approx(1.0))
 
 
 @pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 3/1/1 0/1/1 1/1/1", "f 0 1 2 3"])

@@ -1,5 +1,3 @@
-"""Symmetries of the shape of meshes."""
-
 import numpy as np
 import pytest
 import torch
@@ -19,25 +17,12 @@ def moved(mesh):
     return mesh
 
 
-def prism(sides):
-    return trimesh.creation.cylinder(1.0, 3.0, sections=sides)
+BOXES = [(trimesh.creation.box(size), count) for size, count in (((1, 2, 3), 4), ((1, 1, 3), 8), ((1, 1, 1), 24))]
+PRISMS = [(trimesh.creation.cylinder(1.0, 3.0, sections=n), count) for n, count in ((3, 6), (5, 10), (64, 72))]
+MOVED = [(moved(BOTTLE), 36), (moved(trimesh.creation.box((1, 2, 3))), 4)]
 
 
-@pytest.mark.parametrize(
-    ("mesh", "count"),
-    [
-        (trimesh.creation.box((1, 2, 3)), 4),
-        (trimesh.creation.box((1, 1, 3)), 8),
-        (trimesh.creation.box((1, 1, 1)), 24),
-        (prism(3), 6),
-        (prism(5), 10),
-        (prism(64), 72),
-        (BOTTLE, 36),
-        (moved(BOTTLE), 36),
-        (moved(trimesh.creation.box((1, 2, 3))), 4),
-        (example_mesh(), 1),
-    ],
-)
+@pytest.mark.parametrize(("mesh", "count"), [*BOXES, *PRISMS, *MOVED, (BOTTLE, 36), (example_mesh(), 1)])
 def test_symmetries_map_the_shape_to_itself(mesh, count):
     symmetries = mesh_symmetries(mesh)
     assert symmetries.shape == (count, 4, 4)

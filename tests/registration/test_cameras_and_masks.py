@@ -6,14 +6,14 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch import Camera, camera_matrix, project_points, render_depth, rotation_error
+from curvireg_torch import Camera, camera_matrix, project_points, render_depth
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import undistorted
 from curvireg_torch.geometry.cameras import boxes_around
 from curvireg_torch.registration import FailedRegistration, Follower, detect
 from curvireg_torch.registration.inputs import image_item, image_items
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene, truck_registrar
 
 # The object, in the middle of the picture, is 20 degrees off its axis, where distortion moves it
 OFF_CENTRE = camera_matrix(260.0, 260.0, 20.0, 30.0)
@@ -39,12 +39,6 @@ def distorted(camera, seed):
     y, x = (moved[3] >= 0.5).nonzero().unbind(1)
     box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])
     return ideal, moved[:3], box, moved[3], T
-
-
-def errors(result, T):
-    """Degrees, and the error of the position as a fraction of the distance."""
-    away = torch.linalg.vector_norm(result.translation - T[:3, 3]) / torch.linalg.vector_norm(T[:3, 3])
-    return float(rotation_error(result.rotation, T[:3, :3])), float(away)
 
 
 @pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial-tangential", "fisheye"])
@@ -74,12 +68,16 @@ def test_detection_refinement_and_following_take_cameras():
     assert errors(follow(photo), T)[1] < 0.02
 
 
-def test_box_that_the_camera_did_not_record_is_warned_of():
+def test_inverted_masks_and_boxes_that_the_camera_did_not_record_are_warned_of():
     camera = Camera(CAMERA, (1.5, 0.0, 0.0, 0.0), size=SIZE)
     item = image_item(torch.rand(3, *SIZE), torch.tensor([0.0, 0.0, 60.0, 60.0]), camera)
     assert not item.warnings
     item = image_item(torch.rand(3, *SIZE), torch.tensor([-60.0, -60.0, 30.0, 30.0]), camera)
     assert "% of the box lie where the distorted photograph shows nothing" in item.warnings[0]
+    mask = torch.ones(40, 60)
+    mask[5:35, 20:50] = 0.0
+    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
 
 
 def test_mask_gives_the_box_and_the_outline():
@@ -106,46 +104,26 @@ def test_mask_decides_which_edges_are_the_outline():
     assert register.object_mask(query, [image_item(image, box, CAMERA)]) is None
 
 
-@pytest.mark.parametrize("kind", ["bool", "bytes", "zeros and ones", "array", "file"])
-def test_masks_in_any_form(tmp_path, kind):
+def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
     mask = torch.zeros(40, 60, dtype=torch.bool)
     mask[10:30, 20:50] = True
     Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
-    forms = {
-        "bool": mask,
-        "bytes": mask.byte() * 255,
-        "zeros and ones": mask.byte(),
-        "array": mask.numpy().astype(np.float64),
-        "file": tmp_path / "mask.png",
-    }
-    item = image_item(torch.rand(3, 40, 60), None, mask=forms[kind])
-    assert torch.equal(item.mask, mask.float())
-    assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
-
-
-@pytest.mark.parametrize(
-    ("mask", "box", "words"),
-    [
+    for form in (mask, 255 * mask.byte(), mask.byte(), mask.numpy().astype(np.float64), tmp_path / "mask.png"):
+        item = image_item(torch.rand(3, 40, 60), None, mask=form)
+        assert torch.equal(item.mask, mask.float())
+        assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
+    for mask, box, words in (
         (torch.zeros(40, 60, dtype=torch.bool), None, "mask: no white pixel; expected the object white"),
         (torch.eye(40, 60), [50.0, 0.0, 58.0, 9.0], "mask: no white pixel in the box"),
         (torch.ones(60, 40), None, r"mask: expected shape \(40, 60\), that of the photograph, got \(60, 40\)"),
         (torch.ones(40, 60, dtype=torch.int64), None, "mask: expected bool, uint8 or floating"),
         (torch.full((40, 60), 255.0), None, "mask: expected values from 0 to 1"),
         ("no.png", None, "no.png: no such file"),
-    ],
-)
-def test_unusable_masks_are_named(mask, box, words):
-    (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
-    assert isinstance(result, FailedRegistration)
-    with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
-        raise result.error
-
-
-def test_inverted_mask_is_warned_of():
-    mask = torch.ones(40, 60)
-    mask[5:35, 20:50] = 0.0
-    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
-    assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
+    ):
+        (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
+        assert isinstance(result, FailedRegistration)
+        with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
+            raise result.error
 
 
 def test_camera_is_scaled_to_each_photograph():

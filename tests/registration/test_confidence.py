@@ -1,5 +1,3 @@
-"""Confidence: closed forms, what raises it, and results that have none."""
-
 import json
 import math
 from dataclasses import replace
@@ -11,20 +9,7 @@ import trimesh
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration.confidence import (
-    CALIBRATION,
-    CONFIDENCE_FEATURES,
-    MAX_MARGIN,
-    RELIABLE,
-    UNCOMPARED_CONFIDENCE,
-    LogisticModel,
-    are_near,
-    concentration,
-    confidence_features,
-    hypothesis_probabilities,
-    is_calibrated,
-    registration_confidence,
-)
+from curvireg_torch.registration import confidence
 from curvireg_torch.registration.contour_fit import contour_support
 from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.synthetic import procedural_background
@@ -39,7 +24,7 @@ def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
 
 def test_concentration_in_closed_form():
     """Two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of view 3."""
-    near = are_near(R30, R30[3])
+    near = confidence.are_near(R30, R30[3])
     assert near.nonzero()[:, 0].tolist() == [1, 2, 3, 4, 5]
     share = 1 + 0.9**4 + 3 * 0.1**4
     for scores, expected in (
@@ -48,27 +33,32 @@ def test_concentration_in_closed_form():
         (scores_of({5: 1.0}, 0.0), 1.0),
         (torch.zeros(30), 0.0),
     ):
-        assert concentration(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    assert concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
+        assert confidence.concentration(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert confidence.concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
 
 
-def test_logistic_model():
-    model = LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
+def test_logistic_model_and_probabilities_of_hypotheses_in_closed_form():
+    model = confidence.LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
     assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
     assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
-    assert model({"similarity": 5.0, "margin": None}) == UNCOMPARED_CONFIDENCE, "bounded without a rival"
-    assert (LogisticModel({}, 1e4)({}), LogisticModel({}, -1e4)({})) == (1.0, 0.0)
+    assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, "bounded without a rival"
+    assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (1.0, 0.0)
+    constants = confidence.CALIBRATION["instance"]
+    found = confidence.hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 0.0]), exact=True)
+    weights = [1.0, math.exp(-constants["slope"]), math.exp(constants["none"])]
+    assert found == pytest.approx((0.6, *(0.4 * w / sum(weights) for w in weights[:2])))
+    assert confidence.hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
 
 
 @pytest.mark.parametrize("exact", [True, False])
 def test_every_feature_raises_the_confidence(exact):
-    model = CALIBRATION["instance" if exact else "category"]
-    assert tuple(model["weights"]) == CONFIDENCE_FEATURES
+    model = confidence.CALIBRATION["instance" if exact else "category"]
+    assert tuple(model["weights"]) == confidence.CONFIDENCE_FEATURES
     tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3, "landmarks": 1.0}
-    for name in CONFIDENCE_FEATURES if exact else CONFIDENCE_FEATURES[:-1]:  # similar meshes have no landmarks
-        assert registration_confidence({**tied, name: tied[name] + 0.1}, exact=exact) > registration_confidence(
-            tied, exact=exact
-        )
+    for name in confidence.CONFIDENCE_FEATURES[: 5 if exact else 4]:  # similar meshes have no landmarks
+        better = {**tied, name: tied[name] + 0.1}
+        more, less = (confidence.registration_confidence(features, exact=exact) for features in (better, tied))
+        assert more > less
 
 
 def test_confidence_features():
@@ -77,35 +67,24 @@ def test_confidence_features():
     )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0}
-    assert confidence_features(evidence, scores, 0.3) == pytest.approx(expected)
+    assert confidence.confidence_features(evidence, scores, 0.3) == pytest.approx(expected)
     for factor in (10.0, -10.0):
-        assert confidence_features(evidence, factor * scores, 0.3)["margin"] == math.copysign(MAX_MARGIN, factor)
-    alone = confidence_features(evidence[:1], scores[:1], None)
+        margin = confidence.confidence_features(evidence, factor * scores, 0.3)["margin"]
+        assert margin == math.copysign(confidence.MAX_MARGIN, factor)
+    alone = confidence.confidence_features(evidence[:1], scores[:1], None)
     assert alone["margin"] is alone["concentration"] is None
 
 
-def test_probabilities_of_hypotheses_in_closed_form():
-    constants = CALIBRATION["instance"]
-    found = hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 0.0]), exact=True)
-    weights = [1.0, math.exp(-constants["slope"]), math.exp(constants["none"])]
-    assert found == pytest.approx((0.6, *(0.4 * w / sum(weights) for w in weights[:2])))
-    assert hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
-
-
-@pytest.mark.parametrize(
-    ("pipeline", "calibrated"),
-    [
+def test_only_the_default_pipeline_is_calibrated():
+    for pipeline, calibrated in (
         (Pipeline(), True),
         (replace(Pipeline(), hypotheses=1, box_jitter=0.0), True),
         (replace(Pipeline(), contours=False), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),
-    ],
-    ids=str,
-)
-def test_only_the_default_pipeline_is_calibrated(pipeline, calibrated):
-    assert is_calibrated(pipeline) == calibrated
+    ):
+        assert confidence.is_calibrated(pipeline) == calibrated
 
 
 def test_uncalibrated_pipeline_gives_no_number():
@@ -123,9 +102,8 @@ def test_uncalibrated_pipeline_gives_no_number():
 def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
     result = learned_registrar()([image], box[None], camera)[0]
-    exact = camera is not None
-    assert result.confidence == pytest.approx(registration_confidence(result.confidence_features, exact=exact))
-    assert result.confidence_features["similarity"] == result.score
+    expected = confidence.registration_confidence(result.confidence_features, exact=camera is not None)
+    assert (result.confidence, result.confidence_features["similarity"]) == (pytest.approx(expected), result.score)
     assert result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
     assert len(result.probabilities) == len(result.hypotheses)
     assert sum(result.probabilities) + result.none == pytest.approx(1.0)
@@ -140,20 +118,18 @@ def test_confidence_is_higher_for_the_object_than_for_clutter():
     assert min(r.confidence for r in there) > max(r.confidence for r in absent)
     assert sorted(r.confidence for r in absent)[2] < 0.5
     assert not any(r.reliable for r in absent)
-    assert sum(r.confidence >= RELIABLE for r in there) >= 4
+    assert sum(r.confidence >= confidence.RELIABLE for r in there) >= 4
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_confidence_does_not_depend_on_the_number_of_reported_hypotheses(seed):
     image, box, _ = scene(seed)
     bank = learned_registrar().bank
-    one, two = (
-        Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=n))([image], box[None], CAMERA)[0] for n in (1, 2)
-    )
+    registrars = (Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=n)) for n in (1, 2))
+    one, two = (registrar([image], box[None], CAMERA)[0] for registrar in registrars)
     assert (len(one.hypotheses), len(two.hypotheses)) == (1, 2)
     assert torch.equal(one.rotation, two.rotation)
-    assert one.confidence_features == two.confidence_features
-    assert one.confidence == two.confidence
+    assert (one.confidence_features, one.confidence) == (two.confidence_features, two.confidence)
 
 
 def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():
@@ -162,7 +138,7 @@ def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():
     bank = ViewBank.build(truck_bank().mesh, near, image_size=96, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
     assert result.confidence_features["concentration"] is None
-    assert result.confidence <= UNCOMPARED_CONFIDENCE
+    assert result.confidence <= confidence.UNCOMPARED_CONFIDENCE
 
 
 @pytest.mark.parametrize("camera", [CAMERA, None])

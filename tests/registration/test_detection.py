@@ -98,15 +98,10 @@ def test_pose_outside_the_photograph_has_score_zero(registrar, found, monkeypatc
     assert result.detection.score == 0.0
 
 
-def two_trucks():
-    first, box = pasted_scene(5, (0, 0), 0.7)
-    second, other = pasted_scene(5, (150, 70), 0.7)
-    first[:, 70:, 150:] = second[:, 70:, 150:]
-    return first, box, other
-
-
 def test_detect_finds_several_instances(registrar):
-    image, box, other = two_trucks()
+    image, box = pasted_scene(5, (0, 0), 0.7)
+    second, other = pasted_scene(5, (150, 70), 0.7)
+    image[:, 70:, 150:] = second[:, 70:, 150:]
     results = detect(registrar, [image], instances=2)[0]
     boxes = torch.stack([r.detection.box for r in results])
     overlap = box_iou(boxes, torch.stack([box, other]).double())
@@ -131,12 +126,11 @@ def test_detect_reports_an_object_once(registrar, monkeypatch):
     assert torch.equal(results[0].detection.box, box.double())
 
 
-def test_the_most_certain_of_all_proposals_is_reported():
+def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeypatch):
     """The detector prefers a box of the background."""
-    registrar = cr.Registrar(bank(), pipeline=unrefined(bank()))
-    image, box = pasted_scene(5, (90, 40), 0.9)
+    image, box, _ = found
     background = torch.tensor([2.0, 2.0, 60.0, 40.0])
-    registrar.__dict__["detector"] = fixed(torch.stack([background, box]), [6.2, 6.0])
+    monkeypatch.setattr(registrar, "detector", fixed(torch.stack([background, box]), [6.2, 6.0]))
     result = detect(registrar, [image], instances=1)[0][0]
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
@@ -184,15 +178,14 @@ def test_bad_distances_raise(registrar, found):
             _ = registrar([found[0]], boxes, CAMERA, prior=prior)[0].rotation
 
 
-def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail():
+def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registrar, monkeypatch):
     """In a wide camera: the hint holds at the truck, and nowhere at the other proposals, which come first."""
-    registrar = cr.Registrar(bank(), pipeline=unrefined(bank()))
     image, box = pasted_scene(5, (200, 120), 0.45)
     K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5, dtype=torch.float64)
     alone = registrar([image], box[None], K)[0]
     prior = PosePrior(rotation=alone.rotation, within=2.0)
     far = torch.tensor([[4.0, 4.0, 44.0, 44.0], [4.0, 190.0, 44.0, 230.0]])
-    registrar.__dict__["detector"] = fixed(torch.cat([far, box[None]]), [9.0, 8.0, 7.0])
+    monkeypatch.setattr(registrar, "detector", fixed(torch.cat([far, box[None]]), [9.0, 8.0, 7.0]))
     result = registrar([image], camera_matrices=K, prior=prior)[0]
     assert result.ok
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
@@ -228,8 +221,7 @@ def test_detector_finds_the_object(seed, corner, scale):
     located = detector()(image)
     assert box_iou(located.boxes, box[None])[:2].max() > 0.6
     assert located.responses.diff().max() <= 0
-    assert len(located.boxes) == 20
-    assert located.boxes.dtype == torch.float32
+    assert (len(located.boxes), located.boxes.dtype) == (20, torch.float32)
     assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
 
 
@@ -284,13 +276,10 @@ def test_smallest_size(shape, least):
     assert 80.0 / max(scales) == pytest.approx(least)
 
 
-def squared_distances(points: torch.Tensor) -> torch.Tensor:
-    return (points[:, None] - points).square()
-
-
-def test_medoids_are_the_centres_of_clusters() -> None:
+def test_medoids_are_the_centres_of_clusters():
     points = torch.tensor([0.0, 0.1, 0.2, 5.0, 5.1, 5.2, 9.0, 9.1, 9.2])[torch.randperm(9)]
-    assert sorted(points[_medoids(squared_distances(points), 3)].tolist()) == pytest.approx([0.1, 5.1, 9.1])
+    medoids = _medoids((points[:, None] - points).square(), 3)
+    assert sorted(points[medoids].tolist()) == pytest.approx([0.1, 5.1, 9.1])
 
 
 @pytest.mark.parametrize(("score", "kept"), [(0.2, [0.9, 0.3]), (0.5, [0.9, 0.3]), (0.95, [0.95])])

@@ -1,6 +1,6 @@
 """A result does not depend on its batch, on what was registered before, or on the number of threads."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -13,13 +13,6 @@ from curvireg_torch.utils.threads import one_torch_thread
 from tests._support.scenes import CAMERA, scene
 
 IMAGES, BOXES = [scene(seed)[0] for seed in (0, 1)], torch.stack([scene(seed)[1] for seed in (0, 1)])
-
-
-@pytest.fixture(autouse=True)
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +31,10 @@ def numbers(result: Registration) -> list[torch.Tensor]:
     return [*poses, torch.tensor(values, dtype=torch.float64), result.ranking.scores, result.ranking.order]
 
 
-def test_registration_is_bit_identical_in_any_company(bank: ViewBank) -> None:
-    torch.set_num_threads(1)
+def test_registration_is_bit_identical_in_any_company(bank: ViewBank, threads: Callable[[int], None]) -> None:
+    threads(1)
     alone = [Registrar(bank)([i], b[None], CAMERA)[0] for i, b in zip(IMAGES, BOXES, strict=True)]
-    torch.set_num_threads(3)
+    threads(3)
     together = Registrar(bank)(IMAGES, BOXES, CAMERA)
     registrar = Registrar(bank)
     later = [registrar([IMAGES[k]], BOXES[k : k + 1], CAMERA)[0] for k in (1, 0)][::-1]
@@ -52,10 +45,10 @@ def test_registration_is_bit_identical_in_any_company(bank: ViewBank) -> None:
             assert all(map(torch.equal, numbers(one), numbers(other)))
 
 
-def test_detection_is_bit_identical_in_any_company(bank: ViewBank) -> None:
-    torch.set_num_threads(1)
+def test_detection_is_bit_identical_in_any_company(bank: ViewBank, threads: Callable[[int], None]) -> None:
+    threads(1)
     alone = Registrar(bank)(IMAGES[1:])[0]
-    torch.set_num_threads(2)
+    threads(2)
     together = Registrar(bank)(IMAGES)[1]
     assert torch.equal(alone.detection.boxes, together.detection.boxes)
     assert torch.equal(alone.rotation, together.rotation)

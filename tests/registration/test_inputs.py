@@ -2,22 +2,19 @@
 
 import weakref
 
-import cv2
-import pytest
 import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import inputs
 from curvireg_torch.registration.inputs import ImageItem, camera_warnings, image_items
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar
+from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar, write_photo
 
 VGA = (480, 640)
 
 
-@pytest.mark.parametrize(
-    ("camera", "size", "parts"),
-    [
+def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
+    for camera, size, parts in (
         ((325, 325, 572, 573), VGA, ["(572, 573) lies outside", "640 x 480", "seem to be swapped"]),
         ((572, 700, 573, 650), VGA, ["near the centre"]),  # inside the picture, but no swapped camera
         ((1450, 1450, 960, 540), VGA, ["belong to a picture of about 1921 x 1081 px; scale it"]),
@@ -27,33 +24,25 @@ VGA = (480, 640)
         ((572, 573, 325, 242), VGA, []),
         ((12799, 12799, 319.5, 239.5), VGA, []),
         ((600, 600, 0, 1), VGA, []),
-    ],
-)
-def test_camera_warnings_name_the_likely_mistake(camera, size, parts):
-    warnings = camera_warnings(camera_matrix(*camera), size)
-    text = "; ".join(warnings)
-    assert bool(warnings) == bool(parts)
-    for part in parts:
-        assert part in text
-
-
-@pytest.mark.parametrize(
-    ("box", "refused", "warned"),
-    [
+    ):
+        warnings = camera_warnings(camera_matrix(*camera), size)
+        text = "; ".join(warnings)
+        assert bool(warnings) == bool(parts)
+        for part in parts:
+            assert part in text
+    for box, refused, warned in (
         ([10, 10, 21.9, 200], True, True),
         ([10, 10, 22, 200], False, True),
         ([10, 10, 33.9, 200], False, True),
         ([10, 10, 34, 34], False, False),
         ([-50, 10, 11, 200], True, True),  # 11.5 px are inside the picture
         ([10, 400, 200, 491.5], False, False),
-    ],
-)
-def test_boxes_that_show_few_pixels_are_refused_or_questioned(box, refused, warned):
-    picture = torch.rand(1, *VGA)
-    assert bool(ImageItem(picture, torch.tensor(box).float(), None).warnings) == warned
-    item = image_items([picture], [box], None)[0]
-    assert isinstance(item, InvalidInputError) == refused
-    assert not refused or "at least 12 are needed" in str(item)
+    ):
+        picture = torch.rand(1, *VGA)
+        assert bool(ImageItem(picture, torch.tensor(box).float(), None).warnings) == warned
+        item = image_items([picture], [box], None)[0]
+        assert isinstance(item, InvalidInputError) == refused
+        assert not refused or "at least 12 are needed" in str(item)
 
 
 def test_result_with_a_questionable_camera_is_never_reliable(monkeypatch):
@@ -85,12 +74,10 @@ def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
     scenes = [scene(seed) for seed in range(6)]
     paths = [tmp_path / f"{seed}.png" for seed in range(6)]
     for path, (image, *_) in zip(paths, scenes, strict=True):
-        pixels = (255.0 * image).round().byte().permute(1, 2, 0).numpy()
-        assert cv2.imwrite(str(path), pixels[..., ::-1])
+        write_photo(path, image)
     registrar = truck_registrar(contours=False)
     results = registrar(paths, torch.stack([box for _, box, _ in scenes]), CAMERA)
     assert all(result.ok for result in results)
-    assert decoded.count(paths[0]) == 1
-    assert len(decoded) == len(paths)
+    assert (decoded.count(paths[0]), len(decoded)) == (1, len(paths))
     assert most[0] <= torch.get_num_threads() + 1
     assert len(alive) <= 1

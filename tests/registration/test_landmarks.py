@@ -1,5 +1,3 @@
-"""Poses and boxes from landmarks of a mesh's print."""
-
 import math
 from dataclasses import replace
 from functools import cache
@@ -220,14 +218,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmar
     assert len(poses) == len(count) == 0
 
 
-def test_a_second_place_with_landmarks_makes_the_first_less_certain():
-    """As two objects with similar prints do."""
-    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
-    assert alone == LANDMARK_PROBABILITY
-    assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
-
-
-def test_boxes_of_landmarks_are_the_first_proposals():
+def test_boxes_of_landmarks_are_the_first_proposals_less_certain_with_a_rival():
     T = pose(65.0, 0.4, 4.0)
     item = image_items([photograph(T)], None, K)[0]
     proposals = propose(registrar(), item)
@@ -236,6 +227,9 @@ def test_boxes_of_landmarks_are_the_first_proposals():
     (found,) = detect(registrar(), [item.image], K)[0]
     assert found.detection.score == LANDMARK_PROBABILITY
     near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
-    assert proposals.by_landmarks == 1
-    assert propose(registrar(), near).by_landmarks == 0
+    assert (proposals.by_landmarks, propose(registrar(), near).by_landmarks) == (1, 0)
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
+    # As two objects with similar prints do.
+    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
+    assert alone == LANDMARK_PROBABILITY
+    assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))

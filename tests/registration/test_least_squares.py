@@ -8,23 +8,8 @@ import trimesh
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
+from curvireg_torch.registration import least_squares as ls
 from curvireg_torch.registration.confidence import COVARIANCE_SCALE
-from curvireg_torch.registration.least_squares import (
-    CELL_SIDE,
-    MIN_MATCHES,
-    POINT_ERROR,
-    SHARED_ERROR,
-    Measurements,
-    PointMatches,
-    apply_twist,
-    damped_solution,
-    fit_points,
-    least_squares_step,
-    nearest_rigid,
-    pixels,
-    pose_covariance,
-    project,
-)
 from curvireg_torch.rendering.contours import ContourPoints
 from tests.registration.cube import K, fitted, pose, silhouette
 
@@ -36,13 +21,13 @@ def test_project_and_its_derivative():
     T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
 
     def moved(step: torch.Tensor) -> torch.Tensor:
-        return project(points, apply_twist(T, step[None], centre), K[None], centre)[0][0]
+        return ls.project(points, ls.apply_twist(T, step[None], centre), K[None], centre)[0][0]
 
     # Not at zero, where the angle of an axis-angle vector is not differentiable.
     expected = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
-    uv, derivative = project(points, T, K[None], centre)
+    uv, derivative = ls.project(points, T, K[None], centre)
     torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
-    torch.testing.assert_close(pixels(points, T, K[None], centre), uv)
+    torch.testing.assert_close(ls.pixels(points, T, K[None], centre), uv)
     torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
 
 
@@ -55,40 +40,41 @@ def test_long_steps_are_shortened(rotation, translation, fraction):
     T, centre = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None], torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
     step = torch.tensor([[*rotation, *(6.5 * t for t in translation)]], dtype=torch.float64)
     A = torch.eye(6, dtype=torch.float64)[None]
-    torch.testing.assert_close(least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
+    torch.testing.assert_close(ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
 
 
 def test_damping_shortens_each_direction_alike():
     A = torch.diag(torch.tensor([1.0, 100.0, 1e4, 1.0, 1.0, 1.0], dtype=torch.float64))[None]
-    x = damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
+    x = ls.damped_solution(A, A @ torch.ones(1, 6, 1, dtype=torch.float64), 0.25)
     torch.testing.assert_close(x, torch.full((1, 6), 0.8, dtype=torch.float64))
-    assert damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
+    assert ls.damped_solution(0 * A, torch.zeros(1, 6, 1).double(), 0.01).tolist() == [[0.0] * 6]
 
 
 def test_points_need_a_minimum_of_matches():
     T, truth = pose([0.0] * 3, [0.0, 0.0, 6.0])[None], pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
     points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    uv = pixels(points, truth, K[None], ZERO)
-    for count, expected in ((MIN_MATCHES - 1, T), (MIN_MATCHES, truth)):
+    uv = ls.pixels(points, truth, K[None], ZERO)
+    for count, expected in ((ls.MIN_MATCHES - 1, T), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
-        found = fit_points(PointMatches(points, uv, weight), T, K[None], ZERO, [8.0] * 8)
+        found = ls.fit_points(ls.PointMatches(points, uv, weight), T, K[None], ZERO, [8.0] * 8)
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
 
 
 def test_inlier_ratio_counts_all_points():
     T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
     points = torch.rand(1, 10, 3, dtype=torch.float64) - 0.5
-    uv, weight = pixels(points, T, K[None], ZERO), torch.ones(1, 10)
+    uv, weight = ls.pixels(points, T, K[None], ZERO), torch.ones(1, 10)
     uv[:, :2], uv[:, 2] = uv[:, :2] + 500.0, uv[:, 2] + torch.tensor([2.0, 0.0])
     weight[:, 3:5] = 0.0  # not found
-    assert PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO) == pytest.approx((5 + 0.25) / 10, abs=1e-4)
+    ratio = ls.PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO)
+    assert ratio == pytest.approx((5 + 0.25) / 10, abs=1e-4)
 
 
 def test_nearest_rigid_pose_is_orthogonal():
     T = pose([0.3, -0.2, 0.5], [1.0, 2.0, 3.0])[None]
     drifted = T.clone()
     drifted[:, :3, :3] *= 1.001
-    torch.testing.assert_close(nearest_rigid(drifted), T)
+    torch.testing.assert_close(ls.nearest_rigid(drifted), T)
 
 
 def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -97,7 +83,7 @@ def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.
     T, centre = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None], torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
-    J = (normals[..., None, :] @ project(model, T, K[None], centre)[1])[..., 0, :]
+    J = (normals[..., None, :] @ ls.project(model, T, K[None], centre)[1])[..., 0, :]
     everywhere = torch.ones(1, count, dtype=torch.bool)
     return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
 
@@ -107,7 +93,7 @@ def test_covariance_in_closed_form():
     points, T, centre, J = cloud(60)
     generator = torch.Generator().manual_seed(1)
     W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
-    C, known = pose_covariance(Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     assert int(known) == 6
 
     def moved(step: torch.Tensor) -> torch.Tensor:
@@ -116,8 +102,8 @@ def test_covariance_in_closed_form():
 
     derivative = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
     rows, w, r = (points.normals[0, :, None] @ derivative)[:, 0], W[0], d[0]
-    B = rows.T @ (w * w * rows) * (POINT_ERROR**2 + SHARED_ERROR * float((w * r * r).sum() / w.sum()))
-    cells = (project_points(points.model[0], T[0], K) / CELL_SIDE).floor()
+    B = rows.T @ (w * w * rows) * (ls.POINT_ERROR**2 + ls.SHARED_ERROR * float((w * r * r).sum() / w.sum()))
+    cells = (project_points(points.model[0], T[0], K) / ls.CELL_SIDE).floor()
     for cell in cells.unique(dim=0):
         g = (w * r * rows)[(cells == cell).all(dim=1)].sum(dim=0)
         B += g[:, None] * g
@@ -129,19 +115,15 @@ def test_covariance_in_closed_form():
 def test_covariance_needs_a_minimum_of_weight(factor, known):
     points, T, centre, J = cloud(60)
     W, d = torch.full((1, 60, 1), factor * 0.1, dtype=torch.float64), torch.full((1, 60, 1), 0.1, dtype=torch.float64)
-    C, directions = pose_covariance(Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    C, directions = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
     assert bool(C.isfinite().all()) == bool(directions > 0) == known
-
-
-def silhouette_fit(mesh: trimesh.Trimesh, axis_angle: list[float]):
-    T = pose(axis_angle, [0.1, 0.0, 8.0])
-    off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
-    return T, fitted(silhouette(mesh, T), apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
 
 
 @pytest.mark.parametrize("axis_angle", [[1.0, 0.3, 0.2], [1.9, -0.4, 0.3]])
 def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle):
-    T, fit = silhouette_fit(trimesh.creation.cylinder(0.5, 1.4, sections=96), axis_angle)
+    mesh, T = trimesh.creation.cylinder(0.5, 1.4, sections=96), pose(axis_angle, [0.1, 0.0, 8.0])
+    off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
+    fit = fitted(silhouette(mesh, T), ls.apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
     assert 4 <= int(fit.observable) <= 5
     C = fit.covariance[0, :3, :3]
     axis = fit.transform[0, :3, 2]

@@ -19,11 +19,6 @@ ONE, TRUTH = ([IMAGE], BOX[None], CAMERA), T[:3, :3]
 AZIMUTH = float(viewpoint_from_rotation(TRUTH)[0])
 
 
-@pytest.fixture(scope="module")
-def registrar():
-    return truck_registrar()
-
-
 def around(azimuth, tolerance):
     return PosePrior(azimuth=((azimuth - tolerance) % 360, (azimuth + tolerance) % 360))
 
@@ -37,21 +32,16 @@ def test_every_hypothesis_lies_within_hard_limits(pipeline):
     assert result.prior_contradiction == "better outside"
 
 
-def test_each_photograph_has_its_own_prior(registrar):
-    priors = [None, around(AZIMUTH + 180.0, 40.0)]
-    free, limited = registrar([IMAGE, IMAGE], BOX.repeat(2, 1), CAMERA, prior=priors)
+def test_each_photograph_has_its_own_prior_which_may_leave_no_view():
+    registrar = truck_registrar()
+    priors = [None, around(AZIMUTH + 180.0, 40.0), PosePrior(elevation=(85, 90), theta=(90, 91))]
+    free, limited, failed = registrar([IMAGE] * 3, BOX.repeat(3, 1), CAMERA, prior=priors)
     assert float(rotation_error(free.rotation, TRUTH)) < 5.0
     assert float(priors[1].excess(limited.rotation)) <= 3.0
-    with pytest.raises(InvalidInputError, match="prior: expected a PosePrior, or a list of 2"):
-        registrar([IMAGE, IMAGE], BOX.repeat(2, 1), CAMERA, prior=priors[:1])
-
-
-def test_prior_that_leaves_no_view_fails_that_photograph_alone(registrar):
-    nowhere = PosePrior(elevation=(85, 90), theta=(90, 91))
-    failed, fine = registrar([IMAGE, IMAGE], BOX.repeat(2, 1), CAMERA, prior=[nowhere, None])
     assert not failed.ok
     assert "no view of the bank" in str(failed.error)
-    assert fine.ok
+    with pytest.raises(InvalidInputError, match="prior: expected a PosePrior, or a list of 3"):
+        registrar([IMAGE] * 3, BOX.repeat(3, 1), CAMERA, prior=priors[:1])
 
 
 def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
@@ -81,19 +71,15 @@ def pose_at(away=1.5, degrees=0.0) -> Poses:
     return Poses.at(pose, CAMERA[None], describer.centre, index, one)
 
 
-def test_fitted_poses_up_to_three_degrees_outside_are_kept():
+def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():
     limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
     assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
+    words = [limits.contradiction(pose_at(degrees=d), pose_at(), better_outside=False) for d in (8.9, 9.1, 11.0)]
+    assert words == [None, "at the limit", "at the limit"]
 
 
 # Limits of which one moves a rotation out of another
 COMBINED = PosePrior(azimuth=(20.0, 40.0), elevation=(50.0, 70.0), theta=(-5.0, 5.0))
-
-
-@pytest.mark.parametrize(("degrees", "word"), [(8.9, None), (9.1, "at the limit"), (11.0, "at the limit")])
-def test_poses_within_a_degree_of_a_limit_lie_at_it(degrees, word):
-    limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
-    assert limits.contradiction(pose_at(degrees=degrees), pose_at(), better_outside=False) == word
 
 
 def test_poses_are_turned_into_all_limits_about_their_centre():
@@ -137,37 +123,26 @@ def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
 DISTANCE = float(T[:3, 3].norm())  # of the origin, which is near the centre
 
 
-def centre_distances(result, registrar):
-    centre = registrar.describer.centre
-    return [float((h.rotation @ centre + h.translation).norm()) for h in result.hypotheses]
-
-
 @pytest.mark.parametrize("pipeline", [{}, {"contours": False}], ids=str)
 @pytest.mark.parametrize("factors", [(0.5, 0.7), (1.4, 2.0)])
 def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     registrar = truck_registrar(**pipeline)
     near, far = (factor * DISTANCE for factor in factors)
     result = registrar(*ONE, prior=PosePrior(distance=(near, far)))[0]
-    for distance in centre_distances(result, registrar):
+    for hypothesis in result.hypotheses:
+        distance = float((hypothesis.rotation @ registrar.describer.centre + hypothesis.translation).norm())
         assert 0.97 * near <= distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
     assert not result.reliable
 
 
-def test_fitted_poses_up_to_three_percent_too_far_are_kept():
+def test_limits_on_the_distance_keep_contradict_and_move_poses():
+    """Fitted poses up to 3 % too far are kept, and others move along their ray; a box may ask for 10 % more."""
     limits = limits_of(PosePrior(distance=(1.0, 2.0)))
     kept = [bool(limits.keeps(pose_at(away))) for away in (0.969, 0.972, 2.055, 2.065)]
     assert kept == [False, True, True, False]
-
-
-@pytest.mark.parametrize(("away", "outside"), [(0.89, True), (0.92, False), (2.19, False), (2.21, True)])
-def test_box_that_asks_for_a_distance_far_outside_is_reported(away, outside):
-    limits = limits_of(PosePrior(distance=(1.0, 2.0)))
-    word = limits.contradiction(pose_at(1.5), pose_at(away), better_outside=False)
-    assert word == ("better outside" if outside else None)
-
-
-def test_poses_move_along_the_ray_to_an_allowed_distance():
-    limits = limits_of(PosePrior(distance=(1.0, 2.0)))
+    asked = [pose_at(away) for away in (0.89, 0.92, 2.19, 2.21)]
+    words = [limits.contradiction(pose_at(1.5), pose, better_outside=False) for pose in asked]
+    assert words == ["better outside", None, None, "better outside"]
     for away, expected in ((0.5, 1.0), (1.5, 1.5), (9.0, 2.0)):
         torch.testing.assert_close(limits.moved_inside(pose_at(away)).T, pose_at(expected).T)

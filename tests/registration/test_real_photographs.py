@@ -1,8 +1,5 @@
 """Real photographs and a video, default pipeline: the poses agree with the annotations in frame and unit.
-
-These photographs are registered correctly by a wide margin; docs/accuracy.md has fractions of correct results. The
-tests take about two minutes on one core, mostly for banks of any orientation.
-"""
+They are registered correctly by a wide margin; docs/accuracy.md has fractions. The tests take two minutes on a core."""
 
 import json
 from dataclasses import dataclass

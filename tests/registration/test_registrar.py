@@ -13,11 +13,12 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration
+from curvireg_torch.registration import FailedRegistration, Follower
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
 from curvireg_torch.registration.inputs import ImageItem, check_crop
+from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
 
@@ -25,20 +26,10 @@ IMAGES, BOXES, TRUTHS = zip(*(scene(seed) for seed in range(6)), strict=True)
 IMAGE, BOX, TRUTH = scene(0)
 
 
-def ranking_registrar() -> Registrar:
-    """A quick one, which reports views of the bank."""
-    return truck_registrar(contours=False)
-
-
-@pytest.fixture(scope="module")
-def registered() -> tuple[list, list]:
+def test_poses_of_synthetic_scenes():
     """Six scenes of known truth, before and after refinement."""
-    return tuple(
-        registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in (ranking_registrar(), truck_registrar())
-    )
-
-
-def test_poses_of_synthetic_scenes(registered):
+    registrars = truck_registrar(contours=False), truck_registrar()
+    registered = [registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in registrars]
     coarse, fine = (
         torch.stack([rotation_error(r.rotation, T[:3, :3]) for r, T in zip(results, TRUTHS, strict=True)])
         for results in registered
@@ -60,6 +51,10 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 5
     with pytest.raises(InvalidInputError, match="empty list"):
         Registrar([])
+    with pytest.raises(InvalidInputError, match="knows one mesh"):
+        Registrar([truck_bank()] * 2, renderer=make_renderer(example_mesh()))
+    with pytest.raises(InvalidInputError, match="one mesh"):
+        Follower(Registrar([truck_bank()] * 2), CAMERA)
 
 
 def test_flat_mesh_without_colours_warns():
@@ -75,7 +70,7 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
     grey, four = torch.full((3, 50, 50), 0.3), torch.zeros(4, 9, 9)
     images = [IMAGE, grey, nan, IMAGE, tmp_path / "none.png", IMAGE * 255, four, IMAGE]
     boxes = torch.stack([BOX, torch.tensor([5.0, 5, 40, 40]), BOX, -BOX, BOX, BOX, BOX, BOX])
-    results = ranking_registrar()(images, boxes, CAMERA)
+    results = truck_registrar(contours=False)(images, boxes, CAMERA)
     assert [result.ok for result in results] == [True, False, False, False, False, False, False, True]
     assert results[0].rotation.equal(results[7].rotation)
     messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
@@ -158,18 +153,15 @@ def test_origin_of_the_mesh_may_be_far_away():
     assert float((position - TRUTH[:3, 3]).norm() / TRUTH[:3, 3].norm()) < 0.02
 
 
-def test_registrar_accepts_tensors_arrays_and_paths(tmp_path):
+def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_path):
     pixels = (IMAGE * 255).round().byte()
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
     images = [pixels, array, array.astype("float32") / 255, tmp_path / "photo.png", str(tmp_path / "photo.png")]
-    first, *others = ranking_registrar()(images, [BOX.tolist()] * 5)
+    first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
     for result in others:
         torch.testing.assert_close(result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4)
-
-
-def test_registrar_rejects_bad_calls():
-    registrar = ranking_registrar()
+    registrar = truck_registrar(contours=False)
     with pytest.raises(InvalidInputError, match="focal"):
         _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[0].rotation
     for images, boxes, camera, message in (
@@ -230,17 +222,13 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
         Registrar(bank, progress=cancel)([IMAGE])
 
 
-EDGES = torch.tensor([-0.1, 0.2, 0.1, 0.15])  # Errors of a box's edges, as fractions of its sides
-WRONG = BOX + EDGES * (BOX[2:] - BOX[:2]).repeat(2)
-
-
-def uncorrected(box):
-    return truck_registrar(box_jitter=0.0)([IMAGE], box[None], CAMERA)[0]
+WRONG = BOX + torch.tensor([-0.1, 0.2, 0.1, 0.15]) * (BOX[2:] - BOX[:2]).repeat(2)
 
 
 def test_wrong_box_is_corrected():
     registrar = truck_registrar()
-    result, before = registrar([IMAGE], WRONG[None], CAMERA)[0], uncorrected(WRONG)
+    result = registrar([IMAGE], WRONG[None], CAMERA)[0]
+    before = truck_registrar(box_jitter=0.0)([IMAGE], WRONG[None], CAMERA)[0]
     assert before.corrected_box is None
     assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
     assert result.score > before.score
@@ -255,7 +243,7 @@ def test_wrong_box_is_corrected():
 def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evidence):
     """Evidence that depends on the box, as the rank does, is not compared."""
     registrar = truck_registrar()
-    one = uncorrected(BOX)
+    one = truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
     first, other = (
         replace(one, hypotheses=(replace(one.hypotheses[0], evidence=one.hypotheses[0].evidence | {**known}),))
         for known in ({"similarity": 0.7, "rank": 0.0}, {"similarity": 0.7, "rank": -3.0} | evidence)
@@ -270,9 +258,7 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
 AZIMUTHS = (15.0, 45.0, 75.0, 225.0)  # Half-way between two views of a coarse bank, so that both lead to the same pose
 
 
-@pytest.fixture(scope="module")
-def coarse():
-    """A registrar with views 30 degrees apart, photographs and boxes."""
+def test_hypotheses_that_merge_are_put_back_and_come_last():
     mesh, images, boxes = example_mesh(), [], []
     for azimuth in AZIMUTHS:
         R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
@@ -281,21 +267,12 @@ def coarse():
         images.append(image)
         boxes.append(box)
     views = sample_views(azimuth_step=30, elevations=[20])
-    bank = ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
-    return Registrar(bank), images, torch.stack(boxes)
-
-
-def angle_moved(registrar, hypothesis) -> float:
-    """Degrees from the view that the hypothesis started from."""
-    view = registrar.bank.rotations[hypothesis.view].double()
-    return float(rotation_error(hypothesis.allocentric_rotation, view))
-
-
-def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
-    registrar, images, boxes = coarse
+    registrar = Registrar(ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False))
     restored = 0
-    for result in registrar(images, boxes, CAMERA):
-        is_moved = [angle_moved(registrar, h) > 0.01 for h in result.hypotheses]
+    for result in registrar(images, torch.stack(boxes), CAMERA):
+        starts = (registrar.bank.rotations[h.view].double() for h in result.hypotheses)
+        moves = (rotation_error(h.allocentric_rotation, R) for h, R in zip(result.hypotheses, starts, strict=True))
+        is_moved = [float(degrees) > 0.01 for degrees in moves]
         assert is_moved[0]
         assert is_moved == sorted(is_moved, reverse=True)
         assert result.hypotheses[0].covariance is not None
@@ -304,35 +281,25 @@ def test_hypotheses_that_merge_are_put_back_and_come_last(coarse):
     assert restored > 0
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "message"),
-    [
-        (0.4, 0.4 + 0.9 / 255.0, "one colour"),
-        (0.2, 1.01, r"outside \[0, 1\]"),
-        (-0.01, 0.8, r"outside \[0, 1\]"),
-        (0.4, 0.4 + 2.0 / 255.0, None),
-        (-0.0005, 1.0005, None),
-    ],
-)
-def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce(low, high, message):
-    crop = torch.full((3, 8, 8), low)
-    crop[:, 2:5, 3] = high
-    with pytest.raises(ImageError, match=message) if message else nullcontext():
-        check_crop(crop)
+def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
+    outside, allowed = r"outside \[0, 1\]", ((0.4, 0.4 + 2.0 / 255.0, None), (-0.0005, 1.0005, None))
+    refused = (0.4, 0.4 + 0.9 / 255.0, "one colour"), (0.2, 1.01, outside), (-0.01, 0.8, outside)
+    for low, high, message in (*refused, *allowed):
+        crop = torch.full((3, 8, 8), low)
+        crop[:, 2:5, 3] = high
+        with pytest.raises(ImageError, match=message) if message else nullcontext():
+            check_crop(crop)
 
 
-@pytest.mark.parametrize(
-    ("size", "given", "box", "expected"),
-    [
+def test_boxes_are_compared_inside_the_photograph():
+    for size, given, box, expected in (
         ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
         ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
         ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
-    ],
-)
-def test_boxes_are_compared_inside_the_photograph(size, given, box, expected):
-    item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
-    assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
+    ):
+        item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
+        assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):

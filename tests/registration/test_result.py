@@ -27,20 +27,9 @@ def registration(covariance=None, confidence=0.9, detection=None):
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
     eye = torch.eye(3, dtype=torch.float64)
-    hypotheses = tuple(
-        Hypothesis(
-            rotation=eye,
-            translation=2.0 * eye[2],
-            score=0.7 - 0.1 * view,
-            evidence={"rank": 0.0},
-            allocentric_rotation=eye,
-            distance=2.0,
-            projection=(torch.eye(4, dtype=torch.float64), eye),
-            view=view,
-            covariance=covariance,
-        )
-        for view in (0, 1)
-    )
+    common = {"rotation": eye, "translation": 2.0 * eye[2], "allocentric_rotation": eye, "distance": 2.0}
+    common |= {"evidence": {"rank": 0.0}, "projection": (torch.eye(4).double(), eye), "covariance": covariance}
+    hypotheses = tuple(Hypothesis(**common, score=0.7 - 0.1 * view, view=view) for view in (0, 1))
     return Registration(hypotheses, (confidence, 0.0), ranking, detection=detection)
 
 
@@ -88,44 +77,31 @@ def test_detection_document_reports_the_score_of_the_most_certain_instance():
     assert [one["response"] for one in document["proposals"]] == [7.0, 6.5]
 
 
-@pytest.mark.parametrize(
-    ("contradiction", "words"), [(None, ""), ("better outside", "much better outside"), ("at the limit", "at one of")]
-)
-def test_remarks_name_a_contradicted_prior(contradiction, words):
-    lines = remarks({"corrected_box": None, "prior": {"azimuth": [0, 9], "contradiction": contradiction}})
-    assert len(lines) == bool(words)
-    assert words in "".join(lines)
-
-
-def test_remarks_print_the_replaced_box_in_whole_pixels():
-    assert remarks({"corrected_box": None}) == []
+def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels():
+    prior = {"azimuth": [0, 9], "contradiction": None}
+    assert remarks({"corrected_box": None}) == remarks({"corrected_box": None, "prior": prior}) == []
+    for contradiction, words in (("better outside", "much better outside"), ("at the limit", "at one of")):
+        (line,) = remarks({"corrected_box": None, "prior": {**prior, "contradiction": contradiction}})
+        assert words in line
     (line,) = remarks({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
     assert line.endswith(": 1 3 30 41")
 
 
-@pytest.mark.parametrize(
-    ("viewpoint", "words"),
-    [
+def test_pose_and_verdict_in_words():
+    for viewpoint, words in (
         ((0, 0, 0), "seen from the front (azimuth 0°), level"),
         ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
         ((225, 30, -40), "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the right"),
         ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
         ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
-    ],
-)
-def test_pose_in_words(viewpoint, words):
-    R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
-    assert pose_in_words(R) == words
-    for up, front in (("y", None), ("-x", None), ("z", "x")):
-        assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
-
-
-def test_verdict_has_three_words():
-    """A high confidence that is not reliable, because of a questionable camera, is no reason to be sure."""
-    assert verdict(0.95, 0.03, True) == "likely"
-    assert verdict(0.95, 0.03, False) == "unsure"
-    assert verdict(0.4, 0.39, False) == "unsure"
-    assert verdict(0.4, 0.41, False) == "no match"
+    ):
+        R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+        assert pose_in_words(R) == words
+        for up, front in (("y", None), ("-x", None), ("z", "x")):
+            assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
+    # A high confidence that is not reliable, because of a questionable camera, is no reason to be sure.
+    assert (verdict(0.95, 0.03, True), verdict(0.95, 0.03, False)) == ("likely", "unsure")
+    assert (verdict(0.4, 0.39, False), verdict(0.4, 0.41, False)) == ("unsure", "no match")
     assert verdict(None, None, False) == "unsure"
 
 
@@ -133,46 +109,26 @@ def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
     return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
 
 
-@pytest.mark.parametrize(
-    ("rotations", "word"),
-    [
-        (turned(10.0), None),
-        (turned(10.0, 190.0), "half turn"),
-        (turned(40.0, 320.0), "mirror"),
-        (turned(40.0, 100.0), "several"),
-        (turned(0.0, 120.0, 240.0), "several"),
-    ],
-)
-def test_ambiguity(rotations, word):
-    assert ambiguity(rotations) == word
-
-
-@pytest.mark.parametrize(("second", "word"), [(0.31, "mirror"), (0.29, None)])
-def test_ambiguous_names_rivals_that_are_half_as_probable(second, word):
+def test_ambiguity():
+    azimuths = (10.0,), (10.0, 190.0), (40.0, 320.0), (40.0, 100.0), (0.0, 120.0, 240.0)
+    assert [ambiguity(turned(*some)) for some in azimuths] == [None, "half turn", "mirror", "several", "several"]
+    # Rivals that are half as probable:
     found = registration()
-    hypotheses = tuple(
-        replace(h, allocentric_rotation=R) for h, R in zip(found.hypotheses, turned(40.0, 320.0), strict=True)
-    )
-    result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
-    assert result.ambiguous == word
-    assert result.none == pytest.approx(0.4 - second)
+    pairs = zip(found.hypotheses, turned(40.0, 320.0), strict=True)
+    hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
+    for second, word in ((0.31, "mirror"), (0.29, None)):
+        result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
+        assert (result.ambiguous, result.none) == (word, pytest.approx(0.4 - second))
 
 
-def test_reliable_needs_confidence_no_warnings_and_no_better_pose_outside_the_limits():
+def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
     sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
     assert sure.reliable
-    for change in (
-        {"probabilities": (0.89, 0.0)},
-        {"probabilities": ()},
-        {"warnings": ("the camera is questionable",)},
-        {"prior_contradiction": "better outside"},
-    ):
+    changes = [{"warnings": ("the camera is questionable",)}, {"prior_contradiction": "better outside"}]
+    for change in ({"probabilities": (0.89, 0.0)}, {"probabilities": ()}, *changes):
         assert not replace(sure, **change).reliable
     assert replace(sure, prior_contradiction="at the limit").reliable
-
-
-def test_reliable_needs_a_rotation_that_contours_determine():
-    """Not where all three rotations are unknown, as those of a sphere."""
+    # Not where all three rotations are unknown, as those of a sphere.
     variances = torch.tensor([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
     sphere = registration(covariance=torch.diag(variances), confidence=0.95)
     fitted = replace(sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses))

@@ -1,5 +1,6 @@
-"""The tracker: each measurement alone on drawn objects, and together on generated sequences."""
+"""The tracker: each measurement alone on drawn objects and in closed form, and together on generated sequences."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,28 +17,32 @@ from curvireg_torch.registration import tracker
 from curvireg_torch.registration.edges import CROP_SIZE
 from curvireg_torch.registration.least_squares import fit_points, pixels
 from curvireg_torch.registration.texture_fit import surface_corners
-from curvireg_torch.registration.tracker import FLOW_SCALES, Frame, Keyframe, Tracker, track_points
+from curvireg_torch.registration.tracker import (
+    FLOW_SCALES,
+    HALF_RATE_COUNT,
+    Frame,
+    Keyframe,
+    RegionModel,
+    Tracker,
+    colour_bins,
+    line_posterior,
+    track_points,
+)
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, sequence
+from tests.registration.cube import cube, pose
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
 SIZE = (240, 320)
-START = transform(
-    rotation_from_axis_angle(torch.tensor([0.4, 0.5, 0.1], dtype=torch.float64)),
-    torch.tensor([0.0, 0.0, 6.0], dtype=torch.float64),
-)
+START = pose([0.4, 0.5, 0.1], [0.0, 0.0, 6.0])
 WINDOW_K = torch.tensor([[[400.0, 0, 127.5], [0, 400.0, 127.5], [0, 0, 1]]], dtype=torch.float64)
 ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 def make_tracker(mesh):
     return Tracker(make_renderer(mesh), MeshContours(mesh), extreme_points(mesh))
-
-
-def cube():
-    return trimesh.creation.box((1.0, 1.4, 0.8))
 
 
 def moved(T, angles, shift):
@@ -65,9 +70,8 @@ def plate(x: float = 0.0, y: float = 0.0):
     T = transform(torch.eye(3, dtype=torch.float64), torch.tensor([x, y, 5.0], dtype=torch.float64))[None]
     size = (CROP_SIZE, CROP_SIZE)
     depth = make_renderer(trimesh.creation.box((2.0, 2.0, 0.01))).render(T, WINDOW_K, size)
-    smooth = torch.nn.functional.interpolate(
-        torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0)), size=1024, mode="bicubic"
-    )[0, 0]
+    rough = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
+    smooth = torch.nn.functional.interpolate(rough, size=1024, mode="bicubic")[0, 0]
     v, u = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
     shift = 80.0 * torch.tensor([x, y])
     look = smooth[(v - shift[1] + 300).long(), (u - shift[0] + 300).long()]  # shifts of whole pixels
@@ -99,7 +103,7 @@ def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
     assert flow.inlier_ratio(T, WINDOW_K, ZERO) < 0.05  # 14 px beside
 
 
-def test_flow_that_does_not_lead_back_is_left_out():
+def test_flow_that_does_not_lead_back_is_left_out_and_a_uniform_surface_has_none():
     """The right half of the plate is covered by another print."""
     window, T, depth = plate()
     covered = framed(window.grey.copy())
@@ -108,34 +112,17 @@ def test_flow_that_does_not_lead_back_is_left_out():
     right = flow.model[0, :, 0] > 0.1
     assert float((flow.weight[0, right] > 0).double().mean()) < 0.2
     assert float((flow.weight[0, ~right] > 0).double().mean()) > 0.7
-
-
-def test_uniform_surface_has_no_corners_and_no_flow():
-    window, T, depth = plate()
     bare = framed(np.full_like(window.grey, 90))
     flow = track_points(keyframe_of(bare, T, depth), window, T, ZERO, levels=1)
-    assert flow.uv.shape == (1, 0, 2)
-    assert flow.inlier_ratio(T, WINDOW_K, ZERO) == 0.0
+    assert (flow.uv.shape, flow.inlier_ratio(T, WINDOW_K, ZERO)) == ((1, 0, 2), 0.0)
     assert torch.equal(fit_points(flow, T, WINDOW_K, ZERO, FLOW_SCALES), T)
 
 
-@pytest.fixture
-def only_colours(monkeypatch):
-    """Weights of points become 0, that of edges nearly so."""
-    for name in ("POINT_WEIGHT", "KEYFRAME_WEIGHT"):
-        monkeypatch.setattr(tracker, name, 0.0)
-    monkeypatch.setattr(tracker, "REGION_WEIGHT", 1e6)
-
-
-@pytest.fixture
-def only_edges(monkeypatch):
-    for name in ("POINT_WEIGHT", "KEYFRAME_WEIGHT", "REGION_WEIGHT"):
-        monkeypatch.setattr(tracker, name, 0.0)
-
-
-@pytest.mark.parametrize("measurement", ["only_edges", "only_colours"])
-def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(request, measurement):
-    request.getfixturevalue(measurement)
+@pytest.mark.parametrize("weight", [0.0, 1e6], ids=["edges", "colours"])
+def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(monkeypatch, weight):
+    """Without points, and without colours or nearly without edges."""
+    for name, value in (("POINT_WEIGHT", 0.0), ("KEYFRAME_WEIGHT", 0.0), ("REGION_WEIGHT", weight)):
+        monkeypatch.setattr(tracker, name, value)
     truth = moved(START, [0.0, 0.0, 0.03], [0.03, -0.02, 0.0])
     follow = make_tracker(cube())
     follow.start(drawn(START), K, START)
@@ -156,7 +143,7 @@ def test_prediction_goes_on_at_constant_velocity():
     assert error < 0.1 * step
 
 
-def test_tracker_follows_a_generated_sequence():
+def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
     frames = sequence(8)
     follow = make_tracker(example_mesh())
     follow.start(frames[0][0], CAMERA, frames[0][2])
@@ -172,6 +159,8 @@ def test_tracker_follows_a_generated_sequence():
         C = follow.covariance(found)
         assert float(torch.linalg.eigvalsh(C).min()) > 0
         assert float(torch.rad2deg(C[:3, :3].diagonal().sqrt()).max()) < 20.0
+    noise = torch.rand(frames[0][0].shape, generator=torch.Generator().manual_seed(1))
+    assert follow.track(noise, CAMERA).confidence < 0.2
 
 
 def test_covariance_counts_edges_near_the_pose():
@@ -182,16 +171,6 @@ def test_covariance_counts_edges_near_the_pose():
     there, beside = (follow.covariance(follow.measure(drawn(START), K, T)) for T in (START, near))
     assert bool(there.isfinite().all())
     assert bool(beside.isnan().all())
-
-
-def test_confidence_falls_where_the_object_is_absent():
-    frames = sequence(2)
-    follow = make_tracker(example_mesh())
-    follow.start(frames[0][0], CAMERA, frames[0][2])
-    there = follow.track(frames[1][0], CAMERA)
-    noise = torch.rand(frames[1][0].shape, generator=torch.Generator().manual_seed(1))
-    absent = follow.track(noise, CAMERA)
-    assert absent.confidence < 0.2 < 0.5 < there.confidence
 
 
 def test_pose_outside_the_image_is_lost():
@@ -213,3 +192,47 @@ def test_frames_from_other_directions_become_keyframes():
         follow.accept(follow.measure(image, CAMERA, T))
     angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
     assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
+
+
+def test_posterior_is_that_of_bayes():
+    ratio = torch.tensor([[0.3, -0.2, 0.9, -1.1, 0.4]], dtype=torch.float64)
+    likelihood = [math.exp(0.3), math.exp(0.1), math.exp(1.0), math.exp(-0.1)]  # ends at -1.5, -0.5, 0.5, 1.5
+    p = torch.tensor(likelihood) / sum(likelihood)
+    d = torch.tensor([-1.5, -0.5, 0.5, 1.5])
+    mean, variance = line_posterior(ratio, 2)
+    assert float(mean) == pytest.approx(float((p * d).sum()), abs=1e-6)
+    assert float(variance) == pytest.approx(float((p * d**2).sum() - (p * d).sum() ** 2), abs=1e-6)
+
+
+def halves():
+    """A red left half and a green right half; pixel columns of 8 lines that point to the right from the middle."""
+    colours = torch.zeros(1, 3, 16, 16)
+    colours[:, 0, :, :8], colours[:, 1, :, 8:] = 1.0, 1.0
+    y, x = torch.meshgrid(torch.arange(4.0, 12.0), torch.arange(16.0), indexing="ij")
+    return colour_bins(colours), torch.stack([x, y], dim=-1)
+
+
+def test_log_ratio_has_the_sign_of_the_learned_colours():
+    bins, uv = halves()
+    model, zero = RegionModel(), torch.zeros(8)
+    model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten())
+    ratio = model.log_ratio(bins, uv, zero)
+    assert (ratio[:, :8] > 0.3).all()
+    assert (ratio[:, 8:] < -0.3).all()
+    opposite = model.log_ratio(bins, uv, zero + math.pi)  # nothing learned there but the mean of all directions
+    assert (opposite[:, :8] > 0.1).all()
+    assert (opposite[:, :8] < ratio[:, :8]).all()
+    outside = model.log_ratio(bins, uv - 100.0, zero)
+    assert (outside == 0).all()
+
+
+def test_histograms_move_by_the_rate_towards_new_colours():
+    bins, uv = halves()
+    model, directions = RegionModel(), torch.zeros(128)
+    red, green = bins[0, 0], bins[0, 15]
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten())
+    assert float(model._histograms[0, 0, red]) == 1.0
+    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten())  # the colours swap
+    step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
+    assert float(model._histograms[0, 0, green]) == pytest.approx(step)
+    assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)

@@ -1,5 +1,3 @@
-"""Meshes with colours: loading and rendering."""
-
 from pathlib import Path
 
 import numpy as np

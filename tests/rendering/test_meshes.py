@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,16 +27,12 @@ def assert_same_depth(found: torch.Tensor, expected: torch.Tensor, *, atol: floa
     torch.testing.assert_close(found, expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("flipped", [slice(None), slice(0, None, 2)])
-def test_render_ignores_face_orientation(backend: str, flipped: slice) -> None:
+def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backend: str) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2)
-    faces = mesh.faces.copy()
-    faces[flipped] = faces[flipped, ::-1]
-    assert_same_depth(render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend), render(mesh, backend))
-
-
-def test_render_ignores_doubled_and_degenerate_faces(backend: str) -> None:
-    mesh = trimesh.creation.icosphere(subdivisions=2)
+    for flipped in (slice(None), slice(0, None, 2)):
+        faces = mesh.faces.copy()
+        faces[flipped] = faces[flipped, ::-1]
+        assert_same_depth(render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend), render(mesh, backend))
     inner = mesh.copy().apply_scale(0.5)
     vertices = np.concatenate([mesh.vertices, inner.vertices, [[np.nan] * 3]])  # no face uses the last one
     bridge = [[0, 1, len(mesh.vertices) + 5], [0, 1, len(mesh.vertices) + 9]]  # a hidden edge with four faces
@@ -84,28 +81,20 @@ def test_render_is_precise_for_tiny_and_distant_objects(backend: str, scale: flo
     torch.testing.assert_close(depth / scale, render(mesh, backend), rtol=0, atol=2e-5)
 
 
-def test_render_depth_refuses_bad_arguments() -> None:
+def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails() -> None:
     T, one, size = camera(2)
     box = trimesh.creation.box()
     not_finite = T.clone()
     not_finite[1, 0, 3] = torch.nan
-    for arguments, message in (
-        ((not_finite, one, size), "finite"),
-        ((T, one.expand(3, 3, 3), size), "one or 2 matrices"),
-        ((T, one, (0, 5)), "size"),
-    ):
+    calls = [((not_finite, one, size), "finite"), ((T, one.expand(3, 3, 3), size), "one or 2 matrices")]
+    for arguments, message in (*calls, ((T, one, (0, 5)), "size")):
         with pytest.raises(InvalidInputError, match=message):
             cr.render_depth(box, *arguments)
     with pytest.raises(InvalidInputError, match="'embree'"):
         cr.render_depth(box, T, one, size, renderer="opengl")
     with pytest.raises(MeshError, match="degenerate"):
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
-
-
-def test_a_renderer_that_fails_is_not_replaced() -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise MemoryError("out of memory")
-
+    fail = Mock(side_effect=MemoryError("out of memory"))
     with pytest.raises(RenderingError, match="out of memory"):
         cr.render_depth(trimesh.creation.box(), *camera(2), renderer=SimpleNamespace(name="mine", render=fail))
 

@@ -14,13 +14,6 @@ from curvireg_torch.rendering import make_renderer
 from .conftest import camera, require
 
 
-def run_script(script: str, *arguments: str, **environment: str) -> str:
-    command = [sys.executable, "-c", script, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env={**os.environ, **environment})
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
-
-
 def test_threads_share_a_renderer(backend: str) -> None:
     renderer = make_renderer(trimesh.creation.icosphere(subdivisions=3), backend)
     T, K, size = camera(6)
@@ -30,15 +23,13 @@ def test_threads_share_a_renderer(backend: str) -> None:
     assert all(torch.equal(result, expected) for result in results)
 
 
-_SCENE = """
-import atexit, os, sys, torch, trimesh
+SCRIPT = """
+import os, sys, torch, trimesh
 from curvireg_torch.errors import RenderingError
-from curvireg_torch.rendering import make_renderer, opengl
+from curvireg_torch.rendering import make_renderer
 
 T = torch.eye(4)[None]; T[0, 2, 3] = 4.0
 K = torch.tensor([[60.0, 0, 19.5], [0, 60.0, 14.5], [0, 0, 1]])
-"""
-_FORK = """
 for backend in sys.argv[1:]:
     renderer = make_renderer(trimesh.creation.box(), backend)
     before = renderer.render(T, K, (30, 40))
@@ -64,4 +55,6 @@ for backend in sys.argv[1:]:
 def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
     """embree and OpenCV work in the child; OpenGL cannot, and the error says what to do."""
     require(*backends)
-    assert run_script(_SCENE + _FORK, *backends, OMP_NUM_THREADS="2").split() == codes
+    command, environment = [sys.executable, "-c", SCRIPT, *backends], {**os.environ, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    assert (done.returncode, done.stderr, done.stdout.split()) == (0, "", codes)

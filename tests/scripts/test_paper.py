@@ -1,6 +1,5 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
-import cv2
 import pytest
 import torch
 
@@ -9,6 +8,7 @@ from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from scripts.paper import tables
 from scripts.paper.detectors import DETECTORS
+from tests._support.scenes import write_photo
 
 SETTINGS = BankSettings(image_size=64)
 VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])
@@ -31,8 +31,7 @@ def cases(tmp_path_factory):
         T[2, 3] += 5.0 * 0.5 * float(torch.tensor(mesh.extents).norm())
         generator, background = torch.Generator().manual_seed(i), torch.full((3, 120, 160), 0.9)
         image, box = synthesize_photograph(mesh, T, K, (120, 160), generator, background=background, texture=0.0)
-        pixels = (image.permute(1, 2, 0).flip(-1) * 255).byte().numpy()
-        assert cv2.imwrite(str(folder / f"{i}.png"), pixels)
+        write_photo(folder / f"{i}.png", image)
         lines.append(f"{i}.png,{','.join(f'{v:g}' for v in box.tolist())},{azimuth},{elevation},0,")
     folder.joinpath("views.csv").write_text("\n".join(lines) + "\n")
     return tables.find_cases("web", root)

@@ -24,11 +24,6 @@ def large(**options) -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def large_bank(truck) -> ViewBank:
-    return ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
-
-
-@pytest.fixture(scope="module")
 def matcher(small_bank) -> ViewMatcher:
     return ViewMatcher(small_bank, pipeline=PIPELINE)
 
@@ -52,7 +47,8 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
 
 
-def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, matcher):
+def test_large_bank_compares_the_best_distinct_views(small_bank, truck, matcher):
+    large_bank = ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
     before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(*photograph(2))
     assert large_bank.appearance is None
     reranking = ViewMatcher(large_bank, pipeline=large(top=5, min_angle=40.0))
@@ -73,19 +69,15 @@ def test_large_bank_compares_the_best_distinct_views(small_bank, large_bank, mat
     assert torch.equal(reranking(*photograph(2)).scores, ranking.scores), "cached features"
 
 
-def painted() -> trimesh.Trimesh:
+@pytest.fixture(scope="module")
+def painted_bank() -> ViewBank:
     """A box with a red front and a blue back: rotated by 180 degrees, only its colours differ."""
     box = trimesh.creation.box((0.6, 0.6, 1.0)).subdivide().subdivide()
     colours = np.full((len(box.faces), 4), 255, np.uint8)
     colours[box.triangles_center[:, 1] < -0.29] = [220, 30, 30, 255]
     colours[box.triangles_center[:, 1] > 0.29] = [30, 30, 220, 255]
     box.visual.face_colors = colours
-    return as_mesh(box)
-
-
-@pytest.fixture(scope="module")
-def painted_bank() -> ViewBank:
-    return ViewBank.build(painted(), VIEWS, pipeline=PIPELINE, progress=False)
+    return ViewBank.build(as_mesh(box), VIEWS, pipeline=PIPELINE, progress=False)
 
 
 @pytest.mark.parametrize("exhaustive_limit", [1000, 0])

@@ -1,5 +1,3 @@
-"""Scores of descriptors, feature points and box shapes."""
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -10,28 +8,23 @@ import sklearn.covariance
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
+from torch import nn
 
-from curvireg_torch import ViewMatcher
+from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.terms import (
-    BoxShape,
-    Correlation,
-    Repeatability,
-    Whitening,
-    box_shapes,
-    dilate_points,
-    ledoit_wolf,
-    whole_box_shapes,
-)
+from tests._support.scenes import scene
 
 
-def test_correlation_is_the_cosine_of_the_better_crop():
+def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():
     queries, views = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [0.0, 2.0], [5.0, 12.0]])
     expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
-    module = Correlation().build(SimpleNamespace(descriptors=views))
+    module = terms.Correlation().build(SimpleNamespace(descriptors=views))
     torch.testing.assert_close(module(SimpleNamespace(descriptors=queries[:, None])), expected)
     together = module(SimpleNamespace(descriptors=queries[None]))
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
+    score = terms.Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
+    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
+    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
 
 def sample(count: int, length: int = 12) -> torch.Tensor:
@@ -43,18 +36,18 @@ def sample(count: int, length: int = 12) -> torch.Tensor:
 @pytest.mark.parametrize("count", [5, 30, 2000])
 def test_ledoit_wolf_equals_scikit_learn(count):
     x = sample(count)
-    mean, covariance = ledoit_wolf(x)
+    mean, covariance = terms.ledoit_wolf(x)
     expected = sklearn.covariance.ledoit_wolf(x.double().numpy())[0]
     np.testing.assert_allclose(covariance.numpy(), expected, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(mean, x.mean(dim=0))
 
 
-def test_matcher_ranks_by_whitened_correlation(bank, photographs):
-    images, boxes = photographs[0][:1], photographs[1][:1]
+def test_matcher_ranks_by_whitened_correlation(bank):
+    images, boxes = [scene(0)[0]], scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes).descriptors[:, 0]
-    mean, covariance = ledoit_wolf(bank.descriptors)
+    mean, covariance = terms.ledoit_wolf(bank.descriptors)
     factor = torch.linalg.cholesky(covariance.double())
     a, b = (torch.linalg.solve(factor, (x - mean).double().T).T for x in (query, bank.descriptors))
     expected = F.cosine_similarity(a[:, None], b[None], dim=2).float()
@@ -65,7 +58,7 @@ def test_matcher_ranks_by_whitened_correlation(bank, photographs):
 def test_dilate_points_uses_a_euclidean_disc(eps):
     points = torch.rand(3, 31, 40, generator=torch.Generator().manual_seed(0)) < 0.02
     points[0] = False
-    dilated = dilate_points(points, eps)
+    dilated = terms.dilate_points(points, eps)
     assert not bool(dilated[0].any())
     for plane, expected in zip(dilated[1:], points[1:], strict=True):
         assert (plane.numpy() == (distance_transform_edt(~expected.numpy()) <= eps)).all()
@@ -73,28 +66,24 @@ def test_dilate_points_uses_a_euclidean_disc(eps):
 
 def test_repeatability_score_has_the_closed_form():
     rep = torch.tensor([[0.2, 0.5, 0.8]])
-    assert int(Repeatability(mode="paper").log_score(rep).argmax()) == 1  # favours average views
+    assert int(terms.Repeatability(mode="paper").log_score(rep).argmax()) == 1  # favours average views
     for sigma in (0.1, 0.2):
         expected = [-(d**2) / (2 * sigma**2) for d in (0.6, 0.3, 0.0)]
-        torch.testing.assert_close(Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected))
+        torch.testing.assert_close(terms.Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected))
     with pytest.raises(InvalidInputError, match="mode"):
-        Repeatability(mode="other")
+        terms.Repeatability(mode="other")
 
 
 def box_score(shapes, boxes, **options):
-    return BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
+    return terms.BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
 
 
-def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio():
+def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_border():
     boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 10, 10], [0, 0, 10, 20]]) + 3.0
     expected = [math.exp(-((k * math.log(2)) ** 2) / (2 * 0.5**2)) for k in (0, 1, 2)]
-    assert box_score(box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(expected, rel=1e-5)
+    assert box_score(terms.box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(expected, rel=1e-5)
     assert box_score(torch.tensor([-9.0]), boxes)[0, 2] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("box", "whole"),
-    [
+    for box, whole in (
         ([10, 10, 60, 40], True),
         ([-0.5, 10, 60, 40], False),
         ([10, 10, 98.8, 40], False),
@@ -104,26 +93,50 @@ def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio():
         # The border is 1 px and 1/100 of the longer side, 80 px: 1.8 px.
         ([1.4, 20, 81.4, 60], True),
         ([1.2, 20, 81.2, 60], False),
-    ],
-)
-def test_whole_box_shapes_are_nan_at_the_border(box, whole):
-    shape = whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
-    assert bool(shape.isfinite()) == whole
-    assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
-
-
-def test_correlation_score_is_an_exponential_of_standard_deviations():
-    score = Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
-    low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
-    torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
+    ):
+        shape = terms.whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
+        assert bool(shape.isfinite()) == whole
+        assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
 
 
 def test_whitening_decorrelates():
     x = sample(4000)
-    white = Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
+    white = terms.Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
     torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
     torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
     with pytest.raises(InvalidInputError, match="positive definite"):
-        Whitening(x[:5].mean(dim=0), x[:5].T.cov())
+        terms.Whitening(x[:5].mean(dim=0), x[:5].T.cov())
     with pytest.raises(InvalidInputError, match="covariance"):
-        Whitening(torch.zeros(3), torch.eye(2))
+        terms.Whitening(torch.zeros(3), torch.eye(2))
+
+
+def test_jittered_boxes_are_shifted_and_scaled():
+    box = torch.tensor([[10.0, 20, 110, 70]])
+    jittered = terms.jittered_boxes(box, 0.2)
+    assert jittered[0, 0].equal(box[0])
+    centres = 0.5 * (jittered[0, :, :2] + jittered[0, :, 2:]) - torch.tensor([60.0, 45])
+    expected = torch.tensor([[0.0, 0], [-15, 0], [15, 0], [0, -15], [0, 15], [0, 0], [0, 0]])
+    torch.testing.assert_close(centres, expected)
+    width = jittered[0, :, 2] - jittered[0, :, 0]
+    assert width.tolist() == pytest.approx([100] * 5 + [100 / 1.2, 120], rel=1e-5)
+    assert terms.jittered_boxes(box, 0.0).equal(box[None])
+    assert terms.jittered_boxes(box, 0.45).shape == (1, 7, 4)
+
+
+def test_box_jitter_recovers_a_shifted_view(bank):
+    S, margin = bank.settings.image_size, bank.settings.margin
+    picture = bank.silhouettes_at(slice(30, 31))[:, None].float().expand(-1, 3, -1, -1)
+    side = S / (1 + 2 * margin)
+    box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
+    shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
+    pipelines = (replace(bank.pipeline, box_jitter=jitter) for jitter in (0.0, 0.1))
+    exact, jitter = (ViewMatcher(bank, field=_Gradient(), pipeline=pipeline) for pipeline in pipelines)
+    cases = ((exact, box), (exact, shifted), (jitter, shifted))
+    reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
+    assert lost < reference - 0.05
+    assert recovered > reference - 0.01
+
+
+class _Gradient(nn.Module):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return torch.stack(torch.gradient(image[:, 0], dim=(2, 1)), dim=1)

@@ -9,20 +9,7 @@ from torch import Tensor
 import curvireg_torch as cr
 from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
-from curvireg_torch.utils.checks import (
-    as_boxes,
-    as_camera_matrices,
-    check_camera_matrix,
-    check_fraction,
-    check_integer,
-    check_number,
-    check_photograph,
-    check_pixels,
-    check_pose,
-    check_positive,
-    check_rotation,
-    check_square_pixels,
-)
+from curvireg_torch.utils import checks
 
 CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
 POSE = geometry.transform(cr.rotation_from_viewpoint(30.0, 20.0).double(), torch.tensor([0.1, 0.2, 6.0]).double())
@@ -49,8 +36,8 @@ BAD_CAMERAS = {
 
 @pytest.mark.parametrize("bad", BAD_CAMERAS)
 def test_check_camera_matrix_refuses_what_is_no_camera(bad: str) -> None:
-    check_camera_matrix(CAMERA)
-    for call in (check_camera_matrix, lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K)):
+    checks.check_camera_matrix(CAMERA)
+    for call in (checks.check_camera_matrix, lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K)):
         with pytest.raises(InvalidInputError, match="camera matrix: expected"):
             call(BAD_CAMERAS[bad])
 
@@ -68,11 +55,12 @@ BAD_ROTATIONS = {
 
 @pytest.mark.parametrize("bad", BAD_ROTATIONS)
 def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad: str) -> None:
-    for call in (lambda R: check_rotation(R, "R"), lambda R: cr.rotation_error(R, R)):
+    for call in (lambda R: checks.check_rotation(R, "R"), lambda R: cr.rotation_error(R, R)):
         with pytest.raises(InvalidInputError, match="expected rotations"):
             call(BAD_ROTATIONS[bad])
     T = geometry.transform(BAD_ROTATIONS[bad], POSE[:3, 3])
-    for call in (lambda T: check_pose(T, "T"), lambda T: cr.project_points(torch.zeros(1, 3).double(), T, CAMERA)):
+    point = torch.zeros(1, 3).double()
+    for call in (lambda T: checks.check_pose(T, "T"), lambda T: cr.project_points(point, T, CAMERA)):
         with pytest.raises(InvalidInputError, match="expected rigid"):
             call(T)
 
@@ -80,8 +68,8 @@ def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad: str) -> Non
 def test_check_pose_refuses_other_rows_and_missing_values() -> None:
     for change in ((3, 0, 0.1), (3, 3, 2.0), (2, 3, math.inf), (1, 1, math.nan)):
         with pytest.raises(InvalidInputError, match=r"T: expected (rigid|finite)"):
-            check_pose(changed(POSE, change), "T")
-    check_rotation(changed(R, (1, 1, math.nan)), "R")  # a missing estimate
+            checks.check_pose(changed(POSE, change), "T")
+    checks.check_rotation(changed(R, (1, 1, math.nan)), "R")  # a missing estimate
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
@@ -89,60 +77,52 @@ def test_check_pose_accepts_rounded_poses(dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(0)
     R = geometry.rotation_from_axis_angle(2.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64))
     T = geometry.transform(R, torch.randn(500, 3, generator=generator, dtype=torch.float64)).to(dtype)
-    check_pose(T, "T")
-    check_rotation(T[:, :3, :3], "R")
-    check_pose(torch.linalg.inv(T.double()), "T")
-    check_pose(T[:0], "T")
-    check_pose(T[0], "T")
+    checks.check_pose(T, "T")
+    checks.check_rotation(T[:, :3, :3], "R")
+    checks.check_pose(torch.linalg.inv(T.double()), "T")
+    checks.check_pose(T[:0], "T")
+    checks.check_pose(T[0], "T")
 
 
 def test_check_photograph_and_check_pixels_refuse_other_images() -> None:
     image = torch.rand(3, 8, 9)
-    check_photograph(image)
+    checks.check_photograph(image)
     for bad in (image[0], image[:2], image.long(), image > 0.5, image[None], image[:, :0], "missing.png", None):
         with pytest.raises(InvalidInputError, match="images: expected"):
-            check_photograph(bad)
-    check_pixels(1.0005 * torch.ones(3, 2, 2), "of the box")
+            checks.check_photograph(bad)
+    checks.check_pixels(1.0005 * torch.ones(3, 2, 2), "of the box")
     for value, match in ((math.nan, "NaN or inf"), (-math.inf, "NaN or inf"), (1.01, "255"), (-0.01, "255")):
         with pytest.raises(ImageError, match=match):
-            check_pixels(torch.full((3, 2, 2), value), "of the box")
+            checks.check_pixels(torch.full((3, 2, 2), value), "of the box")
 
 
-def test_as_boxes_accepts_tensors_arrays_and_lists_only() -> None:
+def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only() -> None:
     boxes = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], boxes.int().numpy()):
-        assert torch.equal(as_boxes(given, 2).float(), boxes)
+        assert torch.equal(checks.as_boxes(given, 2).float(), boxes)
     others = [["a", "b", "c", "d"]], [[1.0, 2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0, 5.0]], [None], {"x": 1}
     for bad in (*others, np.array([[1, 2, 3, None]]), torch.ones(1, 4, dtype=torch.bool)):
         with pytest.raises(InvalidInputError, match="boxes: expected"):
-            as_boxes(bad, 1)
-
-
-def test_as_camera_matrices_accepts_one_for_all_or_one_for_each() -> None:
+            checks.as_boxes(bad, 1)
     for K in (CAMERA, [CAMERA, CAMERA], [CAMERA.tolist()] * 2, [*CAMERA.expand(2, 3, 3).numpy()], CAMERA.numpy()):
-        assert torch.equal(as_camera_matrices(K, 2), CAMERA.expand(2, 3, 3))
+        assert torch.equal(checks.as_camera_matrices(K, 2), CAMERA.expand(2, 3, 3))
     for bad in ([None], "camera", [CAMERA, None], [[1.0, 2.0, 3.0]], [CAMERA, CAMERA[:2]], [CAMERA] * 3):
         with pytest.raises(InvalidInputError, match="camera_matrices: expected"):
-            as_camera_matrices(bad, 2)
+            checks.as_camera_matrices(bad, 2)
 
 
-@pytest.mark.parametrize("wrong", ["1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)])
-def test_numbers_of_the_wrong_type_are_refused(wrong: object) -> None:
-    for check in (check_number, check_positive, check_fraction):
-        with pytest.raises(InvalidInputError, match="value: expected"):
-            check(wrong, "value")
+def test_numbers_and_integers_of_the_wrong_type_are_refused() -> None:
+    for wrong in ("1", None, True, math.nan, math.inf, 10**400, [1.0], torch.ones(2)):
+        for check in (checks.check_number, checks.check_positive, checks.check_fraction):
+            with pytest.raises(InvalidInputError, match="value: expected"):
+                check(wrong, "value")
+    for wrong in (2.5, 2.0, "2", None, True, 0, -1, torch.tensor(3)):
+        with pytest.raises(InvalidInputError, match="scales: expected an integer >= 1, got"):
+            checks.check_integer(wrong, "scales")
+    assert checks.check_integer(np.int64(3), "scales") == 3
 
 
-@pytest.mark.parametrize("wrong", [2.5, 2.0, "2", None, True, 0, -1, torch.tensor(3)])
-def test_integers_of_the_wrong_type_are_refused(wrong: object) -> None:
-    with pytest.raises(InvalidInputError, match="scales: expected an integer >= 1, got"):
-        check_integer(wrong, "scales")
-    assert check_integer(np.int64(3), "scales") == 3
-
-
-@pytest.mark.parametrize(
-    "name", [name for name in vars(errors) if name.endswith(("Error", "Warning")) and name[0] != "_"]
-)
+@pytest.mark.parametrize("name", [n for n in vars(errors) if n.endswith(("Error", "Warning")) and n[0] != "_"])
 def test_errors_keep_message_and_subject(name: str) -> None:
     error = getattr(errors, name)("unusable; use another", subject="a.png")
     for copy in (error, pickle.loads(pickle.dumps(error)), type(error)("unusable; use another").with_subject("a.png")):
@@ -154,7 +134,7 @@ def test_errors_keep_message_and_subject(name: str) -> None:
 
 def test_check_square_pixels_accepts_ten_per_cent() -> None:
     for ratio in (1.0 / 1.099, 1.0, 1.099):
-        check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
+        checks.check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
     for ratio in (1.0 / 1.101, 1.101):
         with pytest.raises(InvalidInputError, match="square"):
-            check_square_pixels(torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))]))
+            checks.check_square_pixels(torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))]))

@@ -13,36 +13,26 @@ from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileE
 from curvireg_torch.evaluation.runner import POSE_SOURCES
 from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
-from curvireg_torch.utils.files import (
-    check_writable,
-    code_digest,
-    finite_numbers,
-    read_json,
-    tensor_digest,
-    write_csv,
-    write_file,
-)
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    write_file(tmp_path / "file", OLD)
+    files.write_file(tmp_path / "file", OLD)
     return tmp_path / "file"
 
 
 def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "file"
-    write_file(path, OLD)
+    files.write_file(path, OLD)
     with path.open("rb") as reader:
-        write_file(path, NEW)
+        files.write_file(path, NEW)
         assert reader.read() == OLD, "who has the file open keeps the old content"
-    assert path.read_bytes() == NEW
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (NEW, [path])
     link = tmp_path / "link"
     link.symlink_to(path)
-    write_file(link, OLD)
+    files.write_file(link, OLD)
     assert link.is_symlink()
     assert path.read_bytes() == OLD
 
@@ -52,11 +42,10 @@ def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         with pytest.raises(OutputError, match=r"file: cannot be written \(File too large\); choose another place"):
-            write_file(path, NEW)
+            files.write_file(path, NEW)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert path.read_bytes() == OLD
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
 
 
 @pytest.mark.parametrize("name", ["file/x", "folder", "null"])
@@ -65,7 +54,7 @@ def test_write_file_refuses_other_targets(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "null").symlink_to(os.devnull)
     with pytest.raises(CurviregError, match=f"{name}: cannot be written") as error:
-        write_file(tmp_path / name, NEW)
+        files.write_file(tmp_path / name, NEW)
     assert isinstance(error.value, OSError)
     assert len(str(error.value).splitlines()) == 1
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder", "null"]
@@ -73,11 +62,11 @@ def test_write_file_refuses_other_targets(tmp_path: Path, name: str) -> None:
 
 
 def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> None:
-    check_writable(tmp_path / "a" / "b", "--out")
+    files.check_writable(tmp_path / "a" / "b", "--out")
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
     with pytest.raises(OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"):
-        check_writable(tmp_path / "file", "--out")
+        files.check_writable(tmp_path / "file", "--out")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -85,7 +74,7 @@ def test_write_file_keeps_the_old_content_if_interrupted(
     number: signal.Signals, code: int, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
-    monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: write_file(path, NEW))
+    monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: files.write_file(path, NEW))
     before = signal.getsignal(signal.SIGTERM)
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for jobs in the background
     try:
@@ -93,70 +82,63 @@ def test_write_file_keeps_the_old_content_if_interrupted(
             sys.exit(main(["cache"]))
     finally:
         signal.signal(signal.SIGINT, ignored)
-    assert path.read_bytes() == OLD
-    assert list(path.parent.iterdir()) == [path]
+    assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
     assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) -> None:
     cells = ["=1+1", "+cmd", "-2+3", "@sum", "\tx", "-1.5", "+2e-3", "a=b", "", -0.5]
-    write_csv(tmp_path / "t.csv", [cells])
+    files.write_csv(tmp_path / "t.csv", [cells])
     with (tmp_path / "t.csv").open(newline="") as file:
         (row,) = csv.reader(file)
     assert row == ["'=1+1", "'+cmd", "'-2+3", "'@sum", "'\tx", "-1.5", "+2e-3", "a=b", "", "-0.5"]
 
 
-@pytest.mark.parametrize("content", [b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b"\xff", b"[1]"])
-def test_read_json_refuses_malicious_files(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InvalidInputError, match=r"a\.json: .*README shows the layout") as caught:
-        read_json(tmp_path / "a.json", dict, "README")
-    assert len(str(caught.value).splitlines()) == 1
-    assert len(str(caught.value)) < 1000
-
-
-def test_read_json_refuses_missing_and_large_files(tmp_path: Path) -> None:
+def test_read_json_refuses_malicious_missing_and_large_files(tmp_path: Path) -> None:
+    for content in (b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b"\xff", b"[1]"):
+        (tmp_path / "a.json").write_bytes(content)
+        with pytest.raises(InvalidInputError, match=r"a\.json: .*README shows the layout") as caught:
+            files.read_json(tmp_path / "a.json", dict, "README")
+        assert len(str(caught.value).splitlines()) == 1
+        assert len(str(caught.value)) < 1000
     with open(tmp_path / "a.json", "wb") as file:
         file.truncate((1 << 25) + 1)  # a sparse file
     with pytest.raises(InvalidInputError, match="larger than 33,554,432 bytes"):
-        read_json(tmp_path / "a.json", dict, "README")
+        files.read_json(tmp_path / "a.json", dict, "README")
     with pytest.raises(MissingFileError, match="no such file; README"):
-        read_json(tmp_path / "none.json", dict, "README")
+        files.read_json(tmp_path / "none.json", dict, "README")
 
 
 def test_finite_numbers_accepts_finite_numbers_only() -> None:
-    assert finite_numbers([1, 2.5], 2) == (1.0, 2.5)
+    assert files.finite_numbers([1, 2.5], 2) == (1.0, 2.5)
     for values in ([1], [1, True], [1, "2"], [1, float("nan")], [1, 10**400], "12", {"a": 1, "b": 2}, None):
-        assert finite_numbers(values, 2) is None
+        assert files.finite_numbers(values, 2) is None
 
 
 def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
     x = torch.arange(4.0)
     others = [{"b": x}, {"a": x.double()}, {"a": x.view(2, 2)}, {"a": x + 1e-6}, {"a": x, "b": x}, {"a": x.bfloat16()}]
-    found = {tensor_digest(tensors) for tensors in ({"a": x}, *others)}
+    found = {files.tensor_digest(tensors) for tensors in ({"a": x}, *others)}
     assert len(found) == 1 + len(others)
     strided = torch.stack([x, x], dim=1)[:, 0].requires_grad_()
-    assert tensor_digest({"a": strided}) == tensor_digest({"a": x})
-    assert len(tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
+    assert files.tensor_digest({"a": strided}) == files.tensor_digest({"a": x})
+    assert len(files.tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
 
 
 def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for decide in (cache._SOURCES, POSE_SOURCES):  # banks and results
+        assert {"features", "filters", "geometry", "mesh", "rendering", "terms.py"} <= set(decide)
+        assert len(files.code_digest(*decide)) == 16
     monkeypatch.setattr(files, "_PACKAGE", tmp_path)
     (tmp_path / "room" / "deep").mkdir(parents=True)
     sources = [tmp_path / "room" / "a.py", tmp_path / "room" / "deep" / "b.py", tmp_path / "c.py"]
     seen = set()
     for i, source in enumerate([*sources, *sources]):
         source.write_text(f"x = {i}")
-        code_digest.cache_clear()
+        files.code_digest.cache_clear()
         if i >= 2:
-            seen.add(code_digest("room", "c.py"))
+            seen.add(files.code_digest("room", "c.py"))
     assert len(seen) == 4
     with pytest.raises(FileNotFoundError):
-        code_digest("no_such_room")
-    code_digest.cache_clear()
-
-
-@pytest.mark.parametrize("sources", [cache._SOURCES, POSE_SOURCES])
-def test_code_digests_of_banks_and_results_cover_all_that_decides_them(sources: tuple[str, ...]) -> None:
-    assert {"features", "filters", "geometry", "mesh", "rendering", "terms.py"} <= set(sources)
-    assert len(code_digest(*sources)) == 16
+        files.code_digest("no_such_room")
+    files.code_digest.cache_clear()

@@ -9,8 +9,6 @@ import pytest
 from curvireg_torch import cli
 from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import CurviregError
-from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.utils import choices
 
 HEAVY = {"torch", "numpy", "scipy", "kornia", "trimesh", "cv2", "sklearn", "matplotlib", "safetensors", "tqdm"}
 UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "torchvision", "pandas", "IPython"}
@@ -18,20 +16,15 @@ UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "tor
 
 def imported_by(code: str) -> set[str]:
     """Top-level modules after ``code`` has run in a new process."""
-    script = (
-        f"import sys\ntry:\n    {code}\nexcept SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
-    )
+    ending = "except SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
+    script = f"import sys\ntry:\n    {code}\n{ending}"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
     return {name.split(".")[0] for name in done.stderr.split()}
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["--help"], ["--version"], ["register", "--help"], ["evaluate", "bop", "--help"], ["register", "--unit", "mile"]],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("words", ["--help", "--version", "register -h", "evaluate bop --help", "register --unit mile"])
 def test_help_imports_nothing_heavy(words):
-    assert not imported_by(f"from curvireg_torch.cli import main; main({words!r})") & HEAVY
+    assert not imported_by(f"from curvireg_torch.cli import main; main({words.split()!r})") & HEAVY
 
 
 def test_imports_are_only_those_of_what_is_used():
@@ -41,10 +34,7 @@ def test_imports_are_only_those_of_what_is_used():
     loaded = imported_by("import curvireg_torch.evaluation.result_files")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED
-
-
-def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
-    """kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation."""
+    # kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation.
     loaded = imported_by(
         "import numpy, trimesh, curvireg_torch as cr; from curvireg_torch.geometry import sample_views; "
         "views = sample_views(azimuth_step=90, elevations=[20]); "
@@ -56,29 +46,18 @@ def test_a_registration_imports_no_slow_library_that_it_hardly_uses():
     assert not loaded & (UNUSED | {"kornia", "sympy"})
 
 
-def test_choices_agree_with_the_presets():
-    assert list(PRESETS) == list(choices.PRESET_NAMES)
-    assert choices.DEFAULT in PRESETS
-
-
 def test_options_accept_numbers_with_commas():
-    arguments = parse(
-        ["register", "a,1.jpg", *["--box", "10,", "20,", "30.5,", "40", "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"]]
-    )
+    box = ["--box", "10,", "20,", "30.5,", "40"]
+    arguments = parse(["register", "a,1.jpg", *box, "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"])
     assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == (10.0, 20.0, 30.5, 40.0)
-    assert arguments.camera == (1000.0, 1000.0, -0.5, 2.0)
-    assert arguments.paths == [Path("a,1.jpg"), Path("5,6")]
+    assert (arguments.camera, arguments.paths) == ((1000.0, 1000.0, -0.5, 2.0), [Path("a,1.jpg"), Path("5,6")])
 
 
-@pytest.mark.parametrize(
-    ("raised", "code", "message"),
-    [
-        (KeyboardInterrupt(), 130, "interrupted\n"),
-        (PermissionError(13, "denied", "x.ply"), 2, "error: [Errno 13] denied: 'x.ply'; check that it exists"),
-        (CurviregError("no good"), 2, "error: no good\n"),
-    ],
-)
-def test_main_reports_errors_in_one_line_with_a_code(raised, code, message, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "parse", lambda _: Namespace(run=Mock(side_effect=raised), debug=False))
-    assert main(["cache"]) == code
-    assert capsys.readouterr().err.startswith(f"curvireg: {message}")
+def test_main_reports_errors_in_one_line_with_a_code(monkeypatch, capsys):
+    denied = PermissionError(13, "denied", "x.ply"), 2, "error: [Errno 13] denied: 'x.ply'; check that it exists"
+    refused = CurviregError("no good"), 2, "error: no good\n"
+    for raised, code, message in ((KeyboardInterrupt(), 130, "interrupted\n"), denied, refused):
+        command = Namespace(run=Mock(side_effect=raised), debug=False)
+        monkeypatch.setattr(cli, "parse", lambda _, command=command: command)
+        assert main(["cache"]) == code
+        assert capsys.readouterr().err.startswith(f"curvireg: {message}")

@@ -1,25 +1,16 @@
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
 
-from curvireg_torch.utils.threads import (
-    available_threads,
-    for_each,
-    map_on_threads,
-    one_torch_thread,
-    single_threaded_pool,
-)
+from curvireg_torch.utils import threads
 
 
 @pytest.fixture(autouse=True)
-def two_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+def _two_threads(threads: Callable[[int], None]) -> None:
+    threads(2)
 
 
 def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
@@ -32,7 +23,7 @@ def test_for_each_runs_every_job_once_and_two_at_a_time() -> None:
 
     for _ in range(3):
         done.clear()
-        for_each(6, job)
+        threads.for_each(6, job)
         assert sorted(done) == list(range(6))
 
 
@@ -46,21 +37,21 @@ def test_for_each_stops_at_an_error_and_raises_it() -> None:
         done.append(number)
 
     with pytest.raises(ValueError, match="two"):
-        for_each(20_000, job)
+        threads.for_each(20_000, job)
     assert len(done) < 19_999
-    for_each(2, done.append)  # the threads survive
+    threads.for_each(2, done.append)  # the threads survive
 
 
 def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     def job(number: int) -> tuple[int, int, int]:
         return number, torch.get_num_threads(), threading.get_ident()
 
-    out = map_on_threads(job, range(5))
+    out = threads.map_on_threads(job, range(5))
     assert [number for number, *_ in out] == list(range(5))
     assert {threads for _, threads, _ in out} == {1}
     assert threading.get_ident() not in {thread for *_, thread in out}
     assert torch.get_num_threads() == 2
-    assert map_on_threads(job, []) == []
+    assert threads.map_on_threads(job, []) == []
 
 
 def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
@@ -68,17 +59,17 @@ def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
 
     def threads_in_job(_: int) -> tuple[int, int]:
         both.wait()
-        return torch.get_num_threads(), available_threads()
+        return torch.get_num_threads(), threads.available_threads()
 
-    assert (torch.get_num_threads(), available_threads()) == (2, 2)
-    with one_torch_thread(), one_torch_thread():
-        assert (torch.get_num_threads(), available_threads()) == (1, 2)
-        for_each(2, lambda _: both.wait())
-        assert map_on_threads(threads_in_job, [0, 1]) == [(1, 1)] * 2
-        assert map_on_threads(lambda _: (torch.get_num_threads(), available_threads()), [0]) == [(1, 2)]
-        with single_threaded_pool() as pool:
+    assert (torch.get_num_threads(), threads.available_threads()) == (2, 2)
+    with threads.one_torch_thread(), threads.one_torch_thread():
+        assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)
+        threads.for_each(2, lambda _: both.wait())
+        assert threads.map_on_threads(threads_in_job, [0, 1]) == [(1, 1)] * 2
+        assert threads.map_on_threads(lambda _: (torch.get_num_threads(), threads.available_threads()), [0]) == [(1, 2)]
+        with threads.single_threaded_pool() as pool:
             assert list(pool.map(threads_in_job, [0, 1])) == [(1, 1)] * 2
-        assert (torch.get_num_threads(), available_threads()) == (1, 2)
-    assert (torch.get_num_threads(), available_threads()) == (2, 2)
+        assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)
+    assert (torch.get_num_threads(), threads.available_threads()) == (2, 2)
     torch.set_num_threads(1)
-    assert available_threads() == 1, "outside, the setting of the caller holds"
+    assert threads.available_threads() == 1, "outside, the setting of the caller holds"

@@ -1,5 +1,3 @@
-"""A headless browser that shows a page of the viewer."""
-
 import importlib.util
 import os
 import shutil
@@ -9,8 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-__all__ = ["MISSING", "Browser", "wait_for"]
 
 PROGRAMS = [next(filter(None, map(shutil.which, names)), None)
             for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))]  # fmt: skip

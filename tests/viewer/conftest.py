@@ -1,5 +1,3 @@
-"""A viewer and a browser that shows it."""
-
 import os
 import re
 import shutil
@@ -36,9 +34,8 @@ def address(folder):
     (folder / "temporary").mkdir()
     environment["TMPDIR"] = str(folder / "temporary")
     with (folder / "log").open("w") as log:
-        server = subprocess.Popen(
-            command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, bufsize=1
-        )
+        pipes = {"stdout": subprocess.PIPE, "stderr": log, "text": True, "bufsize": 1}
+        server = subprocess.Popen(command, cwd=folder, env=environment, **pipes)
     try:
         line = server.stdout.readline()
         assert "http://127.0.0.1:" in line, (folder / "log").read_text()
@@ -81,6 +78,17 @@ def registered(tmp_path_factory):
         session.set_camera((260.0, 260.0, 119.5, 89.5))
         session.register()
         yield session, folder, T
+
+
+@pytest.fixture
+def session(registered):
+    """The session at its first hypothesis; its options, photographs and result are restored afterwards."""
+    session = registered[0]
+    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
+    shot.choose(0)
+    yield session
+    vars(shot).update(kept)
+    session.options, session.shots, session.shot = options, [shot], shot
 
 
 @pytest.fixture

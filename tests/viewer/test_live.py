@@ -1,11 +1,11 @@
-"""``curvireg follow --show``: a page with the latest frame."""
-
+import itertools
 import json
 import threading
 import time
 import urllib.error
 import urllib.request
 import webbrowser
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,26 +23,17 @@ from tests._support.lists import CAMERA
 from tests._support.scenes import learned_registrar, sequence
 
 
-class Camera:
+def camera(frames, taken):
     """Delivers the frames of a sequence, each once the one before was taken."""
+    numbers = itertools.count()
 
-    def __init__(self, frames, taken):
-        self.frames, self.taken, self.number = frames, taken, 0
-
-    def isOpened(self):  # noqa: N802
-        return True
-
-    def get(self, _):
-        return 0.0
-
-    def release(self):
-        pass
-
-    def read(self):
-        while len(self.taken) < self.number:
+    def read():
+        number = next(numbers)
+        while len(taken) < number:
             time.sleep(0.01)
-        self.number += 1
-        return (True, self.frames[self.number - 1]) if self.number <= len(self.frames) else (False, None)
+        return (True, frames[number]) if number < len(frames) else (False, None)
+
+    return SimpleNamespace(isOpened=lambda: True, get=lambda _: 0.0, release=lambda: None, read=read)
 
 
 def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
@@ -89,7 +80,7 @@ def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(webbrowser, "open", open_browser)
     monkeypatch.setattr(Follower, "__call__", interrupted)
-    monkeypatch.setattr(cv2, "VideoCapture", lambda _: Camera(pictures, seen))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda _: camera(pictures, seen))
     box = map(str, scenes[0][1].tolist())
     words = ["follow", "0", str(tmp_path / "truck.safetensors"), "--camera", *map(str, CAMERA), "--box", *box]
     assert main([*words, "--show", "--json"]) == 0

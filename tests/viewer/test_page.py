@@ -1,5 +1,3 @@
-"""The photograph, the steps and the fields of the page, without a browser."""
-
 import asyncio
 from dataclasses import replace
 from types import SimpleNamespace
@@ -58,8 +56,7 @@ def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
         assert shot.box == pytest.approx(box)
     for kind in ("press", "move", "cancel", "release"):
         send(stage, kind, 0.9, 0.9)
-    assert shot.box == pytest.approx((10, 30, 140, 90))
-    assert stage.shapes.content.count("<rect") == 2
+    assert (shot.box, stage.shapes.content.count("<rect")) == (pytest.approx((10, 30, 140, 90)), 2)
     assert "viewBox='-0.5 -0.5 240 180'" in stage.shapes.content
     send(stage, "remove")
     assert shot.box is None
@@ -128,17 +125,12 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
 
 
 @pytest.fixture
-def shown(registered, tmp_path):
-    """The page of a session with a result, which is restored afterwards."""
-    session = registered[0]
+def shown(session, tmp_path):
+    """The page of a session with a result."""
     workspace = Workspace(session.options, tmp_path)
     workspace.session = session
-    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
-    shot.choose(0)
     with Client(page(""), request=None):
         yield workspace
-    vars(shot).update(kept)
-    session.options, session.shots, session.shot = options, [shot], shot
 
 
 def test_each_remark_has_its_repair(shown, monkeypatch):
@@ -177,8 +169,7 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     asyncio.run(posed.refresh())
     assert "disabled" not in posed.undo.props
     drag(posed, (2, 2), (22, 2))  # beside the mesh: it turns
-    assert centre() == pytest.approx([x + 20, y + 10], abs=1e-6)
-    assert len(shot.answer.edits) == 2
+    assert (centre(), len(shot.answer.edits)) == (pytest.approx([x + 20, y + 10], abs=1e-6), 2)
     send(posed, "undo")
     assert len(shot.answer.edits) == 1
     for kind, values in (("scale", {"factor": 1.1, "roll": 5.0}), ("nudge", {"dx": 1, "dy": 0, "shift": True})):

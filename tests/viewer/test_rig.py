@@ -6,10 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
@@ -19,25 +17,12 @@ from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.workspace import Workspace
-from tests._support.lists import CAMERA as NUMBERS
+from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos
 from tests._support.scenes import learned_registrar
-from tests.registration.test_several import EASY, WORLD, rig_of
+from tests.registration.test_several import WORLD
 from tests.viewer.test_workspace import upload
 
 HEADER = ["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION]
-
-
-def write_rig(folder: Path) -> list[list]:
-    """Write 0.png to 2.png, truck.safetensors and rig.csv, without a box of the second; returns its rows."""
-    rows = []
-    for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
-        picture = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
-        cv2.imwrite(str(folder / f"{k}.png"), picture)
-        given = [""] * 4 if k == 1 else box.tolist()
-        rows.append([f"{k}.png", *given, *NUMBERS, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()])
-    write_table(folder / "rig.csv", HEADER, rows)
-    learned_registrar().bank.save(folder / "truck.safetensors")
-    return rows
 
 
 def write_table(path, header, rows):
@@ -47,8 +32,13 @@ def write_table(path, header, rows):
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
+    """Photographs, truck.safetensors, and rig.csv without a box of the second; returns the folder and the rows."""
     folder = tmp_path_factory.mktemp("rig")
-    return folder, write_rig(folder)
+    rows = write_rig_photos(folder)
+    rows[1][1:5] = [""] * 4
+    write_table(folder / "rig.csv", HEADER, rows)
+    learned_registrar().bank.save(folder / "truck.safetensors")
+    return folder, rows
 
 
 def send(workspace, folder, *names):
@@ -88,8 +78,7 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
         assert document[key] == written[key], key
     assert (document["mesh"], document["inputs"]["rig"]) == ("truck.safetensors", "rig.csv")
     for shot, view in zip((first, second, third), document["views"], strict=True):
-        assert shot.projection[0][:3, :3].tolist() == view["rotation"]
-        assert shot.found_box.tolist() == view["box"]
+        assert (shot.projection[0][:3, :3].tolist(), shot.found_box.tolist()) == (view["rotation"], view["box"])
         assert shot.answer is first.answer
     assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
     assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()
@@ -112,9 +101,8 @@ def found(rig, tmp_path_factory):
 
 def test_photographs_of_no_row_and_rows_without_photograph_are_named(found):
     _, session = found
-    assert session.rig_gaps() == (
-        "not open: 1.png; drop what is missing here, or go on without; not in the rig: other.png; registered alone"
-    )
+    missing = "not open: 1.png; drop what is missing here, or go on without"
+    assert session.rig_gaps() == f"{missing}; not in the rig: other.png; registered alone"
     other, first, last = session.shots
     assert [shot.result is first.result for shot in (other, first, last)] == [False, True, True]
     assert len(session.document()["views"]) == 2
@@ -224,19 +212,10 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
 
 def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     folder, rows = rig
-    T = [torch.tensor(row[9:]).double() for row in rows]
-    lines, scene = [], {}
     for k, row in enumerate(rows):
-        x, y, z, w = Rotation.from_matrix(T[k][:9].view(3, 3).numpy()).as_quat()
-        lines += [f"{k + 1} {w} {x} {y} {z} {row[18]} {row[19]} {row[20]} 1 {row[0]}", ""]
-        K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-        scene[str(k)] = {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]}
         shutil.copy(folder / row[0], tmp_path / f"00000{k}.png")
-    (tmp_path / "images.txt").write_text("\n".join(lines))
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 240 180 260 260 120 90\n")
-    (tmp_path / "scene_camera.json").write_text(json.dumps(scene))
-    (tmp_path / "scene_gt.json").write_text(json.dumps({str(k): [{"obj_id": 5}] for k in range(3)}))
-    (tmp_path / "scene_gt_info.json").write_text(json.dumps({str(k): [{"bbox_obj": [5, 6, 20, 30]}] for k in range(3)}))
+    write_colmap(tmp_path, rows)
+    write_bop_scene(tmp_path, rows, [[5]] * 3, [[5, 6, 20, 30]])
     session = send(workspace, folder, "0.png", "1.png")
     send(workspace, tmp_path, "images.txt")
     assert workspace.messages["rig"].startswith("images.txt: ")
@@ -244,9 +223,8 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert (workspace.messages, len(session.together())) == ({}, 2)
     assert session.rig_gaps() == "not open: 2.png; drop what is missing here, or go on without"
     example_mesh().apply_scale(1000.0).export(tmp_path / "obj_000005.ply")
-    send(
-        workspace, tmp_path, "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
-    )
+    names = "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
+    send(workspace, tmp_path, *names)
     assert (workspace.messages, session.options.unit) == ({}, "mm")
     assert [shot.path.name for shot in session.together()] == ["000000.png"]
     assert session.shot.box == (5.0, 6.0, 25.0, 36.0)

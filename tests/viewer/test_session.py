@@ -6,7 +6,6 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,7 +23,7 @@ from curvireg_torch.viewer import session as module
 from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.shot import dragged_box
 from tests._support.exif import exif, with_exif
-from tests._support.scenes import scene
+from tests._support.scenes import scene, write_photo
 
 VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 
@@ -32,8 +31,7 @@ VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
 def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]:
     """Write photo.png, truck.ply and small.json; returns the box and the true pose."""
     image, box, T = scene(seed)
-    picture = (image.permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-    cv2.imwrite(str(folder / "photo.png"), picture)
+    write_photo(folder / "photo.png", image)
     example_mesh().export(folder / "truck.ply")
     small = replace(PRESETS["classical"], views=VIEWS, bank=BankSettings(image_size=96), hypotheses=2)
     (folder / "small.json").write_text(small.to_json())
@@ -61,17 +59,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     write_scene(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def session(registered):
-    """The session at its first hypothesis; its options and its result are restored afterwards."""
-    session = registered[0]
-    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
-    shot.choose(0)
-    yield session
-    vars(shot).update(kept)
-    session.options = options
 
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
@@ -111,8 +98,7 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     calibrated = replace(found, probabilities=(0.95, 0.03))
     session.shot.result = replace(session.shot.result, registration=calibrated)
     assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
-    assert session.document()["probabilities"] == [0.03, 0.95]
-    assert session.document()["none"] == pytest.approx(0.02)
+    assert (session.document()["probabilities"], session.document()["none"]) == ([0.03, 0.95], pytest.approx(0.02))
     assert session.document()["covariance"] is None
     session.shot.choose(0)
     assert session.shot.result.chosen is calibrated
@@ -196,11 +182,8 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session):
 
 def test_messages_use_the_names_of_the_user(folder):
     session = Session(RegisterOptions(), folder)
-    assert [session.name(path) for path in (folder / "cat.obj", "other/cat.obj", "")] == [
-        "cat.obj",
-        "other/cat.obj",
-        "",
-    ]
+    paths = (folder / "cat.obj", "other/cat.obj", "")
+    assert [session.name(path) for path in paths] == ["cat.obj", "other/cat.obj", ""]
     warnings = CurviregWarning("large", subject=folder / "cat.obj"), UserWarning("plain")
     assert list(map(session.describe_warning, warnings)) == ["cat.obj: large", "plain"]
     with pytest.raises(InvalidInputError, match="choose a photograph and a mesh"):
@@ -252,8 +235,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     session.set_camera(Camera(K, size=(360, 480)))
     session.load()
     plain = session.shot.photo
-    assert session.request().camera == pytest.approx((250, 250, 119.5, 89.5))
-    assert plain.notes == ()
+    assert (session.request().camera, plain.notes) == (pytest.approx((250, 250, 119.5, 89.5)), ())
     assert "--camera 250 250 119.5 89.5" in session.command()
     session.shot.set_box((10.0, 20.0, 90.0, 80.0))
     camera, box = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480)), ["--box", "10", "20", "90", "80"]
@@ -262,9 +244,7 @@ def test_distortion_is_removed_from_all_photographs(folder):
     given.load()
     seen = undistorted(plain.image, camera, torch.tensor([10.0, 20, 90, 80]))
     assert torch.equal(given.shot.photo.image, seen.image)
-    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), (
-        "the option is of the photograph as it was taken"
-    )
+    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), "px of the photograph as it was taken"
     with pytest.raises(InvalidInputError, match="--box: needs a photograph"):
         new_session(*box).load()
     session.set_camera(camera)
@@ -279,14 +259,13 @@ def test_distortion_is_removed_from_all_photographs(folder):
     session.shot.set_box(tuple(scene(0)[1].tolist()))
     session.register()
     document = session.document()
-    assert document["inputs"]["camera_source"] == "file"
-    assert document["camera"] == camera.at((180, 240)).describe()
+    assert (document["inputs"]["camera_source"], document["camera"]) == ("file", camera.at((180, 240)).describe())
     assert "cr.register(cr.geometry.undistorted(cr.data.read_photo(" in session.python()
     session.set_camera((250.0, 250.0, 119.5, 89.5))
     assert [torch.equal(shot.photo.image, plain.image) for shot in session.shots] == [True, True]
 
 
-def test_command_contains_inputs_and_options(folder):
+def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session = new_session("--unit", "mm", "--up=-y", "--pose", "any", "--preset", "fast")
     session.open_photo(Path("photo.png"))
     assert not session.has_exif
@@ -306,9 +285,6 @@ def test_command_contains_inputs_and_options(folder):
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
-
-
-def test_command_contains_the_limits_on_the_pose():
     words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2", "--fov", "65"]
     session = new_session(*words)
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
@@ -321,9 +297,8 @@ def test_command_contains_the_limits_on_the_pose():
 
 @pytest.mark.usefixtures("folder")
 def test_register_is_cancelled_by_the_user():
-    session = new_session(
-        "photo.png", "truck.ply", "--pipeline", "small.json", "--box", *map(str, scene(0)[1].tolist())
-    )
+    box = map(str, scene(0)[1].tolist())
+    session = new_session("photo.png", "truck.ply", "--pipeline", "small.json", "--box", *box)
     session.load()
     session.cancelled = True
     with pytest.raises(CurviregError, match=r"^stopped$"):
@@ -335,9 +310,8 @@ def test_register_is_cancelled_by_the_user():
 BOX = (10.0, 20.0, 60.0, 50.0)
 
 
-@pytest.mark.parametrize(
-    ("box", "start", "end", "expected"),
-    [
+def test_a_drag_draws_moves_and_resizes_boxes():
+    for box, start, end, expected in (
         (None, (60, 50), (10, 20.26), (10, 20.3, 60, 50)),
         (BOX, (200, 200), (201, 202), BOX),
         (BOX, (11, 35), (5, 99), (5, 20, 60, 50)),
@@ -347,11 +321,8 @@ BOX = (10.0, 20.0, 60.0, 50.0)
         (BOX, (100, 100), (120, 130), (100, 100, 120, 130)),
         (BOX, (10, 35), (90, 35), (60, 20, 90, 50)),
         ((10, 10, 16, 16), (15.5, 13), (30, 13), (10, 10, 30, 16)),
-    ],
-    ids=["new", "click", "left", "top", "corner", "inside", "outside", "across", "small"],
-)
-def test_a_drag_draws_moves_and_resizes_boxes(box, start, end, expected):
-    assert dragged_box(box, start, end, reach=4.0) == expected
+    ):
+        assert dragged_box(box, start, end, reach=4.0) == expected
 
 
 @pytest.fixture
@@ -366,28 +337,20 @@ def seen(T, K, point):
     return at[:2] / at[2]
 
 
-def test_the_centre_follows_the_mouse_that_drags_the_mesh(pose):
+def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     result, T, K, describer = pose
     moved = result.dragged(T, K, (100.0, 80.0), (112.0, 75.0), turns=False)
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
     torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
     assert torch.equal(moved[:3, :3], T[:3, :3])
-
-
-def test_the_near_side_follows_the_mouse_that_drags_beside_the_mesh(pose):
-    result, T, K, describer = pose
     near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
     turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
     shift = seen(turned, K, near) - seen(T, K, near)
     assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
     assert 3 < shift[1] < 6
     torch.testing.assert_close(seen(turned, K, describer.centre), seen(T, K, describer.centre))
-
-
-def test_wheel_and_twist_scale_and_roll_about_the_centre(pose):
-    result, T, K, describer = pose
     moved = result.scaled(T, 1.25, roll=30.0)
-    centres = [pose[:3, :3] @ describer.centre + pose[:3, 3] for pose in (T, moved)]
+    centres = [P[:3, :3] @ describer.centre + P[:3, 3] for P in (T, moved)]
     torch.testing.assert_close(centres[1], centres[0] / 1.25)
     assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
     # Clockwise on the screen: what is right of the centre goes down.

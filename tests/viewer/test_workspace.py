@@ -8,6 +8,7 @@ import threading
 import warnings
 import zipfile
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -53,8 +54,7 @@ def test_uploads_find_their_place(workspace, scene):
     for name in ("a.png", "b.png"):
         asyncio.run(upload(workspace, scene / "photo.png", name))
     assert (names(workspace), session.shot.path.name) == (["a.png", "b.png"], "b.png")
-    assert session.shot.photo.image.shape == (3, 180, 240)
-    assert workspace.messages == {}
+    assert (session.shot.photo.image.shape, workspace.messages) == ((3, 180, 240), {})
     assert sorted(stored(workspace)) == ["a.png", "b.png", "part.PLY"], "the former mesh is removed"
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
@@ -84,7 +84,14 @@ def test_messages_are_about_one_file_and_go_when_their_cause_is_gone(workspace, 
     assert workspace.messages == {}
 
 
-def test_uploads_are_bounded(workspace, scene, monkeypatch):
+def test_uploads_are_bounded_and_not_larger_than_announced(workspace, scene, monkeypatch):
+    async def blocks():
+        for _ in range(3):
+            yield b"12"
+
+    with pytest.raises(InvalidInputError, match=r"^x\.png: larger than announced"):
+        asyncio.run(workspace.receive("x.png", 5, blocks()))
+    assert stored(workspace) == []
     size = (scene / "photo.png").stat().st_size
     monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 2 * size)
     asyncio.run(upload(workspace, scene / "photo.png"))
@@ -93,21 +100,9 @@ def test_uploads_are_bounded(workspace, scene, monkeypatch):
         asyncio.run(upload(workspace, scene, "x.png", b"0"))
 
 
-def test_an_upload_of_more_than_it_announced_is_refused(workspace):
-    async def blocks():
-        for _ in range(3):
-            yield b"12"
-
-    with pytest.raises(InvalidInputError, match=r"^x\.png: larger than announced"):
-        asyncio.run(workspace.receive("x.png", 5, blocks()))
-    assert stored(workspace) == []
-
-
 def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
-    limits = {"theta": (-10.0, 10.0)}
-    own = replace(
-        RegisterOptions(), unit="ft", pose="any", limits=limits, camera=(9.0, 9.0, 5.0, 5.0), mesh_is="similar"
-    )
+    limits, camera = {"theta": (-10.0, 10.0)}, (9.0, 9.0, 5.0, 5.0)
+    own = replace(RegisterOptions(), unit="ft", pose="any", limits=limits, camera=camera, mesh_is="similar")
     session = workspace.session
     session.options = own
     for _ in range(2):
@@ -131,18 +126,8 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
 
 def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     """Outline of the cup and its handle, marked by eye in the photograph, in px."""
-    marked = [
-        (173, 116),
-        (177, 163),
-        (183, 193),
-        (200, 220),
-        (409, 117),
-        (400, 166),
-        (380, 214),
-        (280, 286),
-        (302, 283),
-    ]
-    handle = [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
+    sides = [(173, 116), (177, 163), (183, 193), (200, 220), (409, 117), (400, 166), (380, 214)]
+    foot, handle = [(280, 286), (302, 283)], [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
@@ -151,17 +136,14 @@ def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     T, K = workspace.session.shot.projection
     vertices = torch.tensor(workspace.session.mesh.vertices) @ T[:3, :3].mT + T[:3, 3]
     seen = (vertices @ K.mT)[:, :2] / vertices[:, 2:]
-    distances = torch.cdist(torch.tensor([*marked, *handle]).double(), seen).amin(dim=1)
+    distances = torch.cdist(torch.tensor([*sides, *foot, *handle]).double(), seen).amin(dim=1)
     assert float(distances.mean()) < 4
-    assert float(distances[len(marked) :].max()) < 8, "the handle is at the handle"
+    assert float(distances[-len(handle) :].max()) < 8, "the handle is at the handle"
 
 
 def test_warnings_and_defects_become_messages(workspace, capsys):
     def warn():
         warnings.warn(CurviregWarning("small", subject="a.obj"), stacklevel=1)
-
-    def fail():
-        raise KeyError("x")
 
     with warnings.catch_warnings():
         warnings.simplefilter("always")
@@ -170,7 +152,7 @@ def test_warnings_and_defects_become_messages(workspace, capsys):
     assert workspace.messages == {"mesh": "a.obj: small"}
     assert asyncio.run(workspace.run("mesh", lambda: 5)) == 5
     assert workspace.messages == {}
-    assert asyncio.run(workspace.run("pose", fail)) is None
+    assert asyncio.run(workspace.run("pose", Mock(side_effect=KeyError("x")))) is None
     assert workspace.messages["pose"].startswith("KeyError: 'x'")
     assert "Traceback" in capsys.readouterr().err
 
@@ -198,28 +180,30 @@ def search(workspace, monkeypatch):
     search.released.set()
 
 
-def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end_it(workspace, scene, search):
-    async def start():
-        search.begun.clear()
-        running = workspace.start_search()
-        assert workspace.start_search() is running, "one search at a time"
-        await asyncio.to_thread(search.begun.wait, 10)
-        return running
+async def begin(workspace, search):
+    """Start a search, and wait until it runs."""
+    search.begun.clear()
+    running = workspace.start_search()
+    assert workspace.start_search() is running, "one search at a time"
+    await asyncio.to_thread(search.begun.wait, 10)
+    return running
 
+
+def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end_it(workspace, scene, search):
     async def work():
-        await start()
+        await begin(workspace, search)
         await asyncio.wait_for(upload(workspace, scene / "photo.png"), 10)
         assert workspace.searching
         await asyncio.wait_for(upload(workspace, scene / "truck.ply"), 10)
         assert not workspace.searching
         assert workspace.messages == {}
-        running = await start()
+        running = await begin(workspace, search)
         workspace.stop()
         await asyncio.wait_for(running, 5)
         assert workspace.messages == {"pose": "stopped"}
         workspace.stop()  # nothing that could end the next search
         search.released.set()
-        await (await start())
+        await (await begin(workspace, search))
         assert workspace.messages == {}
 
     asyncio.run(work())
@@ -243,8 +227,7 @@ def test_a_search_that_waits_for_a_mesh_searches_with_it(workspace, scene, searc
 
     asyncio.run(work())
     assert len(search.shots) == 1
-    assert workspace.session.mesh_path == scene / "truck.ply"
-    assert workspace.messages == {}
+    assert (workspace.session.mesh_path, workspace.messages) == (scene / "truck.ply", {})
 
 
 def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, scene, search):
@@ -252,9 +235,7 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
 
     async def work():
         for close in (lambda: upload(workspace, scene / "photo.png"), workspace.remove_photo):
-            search.begun.clear()
-            running = workspace.start_search()
-            await asyncio.to_thread(search.begun.wait, 10)
+            running = await begin(workspace, search)
             workspace.session.searched = (workspace.session.shot,)  # as ``register`` sets it
             try:
                 await close()
@@ -267,8 +248,7 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
 
     asyncio.run(workspace.load_sample())
     asyncio.run(work())
-    assert ended == [True, True]
-    assert names(workspace) == []
+    assert (ended, names(workspace)) == ([True, True], [])
     assert workspace.messages == {}
 
 
@@ -299,8 +279,7 @@ def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene,
 
 
 def test_file_name_has_no_folders():
-    assert file_name("../../etc/passwd") == "passwd"
-    assert file_name("C:\\a\\b.png") == "b.png"
+    assert (file_name("../../etc/passwd"), file_name("C:\\a\\b.png")) == ("passwd", "b.png")
     assert file_name("a\nb\x1b.png") == "ab.png"
     assert file_name("") == file_name("a/") == file_name("..") == "file"
     assert file_name("ä" * 500 + ".png").endswith("ä.png")

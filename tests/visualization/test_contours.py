@@ -1,5 +1,3 @@
-"""Contours of depth views in closed form."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""Pictures show the pose with the camera of the registration."""
-
 from dataclasses import replace
 
 import pytest
@@ -7,8 +5,7 @@ import torch
 from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from curvireg_torch import Registrar
-from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.rendering import make_renderer, render_depth
+from curvireg_torch.rendering import render_depth
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.visualization import contour_overlay
 from tests._support.scenes import CAMERA, SIZE, scene, truck_bank
@@ -42,8 +39,3 @@ def test_contour_overlay_draws_the_object_although_the_box_is_wrong(camera, shif
         T, K = registrar.describer.cameras_of_boxes(*at, box[None])
         filling = replace(result.hypotheses[0], projection=(T[0], K[0]))
         assert fraction_near(contour_overlay(registrar, filling, image, box), mask, 2) < 0.5
-
-
-def test_a_custom_renderer_knows_one_mesh(bank):
-    with pytest.raises(InvalidInputError, match="knows one mesh"):
-        Registrar([bank, bank], renderer=make_renderer(example_mesh()))

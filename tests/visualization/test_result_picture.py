@@ -1,5 +1,3 @@
-"""The picture of a result: photograph, caption, close-up, fields and rivals."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -26,10 +24,6 @@ def registered():
     return registrar, replace(result, hypotheses=(truth, *result.hypotheses[1:])), image, box
 
 
-def is_outline(picture):
-    return (picture == GREEN).all(axis=2)
-
-
 def small_picture(sheet, number):
     """One of the eight pictures below the photograph and its caption, from 0."""
     rows = np.nonzero((sheet[720:, 20] != 255).any(axis=1))[0]  # of the first column
@@ -46,7 +40,7 @@ def test_registration_sheet_shows_the_whole_photograph_with_the_contours(registe
     assert np.median(np.abs(photograph - 255 * enlarged.clamp(0, 1).numpy())) < 2
     K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]], dtype=torch.float64) @ CAMERA
     mask = (render_depth(example_mesh(), result.projection[0], K, (720, 960))[0, 0] > 0).numpy()
-    rows, columns = np.nonzero(is_outline(photograph))
+    rows, columns = np.nonzero((photograph == GREEN).all(axis=2))
     for drawn, seen in ((rows, np.nonzero(mask)[0]), (columns, np.nonzero(mask)[1])):
         assert abs(drawn.min() - seen.min()) <= 2
         assert abs(drawn.max() - seen.max()) <= 2

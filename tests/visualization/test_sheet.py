@@ -1,5 +1,3 @@
-"""The page of thumbnails."""
-
 import re
 from dataclasses import replace
 
