@@ -108,9 +108,22 @@ class ViewDescriber:
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`. With the mesh's
         colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`."""
-        S, projection = self.settings.image_size, {"orthographic": self._orthographic}
+        return self._shaded(*self._framed(rotations, distances))
+
+    @torch.no_grad()
+    def described(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`descriptors` and :meth:`shaded`, of the same depth images."""
+        depth, T, K = self._framed(rotations, distances)
+        return self.descriptor(self._filter(depth.to(self._device))), self._shaded(depth, T, K)
+
+    def _framed(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         T, K, _ = self.cameras(rotations, distances)
-        grey = shade(self.view_renderer.render(T, K, (S, S), **projection), K, **projection).to(self._device)
+        size = (self.settings.image_size,) * 2
+        return self.view_renderer.render(T, K, size, orthographic=self._orthographic), T, K
+
+    def _shaded(self, depth: Tensor, T: Tensor, K: Tensor) -> Tensor:
+        S, projection = self.settings.image_size, {"orthographic": self._orthographic}
+        grey = shade(depth, K, **projection).to(self._device)
         if not self._coloured:
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)

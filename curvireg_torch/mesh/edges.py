@@ -21,7 +21,7 @@ class MeshEdges:
         vertices: (V, 3) float64, relative to ``centre``.
         faces: (F, 3) int.
         edges: (E, 2) vertices of each edge.
-        normals: (V, 3) unit vectors, means of the normals of the faces around each vertex.
+        normals: (V, 3) float32 unit vectors, means of the normals of the faces around each vertex.
         is_crease, is_smooth: (E,) bool.
     """
 
@@ -57,18 +57,19 @@ class MeshEdges:
         total = np.zeros_like(vertices)
         for k in range(3):
             np.add.at(total, faces[:, k], self._plane)
-        self.normals: np.ndarray = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+        normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
+        self.normals: np.ndarray = normals.astype(np.float32)
 
     def sides(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which edges are on the occluding contour, seen from cameras (N, 3) relative to ``centre``. (N, E) bool:
-        the third corners of all faces lie on one side of the plane through camera and edge. (N, E) the sign of that
-        side, of ((a - eye) x (b - eye)) . (corner - eye)."""
+        the third corners of all faces lie on one side of the plane through camera and edge. (N, E) bool: whether
+        ((a - eye) x (b - eye)) . (corner - eye) is positive there."""
         behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
         first, *others = (behind[:, faces] ^ flip for faces, flip in zip(self._edge_faces.T, self._flips, strict=True))
         all_same = np.ones_like(first)
         for other in others:
             all_same &= first == other
-        return all_same, np.where(first, 1.0, -1.0)
+        return all_same, first
 
 
 def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -141,18 +141,19 @@ class ContourProblem:
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
         """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and ``others`` measurements."""
         uv, du = project(points.model, T, self.K, self.centre)
-        J = (points.normals[..., None, :] @ du)[..., 0, :]
         distance, strength = self._candidates(uv, points, radius)
+        J = (points.normals[..., None, :] @ du)[..., 0, :].to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
         step = torch.zeros(len(T), 6, 1, dtype=torch.float64)
         for _ in range(SELECTIONS_PER_STEP):
-            residual = distance - J @ step
+            residual = distance - J @ step.to(J.dtype)
             index = (strength * torch.exp(-2.0 * (residual / radius) ** 2)).argmax(dim=-1, keepdim=True)
             tukey = (1.0 - (residual.gather(-1, index) / radius) ** 2).clamp(min=0.0) ** 2
             edges = Measurements(J, distance.gather(-1, index), strength.gather(-1, index) * tukey)
-            A, b = (sum(parts) for parts in zip(edges.equations(), *equations, strict=True))
+            own = (each.double() for each in edges.equations())
+            A, b = (sum(parts) for parts in zip(own, *equations, strict=True))
             step = self.solution(A, b)[..., None]
         return apply_twist(T, step[..., 0] * self.step_fraction(step[..., 0], T)[:, None], self.centre)
 
@@ -165,7 +166,8 @@ class ContourProblem:
         return step_fraction(step, T, self.centre)
 
     def _candidates(self, uv: Tensor, points: ContourPoints, radius: float) -> tuple[Tensor, Tensor]:
-        """Distances in px along the normals and strengths, both (N, P, L); the strength is 0 where there is no edge."""
+        """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a step; the strength is 0
+        where there is no edge."""
         offsets = _offsets(radius)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
         before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
@@ -183,15 +185,15 @@ class ContourProblem:
         by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
-        offsets = torch.arange(-3, 4, dtype=torch.float64)
+        offsets = torch.arange(-3.0, 4.0)
         counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
-        plain = (near.amax(dim=-1) * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
+        plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
         near = near * self.mask.weights(uv, points, offsets, self.image_index, self.size)
         most = self.mask.largest_weights(points) * counts  # a long outline alone is no support
-        return plain, (near.amax(dim=-1) * counts).sum(dim=1) / most.sum(dim=1).clamp(min=1)
+        return plain, (near.amax(dim=-1).double() * counts).sum(dim=1) / most.sum(dim=1).clamp(min=1)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
@@ -199,7 +201,7 @@ class ContourProblem:
         uv, du = project(points.model, state.T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, radius)
         index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
-        d = distance.gather(-1, index)
+        d = distance.gather(-1, index).double()
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
         return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
 
@@ -207,7 +209,7 @@ class ContourProblem:
 def _offsets(radius: float) -> Tensor:
     """Offsets in px at which edges are searched within ``radius`` of a predicted position."""
     far = round(1.5 * radius) + 1
-    return torch.arange(-far, far + 1, dtype=torch.float64)
+    return torch.arange(-far, far + 1, dtype=torch.float32)
 
 
 @dataclass(frozen=True)

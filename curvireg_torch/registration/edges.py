@@ -51,7 +51,7 @@ class EdgeField:
             image_index: (N,) the crop of each pose.
 
         Returns:
-            (N, P, L) float64 in [0, 1).
+            (N, P, L) float32 in [0, 1).
         """
         gradient = _sampled_lines(self._gradient, uv, normals, offsets, image_index)
         gx, gy = gradient[:, 0::2], gradient[:, 1::2]
@@ -59,7 +59,8 @@ class EdgeField:
         across = (gx * nx + gy * ny).abs()
         cosine = across * (gx * gx + gy * gy).clamp(min=1e-20).rsqrt()
         r = (across * cosine.square().square()).amax(dim=1)
-        return (r / (r + self._level[image_index, None, None])).double()
+        strength: Tensor = r / (r + self._level[image_index, None, None])
+        return strength
 
     def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
         """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but those outside the
@@ -89,7 +90,7 @@ class ObjectMask:
             image_index: (N,) the crop of each pose.
 
         Returns:
-            (N, P, L) float64, at most 2.
+            (N, P, L) float32, at most 2.
         """
         aside = MASK_DISTANCE * size
         at = torch.cat([offsets - aside, offsets + aside])
@@ -98,12 +99,12 @@ class ObjectMask:
         outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
         agreement = 1.0 - MASK_TRUST + MASK_TRUST * torch.where(is_outline, outline, within)
-        return agreement.double() * self.largest_weights(points)[..., None]
+        return agreement * self.largest_weights(points)[..., None]
 
     @staticmethod
     def largest_weights(points: ContourPoints) -> Tensor:
-        """(N, P) float64 weights of edges that agree with the mask: 2 for the outline, else 1."""
-        return torch.where(points.outline, OUTLINE_WEIGHT, 1.0).double()
+        """(N, P) float32 weights of edges that agree with the mask: 2 for the outline, else 1."""
+        return torch.where(points.outline, OUTLINE_WEIGHT, 1.0)
 
 
 def _sampled_lines(

@@ -183,23 +183,17 @@ def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) 
     return replace(poses, edge_support=support)
 
 
-def similarities(describer: ViewDescriber, descriptors: Tensor, poses: Poses) -> Tensor:
-    """(H,) normalised correlations of the poses' views with their crops, of (B, D) descriptors."""
+def similarities(views: Tensor, descriptors: Tensor, poses: Poses) -> Tensor:
+    """(H,) normalised correlations of descriptors (H, D) of the poses' views with those (B, D) of their crops."""
     queries = F.normalize(descriptors, dim=1)[poses.crop_index.to(descriptors.device)]
-    views = describer.descriptors(poses.rotation, poses.distance)
     return (F.normalize(views, dim=1) * queries).sum(dim=1).double().cpu()
 
 
 def pose_features(
-    describer: ViewDescriber,
-    descriptors: Tensor,
-    poses: Poses,
-    appearance: Tensor | None = None,
-    landmarks: Tensor | None = None,
+    poses: Poses, similarity: Tensor, appearance: Tensor | None = None, landmarks: Tensor | None = None
 ) -> Tensor:
-    """(H, 5) :data:`POSE_FEATURES`, with an ``appearance`` (H,) where the pipeline has that term, and the evidence of
-    ``landmarks`` (H,) where the mesh has any."""
-    similarity = similarities(describer, descriptors, poses)
+    """(H, 5) :data:`POSE_FEATURES`: the :func:`similarities`, the ``appearance`` (H,) where the pipeline has that term,
+    and the evidence of ``landmarks`` (H,) where the mesh has any."""
     appearance, landmarks = (torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks))
     support = poses.edge_support.nan_to_num(0.0)
     return torch.stack([poses.rank, similarity, support, appearance, landmarks], dim=1)

@@ -22,6 +22,7 @@ from .poses import (
     named_features,
     pose_features,
     pose_scores,
+    similarities,
 )
 from .result import FailedRegistration, Registration
 from .tracker import OUTSIDE, boxes_at
@@ -96,10 +97,15 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     mask = registrar.object_mask(query, [item] * len(T))
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
     poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
-    best = pose_scores(pose_features(describer, descriptors, poses), exact=True).argmax()[None]
+
+    def features_of(poses: Poses) -> Tensor:
+        views = describer.descriptors(poses.rotation, poses.distance)
+        return pose_features(poses, similarities(views, descriptors, poses))
+
+    best = pose_scores(features_of(poses), exact=True).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
         poses = poses.replaced(best, fitted)
-    evidence = pose_features(describer, descriptors, poses)
+    evidence = features_of(poses)
     scores = pose_scores(evidence, exact=True)
     distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]

@@ -51,6 +51,7 @@ from .poses import (
     pose_features,
     pose_scores,
     projected_box,
+    similarities,
     with_edge_support,
 )
 from .priors import Limits
@@ -483,12 +484,15 @@ class Registrar:
 
     def _features(self, work: _Work, poses: Poses) -> Tensor:
         """(H, 5) :data:`POSE_FEATURES`."""
-        appearance = None
+        at, appearance = (poses.rotation, poses.distance), None
         if Appearance.name in work.ranking.terms:
-            pictures = self.matcher.describer.shaded(poses.rotation, poses.distance)
+            views, pictures = self.describer.described(*at)
             appearance = self.matcher.appearance_score(work.query, work.ranking, pictures)
+        else:
+            views = self.describer.descriptors(*at)
+        similarity = similarities(views, work.descriptors, poses)
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
-        return pose_features(self.describer, work.descriptors, poses, appearance, landmarks)
+        return pose_features(poses, similarity, appearance, landmarks)
 
     def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""

@@ -370,12 +370,11 @@ class Rig:
         matcher, parts = self.registrar.matcher, []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
-            views = F.normalize(self.describer.descriptors(R, distance), dim=1)
-            similarity = (views @ photograph.descriptor).double().cpu()
+            views, pictures = self.describer.described(R, distance)
+            similarity = (F.normalize(views, dim=1) @ photograph.descriptor).double().cpu()
             appearance = landmarks = torch.zeros_like(similarity)
             ranking = photograph.result.ranking
             if Appearance.name in ranking.terms:
-                pictures = matcher.describer.shaded(R, distance)
                 appearance = matcher.appearance_score(photograph.query, ranking, pictures)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))

@@ -22,7 +22,11 @@ def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tens
     starts. Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is
     halved where none of them is better, and the search ends where the pose stops moving at the finest step."""
     axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
-    best, score = starts.rotation, similarities(describer, descriptors, starts)
+
+    def scores_of(poses: Poses) -> Tensor:
+        return similarities(describer.descriptors(poses.rotation, poses.distance), descriptors, poses)
+
+    best, score = starts.rotation, scores_of(starts)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
     active = torch.arange(len(starts))
     for _ in range(MAX_ROUNDS):
@@ -31,7 +35,7 @@ def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tens
         turns = rotation_from_axis_angle(axes * torch.deg2rad(step[active])[:, None, None])
         candidates = turns @ best[active, None]
         each = replace(starts[active.repeat_interleave(6)], rotation=candidates.flatten(0, 1))
-        scores = similarities(describer, descriptors, each)
+        scores = scores_of(each)
         far = rotation_error(candidates, starts.rotation[active, None]).flatten() > SEARCH_ANGLE
         value, winner = scores.masked_fill(far, -1.0).view(-1, 6).max(dim=1)
         better = value > score[active]

@@ -55,19 +55,21 @@ class _Level:
         self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
 
-    def lengths(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> np.ndarray:
-        """(N, E) float32 lengths of the edges in px; 0 for those outside the crop and behind the camera."""
-        x, y, z = np.moveaxis(self._vertices @ float32(R.transpose(0, 2, 1)) + float32(position)[:, None], -1, 0)
+    def seen(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+        """(N, V, 3) float32 vertices in the cameras' frames, and (N, E) float32 lengths of the edges in px; 0 for those
+        outside the crop and behind the camera."""
+        vertices = self._vertices @ R.transpose(0, 2, 1) + position[:, None]
+        x, y, z = np.moveaxis(vertices, -1, 0)
         behind = z <= NEAR_PLANE * self.radius
         z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
-        fx, fy, cx, cy = (float32(K[:, i, j])[:, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, fy, cx, cy = (K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         u, v = fx * x / z + cx, fy * y / z + cy
         beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
         a, b = self.edges.edges.T
         beyond = beyond.astype(np.uint8)
         outside = (beyond[:, a] & beyond[:, b]) | ((beyond[:, a] | beyond[:, b]) & 16)
         length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
-        return length
+        return vertices, length
 
     def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
@@ -107,56 +109,62 @@ class MeshContours:
         """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
         ``density`` is a fraction of the usual number of points."""
         T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
-        R = T[:, :3, :3]
         level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
         edges = level.edges
-        position = R @ self.centre.numpy() + T[:, :3, 3]
-        eye = -(position[:, None] @ R)[:, 0]
+        position = T[:, :3, :3] @ self.centre.numpy() + T[:, :3, 3]
+        eye = -(position[:, None] @ T[:, :3, :3])[:, 0]
         on_contour, side = edges.sides(eye)
-        length = level.lengths(R, position, K, size)
-        parts = []
+        R, position, K, eye = (float32(each) for each in (T[:, :3, :3], position, K, eye))
+        vertices, length = level.seen(R, position, K, size)
+        rows, parts = np.arange(len(T))[:, None], []
         for weights, count, most, occluding in (
             (length * on_contour, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
             (length * (edges.is_crease & ~on_contour), CREASE_CANDIDATES, MAX_CREASES, False),
         ):
             index, fraction, valid = _spread(weights, round(density * count))
             ends = edges.edges[index]  # (N, M, 2)
-            rows = np.arange(len(T))[:, None]
-            a, b = (edges.vertices[ends[..., k]] @ R.transpose(0, 2, 1) + position[:, None] for k in (0, 1))
-            at = a + fraction[..., None] * (b - a)
-            normal = _across(np.cross(a, b), K) * -side[rows, index][..., None]
+            a, along = vertices[rows, ends[..., 0]], vertices[rows, ends[..., 1]]
+            along -= a
+            at = a + fraction[..., None] * along
+            z = at[..., 2]
+            normal = _across(_cross(a, along), K) * np.where(side[rows, index], -1, 1).astype(np.float32)[..., None]
             if occluding:  # of a smooth surface, interpolate the vertices' normals
                 n0, n1 = edges.normals[ends[..., 0]], edges.normals[ends[..., 1]]
                 smooth = _across((n0 + fraction[..., None] * (n1 - n0)) @ R.transpose(0, 2, 1), K)
-                smooth *= np.where((smooth * normal).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
-                agree = edges.is_smooth[index] & ((smooth * normal).sum(axis=-1) > 0.5)
-                normal = np.where(agree[..., None], smooth, normal)
-            pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(at[..., 2:], NEAR_PLANE * self.radius)
+                agreement = (smooth * normal).sum(axis=-1)
+                agree = edges.is_smooth[index] & (np.abs(agreement) > 0.5)
+                normal = np.where(agree[..., None], np.sign(agreement)[..., None] * smooth, normal)
+            pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(z, np.float32(NEAR_PLANE * self.radius))[..., None]
             if occluding:
-                hit = level.depth_at(pixel + ASIDE * normal, K, R, eye)
-                valid &= hit - at[..., 2] > OCCLUSION_JUMP * self.radius
+                hit = level.depth_at(pixel + np.float32(ASIDE) * normal, K, R, eye)
+                valid &= hit - z > OCCLUSION_JUMP * self.radius
                 outline = valid & np.isinf(hit)
             else:
-                step = CREASE_SCALE * size
+                step = np.float32(CREASE_SCALE * size)
                 beside = np.concatenate([pixel, pixel + step * normal, pixel - step * normal], axis=1)
                 here, ahead, back = np.split(level.depth_at(beside, K, R, eye), 3, axis=1)
-                z = at[..., 2]
                 valid &= here > z - VISIBLE_TOLERANCE * self.radius
                 with np.errstate(invalid="ignore"):
                     bend = np.abs(ahead - 2.0 * z + back) / step * K[:, :1, 0] / z
                     flat = np.maximum(np.abs(ahead - z), np.abs(back - z)) < 2.0 * OCCLUSION_JUMP * self.radius
                 valid &= (bend > CREASE_BEND) & flat
                 outline = np.zeros_like(valid)
-            model = (at - T[:, None, :3, 3]) @ R
             chosen, valid = _evenly(valid, round(density * most))
-            parts.append((model[rows, chosen], normal[rows, chosen], valid, outline[rows, chosen] & valid))
+            model = (at[rows, chosen] - position[:, None]).astype(np.float64) @ T[:, :3, :3] + self.centre.numpy()
+            parts.append((model, normal[rows, chosen].astype(np.float64), valid, outline[rows, chosen] & valid))
         return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The first two components of the cross products of (N, M, 3)."""
+    return np.stack([a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]], -1)
+
+
 def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 3), appear."""
+    """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 2 or 3),
+    appear."""
     n = plane[..., :2] / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
-    unit: np.ndarray = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
+    unit: np.ndarray = n / np.maximum(np.hypot(n[..., :1], n[..., 1:]), np.float32(1e-30))
     return unit
 
 
@@ -164,13 +172,13 @@ def _spread(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np
     """``count`` places along edges of lengths (N, E), evenly: the edge, the fraction of its length, and whether there
     is one."""
     index = np.zeros((len(weights), count), np.int64)
-    fraction = np.zeros((len(weights), count))
+    fraction = np.zeros((len(weights), count), np.float32)
     total = weights.cumsum(axis=1)
     for row, (weight, end) in enumerate(zip(weights, total, strict=True)):
         if len(end) and end[-1] > 0:
             target = (np.arange(count) + 0.5) * (end[-1] / count)
             index[row] = np.minimum(np.searchsorted(end, target), len(end) - 1)
-            fraction[row] = 1.0 - (end[index[row]] - target) / np.maximum(weight[index[row]], 1e-300)
+            fraction[row] = 1.0 - (end[index[row]] - target) / np.maximum(weight[index[row]], 1e-30)
     there = np.broadcast_to((total[:, -1:] > 0) if total.shape[1] else np.zeros((len(weights), 1), bool), index.shape)
     return index, fraction.clip(0.0, 1.0), there.copy()
 

@@ -109,6 +109,19 @@ def test_edge_strength_peaks_on_a_slanted_edge():
     assert float(edges.strength(here + 500, n, offsets, FIRST).max()) == 0
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest_channel(sign):
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    ramp = sign * torch.tensor([0.004, 0.01, -0.005])[:, None, None] * (0.8 * x + 0.6 * y)
+    angles = math.atan2(0.6, 0.8) + torch.tensor([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi], dtype=torch.float64)
+    n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
+    here = torch.tensor([31.5, 30.2]).double().expand(1, 6, 2)
+    strength = EdgeField(ramp[None]).strength(here, n, torch.zeros(1), FIRST)[0, :, 0].double()
+    r = strength / (1.0 - strength)  # in units of the crop's root mean square gradient
+    cosine = (angles - angles[0]).cos().abs()
+    torch.testing.assert_close(r / r[0], cosine**5, rtol=1e-3, atol=1e-4)
+
+
 def test_edges_outside_the_photograph_do_not_count():
     """A crop whose right half repeats the border of the photograph."""
     inside = torch.zeros(1, 1, 64, 64)
