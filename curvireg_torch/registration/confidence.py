@@ -24,8 +24,8 @@ CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.j
 # true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs
 COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
 # Landmarks that must agree on a pose, and the probability that the object is where they do, in a whole photograph: on
-# generated shelves 28 of 29. It is less where other objects have a similar print
-MIN_LANDMARKS, LANDMARK_PROBABILITY = 12, 0.95
+# generated shelves 84 of 88. It is less where other objects have a similar print
+MIN_LANDMARKS, LANDMARK_PROBABILITY = 8, 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
 CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value

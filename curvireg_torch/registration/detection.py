@@ -20,7 +20,7 @@ from ..geometry.pose_prior import PosePrior, check_distance
 from ..matching import ViewBank, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
-from .confidence import MIN_LANDMARKS, detection_probability
+from .confidence import detection_probability
 from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
 from .priors import Limits
@@ -91,11 +91,10 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
     distance = allowed = None
     poses, count = registrar.landmark_poses(item, registrar.landmark_matches(item))
-    kept = count >= MIN_LANDMARKS
     if item.prior is not None:
         distance, allowed = item.prior.distance, _allowed_views(registrar, item)
-        kept = kept & Limits(item, registrar.bank).keeps(poses)
-    poses, count = poses[kept], count[kept]
+        kept = Limits(item, registrar.bank).keeps(poses)
+        poses, count = poses[kept], count[kept]
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)

@@ -16,6 +16,7 @@ from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.threads import map_on_threads
+from .confidence import MIN_LANDMARKS
 from .inputs import resized
 from .least_squares import nearest_rigid
 
@@ -34,7 +35,6 @@ MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
 REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
 AGREEMENT = 0.06  # The same of poses that were fitted to edges as well
 RANSAC_ROUNDS = 500
-MIN_AGREEING = 8  # Landmarks on which a pose must agree: on generated shelves 48 of 50 such poses are right
 FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks
 
 
@@ -86,7 +86,7 @@ class LandmarkMatches:
     radius: float
 
     def poses(self) -> list[LandmarkPose]:
-        """Poses on which at least ``MIN_AGREEING`` agree, the largest number first."""
+        """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first."""
         near = np.abs(self.centres[:, None] - self.centres) < CLUSTER_DISTANCE * np.sqrt(
             self.radii[:, None] * self.radii
         )
@@ -94,7 +94,7 @@ class LandmarkMatches:
         poses, left = [], np.ones(len(self.uv), dtype=bool)
         for _ in range(MAX_CLUSTERS):
             votes = (near & left).sum(axis=1) * left
-            if not len(votes) or votes.max() < MIN_AGREEING:
+            if not len(votes) or votes.max() < MIN_LANDMARKS:
                 break
             cluster = near[votes.argmax()] & left
             size = float(np.median(self.radii[cluster]))
@@ -213,7 +213,7 @@ def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> La
     count = _places(uv[inliers[:, 0]], error)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
-    if count < MIN_AGREEING or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
+    if count < MIN_LANDMARKS or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
     return LandmarkPose(nearest_rigid(T[None])[0], count)
 

@@ -25,6 +25,7 @@ from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
 from .confidence import (
+    MIN_LANDMARKS,
     are_near,
     concentration,
     confidence_features,
@@ -36,7 +37,7 @@ from .contour_fit import quick_support
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
-from .landmarks import MIN_AGREEING, LandmarkMatches, Landmarks
+from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
     POSE_FEATURES,
     SCORE_WEIGHTS,
@@ -499,7 +500,7 @@ class Registrar:
         poses = fit_poses(self.describer, crops, starts)
         if work.landmarks is not None:
             before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
-            left = ((before >= MIN_AGREEING) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
+            left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
             if len(left):
                 poses = poses.replaced(left, with_edge_support(self.describer, crops, starts[left]))
         return poses

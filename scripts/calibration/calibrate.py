@@ -36,7 +36,7 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
-from curvireg_torch.registration.confidence import MIN_LANDMARKS, RELIABLE, LogisticModel
+from curvireg_torch.registration.confidence import RELIABLE, LogisticModel
 from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
 from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
@@ -169,7 +169,7 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         lost = not result.ok and isinstance(result.error, LostObjectError)
         found = result.detection if result.ok else result.error.detection if lost else None
-        if found is not None and found.response < MIN_LANDMARKS:
+        if found is not None and not float(found.response).is_integer():  # not a number of landmarks
             query = registrar.matcher.query([shown["image"]], found.box[None].float())
             features = {"response": found.response, "similarity": float(registrar.matcher.similarity(query))}
             overlap = float(box_iou(found.box[None], shown["box"][None].double()))
