@@ -185,7 +185,7 @@ class ContourProblem:
         by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
-        offsets = torch.arange(-3.0, 4.0)
+        offsets = torch.arange(-3, 4, dtype=torch.float32)
         counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
@@ -365,11 +365,24 @@ def fit_to_edges(
     before[index] = support[: len(index)]
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
     state, support = state[best], support[best]
-    measured = full.measured_edges(state, FULL_SIZE_RADII[-1])
+    return _measured(full, state, support, before)
+
+
+def _measured(full: ContourProblem, state: ContourState, support: Tensor, before: Tensor) -> ContourFit:
+    edges, contours = full.measured_edges(state, FULL_SIZE_RADII[-1]), full.contours
     covariance, observable = pose_covariance(
-        measured, state.points, state.T, full.K, contours.centre, radius=contours.radius
+        edges, state.points, state.T, full.K, contours.centre, radius=contours.radius
     )
     return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
+
+
+@torch.no_grad()
+def measure_contours(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor) -> ContourFit:
+    """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay as they are."""
+    full = ContourProblem.of(contours, crops, K, image_index)
+    state = full.state(T)
+    support = full.edge_support(state)
+    return _measured(full, state, support, support)
 
 
 @torch.no_grad()

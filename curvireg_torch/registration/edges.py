@@ -104,7 +104,7 @@ class ObjectMask:
     @staticmethod
     def largest_weights(points: ContourPoints) -> Tensor:
         """(N, P) float32 weights of edges that agree with the mask: 2 for the outline, else 1."""
-        return torch.where(points.outline, OUTLINE_WEIGHT, 1.0)
+        return 1.0 + (OUTLINE_WEIGHT - 1.0) * points.outline.float()
 
 
 def _sampled_lines(

@@ -74,7 +74,7 @@ class Follower:
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
-            ImageError: pixels around the mesh are missing or outside [0, 1].
+            ImageError: pixels around the mesh are outside [0, 1].
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))
@@ -105,7 +105,7 @@ class Follower:
         if not self._base:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
         tracked: TrackedPose | None = None
-        with suppress(LostObjectError, ImageError):  # pixels may be missing around the last pose
+        with suppress(LostObjectError, ImageError):  # pixels around the last pose may be unusable
             tracked = self._tracker.track(item.image, item.K)
         found = None if tracked is None else self._registration(tracked, item)
         if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:

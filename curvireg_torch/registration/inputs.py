@@ -4,7 +4,7 @@ Boxes and cameras that are possible, but probably a mistake, give warnings: a re
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
@@ -134,10 +134,11 @@ def image_items(
     return OnDemand(item, n)
 
 
-def _one_each(values: Sequence[Any], count: int, name: str) -> list[Any]:
+def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
+    values = list(values)
     if len(values) != count:
         raise InvalidInputError(f"{name}: expected {count}, one for each image or None, got {len(values)}")
-    return list(values)
+    return values
 
 
 def is_missing(box: Any) -> bool:

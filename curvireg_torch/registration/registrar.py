@@ -33,7 +33,7 @@ from .confidence import (
     is_calibrated,
     registration_confidence,
 )
-from .contour_fit import quick_support
+from .contour_fit import measure_contours, quick_support
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
@@ -281,6 +281,11 @@ class Registrar:
     def _shape_symmetries(self) -> Tensor | None:
         return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
+    @property
+    def fits_landmarks(self) -> bool:
+        """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
+        return self.is_exact(with_camera=True) and self.pipeline.contours
+
     def landmark_matches(self, item: ImageItem, box: Tensor | None = None) -> LandmarkMatches | None:
         """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without colours or a camera
         matrix.
@@ -424,7 +429,7 @@ class Registrar:
         if self.pipeline.contours:
             mask = self.object_mask(query, [item])
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
-        landmarks = self.landmark_matches(item, item.box) if exact and crops is not None else None
+        landmarks = self.landmark_matches(item, item.box) if self.fits_landmarks else None
         descriptors = self.describer.descriptor(query.field)
         return _Work(item, query, ranking, descriptors, limits, exact, symmetries, crops, landmarks)
 
@@ -502,7 +507,9 @@ class Registrar:
             before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
             left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
             if len(left):
-                poses = poses.replaced(left, with_edge_support(self.describer, crops, starts[left]))
+                kept = starts[left]
+                seen = measure_contours(self.describer.contours, crops, kept.cameras, kept.T, kept.crop_index)
+                poses = poses.replaced(left, kept.with_fit(seen, self.describer.centre))
         return poses
 
     def _fitted_again(
@@ -597,7 +604,7 @@ def _better(
 
 
 def _agreement(result: Registration) -> float:
-    """Evidence for the pose that does not depend on the box: similarity and landmarks, with their weights."""
+    """Evidence for the pose that results in different boxes have in common: similarity and landmarks, weighted."""
     weights, evidence = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True)), result.hypotheses[0].evidence
     return sum(weights[name] * evidence[name] for name in ("similarity", "landmarks"))
 

@@ -128,7 +128,7 @@ class RigPhotograph:
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
             descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1)[0],
-            landmarks=registrar.landmark_matches(item, box),
+            landmarks=registrar.landmark_matches(item, box) if registrar.fits_landmarks else None,
             result=result,
         )
 
@@ -370,11 +370,13 @@ class Rig:
         matcher, parts = self.registrar.matcher, []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
-            views, pictures = self.describer.described(R, distance)
+            compares = Appearance.name in (ranking := photograph.result.ranking).terms
+            views, pictures = (
+                self.describer.described(R, distance) if compares else (self.describer.descriptors(R, distance), None)
+            )
             similarity = (F.normalize(views, dim=1) @ photograph.descriptor).double().cpu()
             appearance = landmarks = torch.zeros_like(similarity)
-            ranking = photograph.result.ranking
-            if Appearance.name in ranking.terms:
+            if pictures is not None:
                 appearance = matcher.appearance_score(photograph.query, ranking, pictures)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))

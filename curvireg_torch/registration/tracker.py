@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..errors import LostObjectError
+from ..errors import ImageError, LostObjectError
 from ..geometry import rotation_error
 from ..geometry.cameras import projected_boxes, transform
 from ..rendering import DepthRenderer
@@ -265,10 +265,10 @@ class Tracker:
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
         """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3); :class:`LostObjectError` if it left the
-        image."""
+        image, or pixels around it are outside [0, 1]."""
         found: list[TrackedPose] = []
         for T in self.predictions():
-            with suppress(LostObjectError):
+            with suppress(LostObjectError, ImageError):  # pixels beside a wrong prediction may be unusable
                 found.append(self._fit(image, K, T))
                 if found[-1].confidence >= RELIABLE:
                     break

@@ -82,7 +82,7 @@ def test_inverted_masks_and_boxes_that_the_camera_did_not_record_are_warned_of()
 
 def test_mask_gives_the_box_and_the_outline():
     _, photo, box, mask, T = distorted(RADIAL, 2)
-    (result,) = truck_registrar()([photo], None, RADIAL, masks=[mask])
+    (result,) = truck_registrar()([photo], None, RADIAL, masks=iter([mask]))
     assert errors(result, T)[0] < 1.0
     y, x = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).nonzero().unbind(1)
     true_box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])

@@ -159,9 +159,11 @@ def test_a_fit_that_leaves_the_landmarks_is_not_kept(monkeypatch):
         return placed(fitted, apply_twist(fitted.T, twist.expand(len(fitted), 6), describer.centre), describer.centre)
 
     monkeypatch.setattr(registrar_module, "fit_poses", fit_elsewhere)
+    monkeypatch.setattr(registrar_module, "fit_texture_of", lambda *_: None)
     result = registrar()([photograph(T)], box_of(T)[None], K)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
     assert result.edge_support > 0.0
+    assert result.covariance is not None
 
 
 def test_a_pose_needs_enough_landmarks_at_different_places():

@@ -128,6 +128,15 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
     assert (result.edge_support == support) == kept
 
 
+def test_default_dtype_does_not_matter():
+    torch.set_default_dtype(torch.float64)
+    try:
+        result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert rotation_error(result.rotation, TRUTH[:3, :3]) < 2
+
+
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = registrar_module.fit_poses
 
