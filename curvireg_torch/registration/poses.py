@@ -21,6 +21,7 @@ __all__ = [
     "SCORE_WEIGHTS",
     "Poses",
     "best_views",
+    "common_score",
     "distinct_poses",
     "fit_poses",
     "fit_texture_of",
@@ -207,6 +208,12 @@ def landmark_evidence(count: Tensor) -> Tensor:
 def pose_scores(features: Tensor, *, exact: bool) -> Tensor:
     """(H,) scores that order poses: of all features with an exact mesh, the order of the ranking with a similar one."""
     return features @ torch.tensor(SCORE_WEIGHTS if exact else RANK_ALONE, dtype=features.dtype)
+
+
+def common_score(hypothesis: Hypothesis) -> float:
+    """The part of the score that results in different boxes have in common: similarity and landmarks, weighted."""
+    weights = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True))
+    return sum(weights[name] * hypothesis.evidence[name] for name in ("similarity", "landmarks"))
 
 
 def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:

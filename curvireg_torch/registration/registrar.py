@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
 from ..features.learned_field import LearnedCurvilinearSaliency
-from ..geometry.crops import box_iou
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
@@ -39,10 +38,10 @@ from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
-    POSE_FEATURES,
     SCORE_WEIGHTS,
     Poses,
     best_views,
+    common_score,
     distinct_poses,
     fit_poses,
     fit_texture_of,
@@ -71,18 +70,12 @@ SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
 """Number of the best distinct views of an exact mesh that get a short contour fit, and weight of the edge support that
 they reach, beside log S, in the choice of those that become hypotheses."""
 
-KEPT_LANDMARKS = 0.5
-"""Fraction of the landmarks that agree with a start, which must agree with its fit as well."""
-
-SAME_BOX_OVERLAP = 0.85
-"""Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
-on 60 generated photographs."""
+KEPT_LANDMARKS = 0.5  # Fraction of the landmarks that agree with a start, which must agree with its fit as well
 
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
 
-FLAT_EXTENT = 1e-3
-"""Thickness of a mesh, as a fraction of its radius, below which it counts as flat."""
+FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
 
 Results = list[Registration | FailedRegistration]
 
@@ -366,10 +359,11 @@ class Registrar:
         # Without a camera matrix, poses are derived from their boxes.
         if self.pipeline.box_jitter and self.pipeline.contours and item.camera_matrix is not None:
             box = projected_box(self.describer, result.projection)
-            if _shows_other_part(box, item):
+            if item.shows_other_part(box):
                 with suppress(CurviregError):
                     again = self._register_box(replace(item, box=box.float()))
-                    result = replace(again, corrected_box=box) if _agreement(again) > _agreement(result) else result
+                    if common_score(again.hypotheses[0]) > common_score(result.hypotheses[0]):
+                        result = replace(again, corrected_box=box)
         return result
 
     def _register_box(self, item: ImageItem) -> Registration:
@@ -601,18 +595,3 @@ def _better(
         return replace(rival, model=model)
     ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
     return replace(rival, model=model) if ahead else one
-
-
-def _agreement(result: Registration) -> float:
-    """Evidence for the pose that results in different boxes have in common: similarity and landmarks, weighted."""
-    weights, evidence = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True)), result.hypotheses[0].evidence
-    return sum(weights[name] * evidence[name] for name in ("similarity", "landmarks"))
-
-
-def _shows_other_part(box: Tensor, item: ImageItem) -> bool:
-    """Whether a box is partly inside the photograph and shows another part of it than the item's box."""
-    H, W = item.image.shape[-2:]
-    pair = torch.stack([box, item.box.to(box)]).clamp(min=-0.5)
-    pair = torch.minimum(pair, torch.tensor([W, H, W, H]).to(pair) - 0.5)
-    inside = bool((pair[0, 2:] > pair[0, :2]).all()) and bool(box.isfinite().all())
-    return inside and float(box_iou(pair[:1], pair[1:])) < SAME_BOX_OVERLAP

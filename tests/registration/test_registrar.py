@@ -308,7 +308,7 @@ def test_boxes_are_compared_inside_the_photograph():
         ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
     ):
         item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
-        assert registrar_module._shows_other_part(torch.tensor(box, dtype=torch.float64), item) == expected
+        assert item.shows_other_part(torch.tensor(box, dtype=torch.float64)) == expected
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
