@@ -1,6 +1,7 @@
 """The tracker: each measurement alone on drawn objects and in closed form, and together on generated sequences."""
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 import trimesh
 
 from curvireg_torch import camera_matrix
-from curvireg_torch.errors import LostObjectError
+from curvireg_torch.errors import ImageError, LostObjectError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.mesh.mesh import extreme_points
@@ -236,3 +237,13 @@ def test_histograms_move_by_the_rate_towards_new_colours():
     step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
+
+
+def test_a_prediction_among_unusable_pixels_does_not_hide_another():
+    def fit(_image, _K, T):
+        if T == "beside":
+            raise ImageError("pixels outside [0, 1]")
+        return SimpleNamespace(confidence=0.5)
+
+    guesses = SimpleNamespace(predictions=lambda: ["right", "beside"], _fit=fit)
+    assert Tracker.track(guesses, None, None).confidence == 0.5
