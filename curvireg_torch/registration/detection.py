@@ -90,7 +90,7 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
     distance = allowed = None
-    poses, count = registrar.landmark_poses(item, registrar.landmark_matches(item))
+    poses, count = registrar.landmark_poses(registrar.landmark_matches(item))
     if item.prior is not None:
         distance, allowed = item.prior.distance, _allowed_views(registrar, item)
         kept = Limits(item, registrar.bank).keeps(poses)

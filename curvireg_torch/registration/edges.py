@@ -169,8 +169,10 @@ class EdgeCrops:
     def edges(self, factor: int) -> EdgeField:
         """The edges in crops whose sides are smaller by a factor."""
         if factor not in self._fields:
-            inside = F.avg_pool2d(self._inside, factor).floor()
-            self._fields[factor] = EdgeField(F.avg_pool2d(self.crops, factor), inside)
+            crops, inside = self.crops, self._inside
+            if factor > 1:
+                crops, inside = F.avg_pool2d(crops, factor), F.avg_pool2d(inside, factor).floor()
+            self._fields[factor] = EdgeField(crops, inside)
         return self._fields[factor]
 
 

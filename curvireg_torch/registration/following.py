@@ -96,12 +96,13 @@ class Follower:
             image: see :class:`Registrar`.
             box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None detects it.
         """
+        # All of it on one thread: rounding is always the same, and no idle threads of torch compete with it.
+        return map_on_threads(lambda image: self._next(image, box), [image])[0]
+
+    def _next(self, image: Any, box: Any) -> Registration | FailedRegistration:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
-        return map_on_threads(lambda item: self._next(item, image, box), [item])[0]  # one thread: rounding is the same
-
-    def _next(self, item: ImageItem, image: Any, box: Any) -> Registration | FailedRegistration:
         if not self._base:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
         tracked: TrackedPose | None = None

@@ -49,7 +49,7 @@ that term); log (1 + n) with the number n of landmarks that agree with it, beyon
 colours, camera or contour fit, with a similar mesh, and where a given pose is refined)."""
 
 CHANCE_LANDMARKS = 2
-"""Landmarks that agree with a wrong pose by chance: on generated shelves, 97 % of wrong hypotheses have no more."""
+"""Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses have no more."""
 
 SCORE_WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5, 6.0), (1.0, 0.0, 0.0, 0.0, 0.0)
 """Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md)."""

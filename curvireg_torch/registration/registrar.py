@@ -291,15 +291,16 @@ class Registrar:
             landmarks = self._landmarks
         return landmarks.matches(item.image, item.camera_matrix, box)
 
-    def landmark_poses(self, item: ImageItem, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
+    def landmark_poses(self, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
         """Poses on which landmarks agree, as promising as the best view, and how many, the largest number first.
 
         :meta private:
         """
         found = [] if matches is None else matches.poses()
         T = torch.stack([pose.T for pose in found]) if found else torch.zeros(0, 4, 4, dtype=torch.float64)
-        K, none = torch.eye(3) if item.camera_matrix is None else item.camera_matrix, torch.zeros(len(T))
-        poses = Poses.at(T, K.double().expand(len(T), 3, 3), self.describer.centre, none.long(), none.double())
+        K = torch.eye(3, dtype=torch.float64) if matches is None else torch.from_numpy(matches.K)
+        none = torch.zeros(len(T))
+        poses = Poses.at(T, K.expand(len(T), 3, 3), self.describer.centre, none.long(), none.double())
         views = torch.tensor([nearest_view(self, R) for R in poses.rotation], dtype=torch.long)
         return replace(poses, view=views), torch.tensor([float(pose.count) for pose in found])
 
@@ -443,7 +444,7 @@ class Registrar:
             poses = self._screened(work.crops, poses, count)
         by_landmarks = torch.zeros(len(poses), dtype=torch.bool)
         if work.crops is not None and work.exact:
-            found, _ = self.landmark_poses(work.item, work.landmarks)
+            found, _ = self.landmark_poses(work.landmarks)
             found = found if work.limits is None else found[work.limits.keeps(found)]
             if len(found):
                 poses = poses[~are_near(poses.rotation, found.rotation[0], work.symmetries)]

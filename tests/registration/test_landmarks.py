@@ -218,7 +218,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmar
     grey = cr.Registrar(trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0]))
     assert grey.landmark_matches(item) is None
     assert registrar().landmark_matches(replace(item, camera_matrix=None)) is None
-    poses, count = grey.landmark_poses(item, None)
+    poses, count = grey.landmark_poses(None)
     assert len(poses) == len(count) == 0
 
 
