@@ -3,6 +3,7 @@
     python scripts/speed/speed.py                                # this checkout alone
     git worktree add ../before HEAD~20
     python scripts/speed/speed.py --against ../before            # A B A B, with the ratio of each step
+    python scripts/speed/speed.py --device cuda --steps bank one many layers --out gpu.json
 
 Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every measurement has a process
 of its own; each step counts with its least time and memory over the rounds. Ratios are fair on a busy machine, times
@@ -13,6 +14,7 @@ only on an idle one.
 - rank: a photograph without contour fit; one: the whole registration; both are means of four poses
 - many: each of many photographs in one call
 - follow: each frame of a video in which the photograph moves by 2 px
+- layers: forward and backward pass of three filter layers, each followed by HOG; a photograph of a batch
 """
 
 import argparse
@@ -25,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow")
+STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow", "layers")
 FRAMES, POSES = 12, 4
 SUBDIVISIONS = 6  # of an icosphere: 81,920 faces
 CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
@@ -66,7 +68,31 @@ def camera() -> Any:
     return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
-def measure(step: str, folder: str, photographs: int) -> float:
+def measure_layers(photographs: int, device: str) -> float:
+    """Seconds of a forward and backward pass of three filter layers, each followed by HOG, for one of a batch."""
+    import torch
+
+    import curvireg_torch as cr
+
+    layers = [cr.ImageCurvilinearSaliency(), cr.MultiScaleCurvilinearSaliency(), cr.MultiScaleFocusCurves()]
+    hog = cr.HOG().to(device)
+    images = torch.rand(photographs, 1, 480, 640, generator=torch.Generator().manual_seed(0)).to(device)
+    seconds = []
+    for _ in range(3):
+        if images.is_cuda:
+            torch.cuda.synchronize()
+        start = time.perf_counter()
+        for layer in layers:
+            pixels = images.clone().requires_grad_()
+            hog(layer.to(device)(pixels)).sum().backward()
+            assert pixels.grad is not None
+        if images.is_cuda:
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds) / photographs
+
+
+def measure(step: str, folder: str, photographs: int, device: str) -> float:
     """Seconds of a step in whichever checkout this process imports."""
     from dataclasses import replace
 
@@ -74,15 +100,17 @@ def measure(step: str, folder: str, photographs: int) -> float:
 
     import curvireg_torch as cr
 
+    if step == "layers":
+        return measure_layers(photographs, device)
     mesh, K = cr.load_mesh(Path(folder, "mesh.ply")), camera()
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(POSES)]
     if step == "bank":
         start = time.perf_counter()
-        cr.ViewBank.build(mesh, progress=False)
+        cr.ViewBank.build(mesh, progress=False, device=device)
         return time.perf_counter() - start
     boxes = torch.tensor(json.loads(Path(folder, "boxes.json").read_text()))
     pipeline = replace(cr.Pipeline(), contours=step != "rank")
-    registrar = cr.Registrar(mesh, pipeline=pipeline, progress=False)
+    registrar = cr.Registrar(mesh, pipeline=pipeline, device=device, progress=False)
     if step == "follow":
         from curvireg_torch.data import read_image
         from curvireg_torch.registration import Follower
@@ -108,7 +136,7 @@ def measure(step: str, folder: str, photographs: int) -> float:
     return sum(min(register(paths[k : k + 1], boxes[k : k + 1]) for _ in range(3)) for k in range(POSES)) / POSES
 
 
-def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int) -> dict[str, float]:
+def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str) -> dict[str, float]:
     """Seconds and MB of a step in a checkout."""
     from scripts._shared import run_process
 
@@ -121,13 +149,13 @@ def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: 
             environment["CURVIREG_CACHE"] = tempfile.mkdtemp(dir=folder)
         seconds, usage, _ = run_process(words, folder, environment)
     else:
-        words = ["-c", f"{HERE}; print(measure({step!r}, {str(folder)!r}, {photographs}))"]
+        words = ["-c", f"{HERE}; print(measure({step!r}, {str(folder)!r}, {photographs}, {device!r}))"]
         _, usage, output = run_process(words, folder, environment)
         seconds = float(output.split()[-1])
     return {"seconds": seconds, "megabytes": usage.ru_maxrss / 1024}
 
 
-def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int) -> Any:
+def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     from scripts._shared import run_process
 
@@ -136,10 +164,10 @@ def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, 
         folder = Path(temporary)
         run_process(["-c", f"{HERE}; write_inputs({temporary!r})"], folder, {**os.environ, "PYTHONPATH": str(ROOT)})
         for name, checkout in checkouts.items():  # the first registration caches the bank
-            measured("one", checkout, folder, folder / name, photographs)
+            measured("one", checkout, folder, folder / name, photographs, device)
         for step in tuple(steps) * rounds:
             for name, checkout in checkouts.items():
-                new = measured(step, checkout, folder, folder / name, photographs)
+                new = measured(step, checkout, folder, folder / name, photographs, device)
                 old = found[name].get(step, new)
                 found[name][step] = {key: min(old[key], value) for key, value in new.items()}
     return found
@@ -164,12 +192,15 @@ def table(record: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    import torch
+
     from scripts._shared import REPOSITORY, RESULTS, commit, processor, today, update_page, write_json
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
     parser.add_argument("--photographs", type=int, default=16)
+    parser.add_argument("--device", default="cpu", help="of all steps but the commands (default cpu)")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, help="another file than scripts/results/speed.json; no page is changed")
     options = parser.parse_args(arguments)
@@ -178,9 +209,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     record = {
         "date": today(),
         "commits": {name: commit(root) for name, root in checkouts.items()},
-        "processor": processor(),
+        "processor": processor() if options.device == "cpu" else torch.cuda.get_device_name(options.device),
         "photographs": options.photographs,
-        "times": compare(checkouts, options.steps, options.photographs, options.rounds),
+        "times": compare(checkouts, options.steps, options.photographs, options.rounds, options.device),
     }
     write_json(options.out or RESULTS / "speed.json", record)
     print(table(record))

@@ -54,6 +54,13 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     assert threads.map_on_threads(job, []) == []
 
 
+def test_jobs_share_few_threads_on_many_cores() -> None:
+    torch.set_num_threads(16)  # the fixture undoes it
+    assert threads.available_threads() == threads.MAX_THREADS
+    names = threads.map_on_threads(lambda _: (time.sleep(0.01), threading.get_ident())[1], range(16))
+    assert len(set(names)) <= threads.MAX_THREADS
+
+
 def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
     both = threading.Barrier(2, timeout=20)  # times out unless two jobs run at the same time
 
