@@ -15,10 +15,9 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     gc.set_threshold(10_000)  # imports make 400,000 objects that stay: look for cycles among them less often
-    try:
-        return run()
-    finally:
-        gc.freeze()  # and not at exit
+    code = run()
+    gc.freeze()  # and not at exit
+    return code
 
 
 if __name__ == "__main__":

@@ -247,9 +247,8 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     if unit:
         mesh.units = unit
     mesh.metadata["up"] = up
-    prefix = "mesh.colours."
-    colours: dict[str, Any] = {n.removeprefix(prefix): x.numpy() for n, x in tensors.items() if n.startswith(prefix)}
-    if colours:
+    if "mesh.colours.uv" in tensors:
+        colours = {n.removeprefix("mesh.colours."): x.numpy() for n, x in tensors.items() if "mesh.colours." in n}
         textures = tuple(colours[f"picture{k}"] for k in range(len(colours) - 3))
         surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
         surface.check(len(mesh.faces))
