@@ -280,13 +280,14 @@ class Repeatability(Term):
 def dilate_points(points: Tensor, eps: float) -> Tensor:
     """Pixels within ``eps`` >= 0 px (Euclidean) of a point: (N, H, W) bool -> (N, H, W) bool."""
     radius = int(eps)
-    if radius == 0:
+    if radius == 0 or len(points) == 0:
         return points
     offsets = np.arange(-radius, radius + 1)
     disc = (offsets[:, None] ** 2 + offsets**2 <= eps**2).astype(np.uint8)
-    planes = points.cpu().numpy().view(np.uint8)
-    dilated = np.stack([cv2.dilate(plane, disc) for plane in planes]) if len(planes) else planes
-    return torch.from_numpy(dilated.view(bool)).to(points.device)
+    # All planes one below the other, with empty rows between: a call for each costs more than to dilate it.
+    planes = np.pad(points.cpu().numpy().view(np.uint8), [(0, 0), (0, radius), (0, 0)])
+    dilated = np.asarray(cv2.dilate(planes.reshape(-1, planes.shape[2]), disc)).reshape(planes.shape)
+    return torch.from_numpy(dilated[:, :-radius].view(bool)).to(points.device)
 
 
 def cell_counts(points: Tensor, cell: int) -> Tensor:

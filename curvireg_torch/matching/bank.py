@@ -15,15 +15,17 @@ from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.viewpoint import ViewSphere
+from ..mesh import has_colours, mesh_symmetries
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, mesh_radius, mesh_unit, mesh_up
+from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
+from ..utils.checks import check_symmetries, check_tensor
 from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
-from .describe import ViewDescriber, hog_layer
+from .describe import ViewDescriber, hog_layer, view_mesh
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 7
+FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 8
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
@@ -182,12 +184,14 @@ class ViewBank:
         """Write a safetensors file atomically. Descriptors in float16 change cosines by less than 1e-4."""
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
         contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
-        arrays: dict[str, np.ndarray] = {
-            "vertices": np.array(self.mesh.vertices, np.float64),
-            "faces": np.array(self.mesh.faces, np.int32),
-            **colour_arrays(self.mesh),
-        }
-        contents |= {f"mesh.{name}": torch.from_numpy(x.copy()) for name, x in arrays.items()}
+        arrays = {f"mesh.{name}": x for name, x in colour_arrays(self.mesh).items()}
+        for kind, mesh in (("mesh", self.mesh), ("view_mesh", view_mesh(self.mesh))):
+            arrays[f"{kind}.vertices"] = np.array(mesh.vertices, np.float64)
+            arrays[f"{kind}.faces"] = np.array(mesh.faces, np.int32)
+        contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
+        contents["extreme_points"] = extreme_points(self.mesh)
+        if not has_colours(self.mesh):
+            contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
         metadata = {
             "format": FORMAT,
             "version": str(FORMAT_VERSION),
@@ -223,6 +227,7 @@ class ViewBank:
                 raise BankError(f"changed since it was written (its checksum differs); {REBUILD}", subject=path)
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
+            tensors["descriptors"] = tensors["descriptors"].float()
             mesh = _mesh(tensors, metadata["unit"], metadata["up"])
             _check_contents(views, pipeline.bank, tensors)
         except BankError:
@@ -235,21 +240,29 @@ class ViewBank:
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
-    arrays = {n.removeprefix("mesh."): x.numpy() for n, x in tensors.items() if n.startswith("mesh.")}
-    vertices, faces = arrays.pop("vertices"), arrays.pop("faces")
-    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
-        raise ValueError("not a mesh")
-    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    mesh = _triangles(tensors, "mesh")
+    mesh._cache.update({n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors})
+    mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
+    check_tensor(extreme_points(mesh), "extreme_points", (None, 3))
     if unit:
         mesh.units = unit
     mesh.metadata["up"] = up
-    if arrays:
-        colours: dict[str, Any] = {n.removeprefix("colours."): x for n, x in arrays.items()}
+    if "mesh.colours.uv" in tensors:
+        colours = {n.removeprefix("mesh.colours."): x.numpy() for n, x in tensors.items() if "mesh.colours." in n}
         textures = tuple(colours[f"picture{k}"] for k in range(len(colours) - 3))
         surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
-        surface.check(len(faces))
+        surface.check(len(mesh.faces))
         mesh.metadata["colours"] = surface
+    else:
+        check_symmetries(mesh_symmetries(mesh))
     return mesh
+
+
+def _triangles(tensors: Mapping[str, Tensor], name: str) -> trimesh.Trimesh:
+    vertices, faces = (tensors[f"{name}.{part}"].numpy() for part in ("vertices", "faces"))
+    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+        raise ValueError(f"{name}: not a mesh")
+    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
 
 
 def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
@@ -271,7 +284,7 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
     for name, width in widths.items():
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.
-        if x.shape != (N, width) or not bool(x.sum(dtype=torch.float32).isfinite()):
+        if x.shape != (N, width) or (x.is_floating_point() and not bool(x.sum(dtype=torch.float32).isfinite())):
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
     if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
         raise ValueError("viewpoints that are not finite")

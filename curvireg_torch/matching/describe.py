@@ -12,7 +12,7 @@ from ..geometry.cameras import projected_boxes, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
 from ..mesh.edges import simplified
-from ..mesh.mesh import extreme_points, mesh_centre, mesh_radius
+from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import LEVELS, MeshContours
@@ -36,9 +36,19 @@ def hog_layer(settings: BankSettings) -> HOG:
     return HOG(grid=settings.grid, bins=settings.bins, block=settings.block, clip=settings.clip)
 
 
+@cached_in_mesh
+def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh that framed views are rendered from, of at most ``VIEW_FACES`` faces."""
+    if len(mesh.faces) <= VIEW_FACES:
+        return mesh
+    centre = mesh_centre(mesh).numpy()
+    vertices, faces = simplified(mesh, centre, VIEW_FACES)
+    return trimesh.Trimesh(vertices + centre, faces, process=False)
+
+
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
-    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
+    Framed views are rendered from :func:`view_mesh`; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
@@ -54,8 +64,7 @@ class ViewDescriber:
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
-            vertices, faces = simplified(mesh, self.centre.numpy(), VIEW_FACES)
-            self._simple = trimesh.Trimesh(vertices + self.centre.numpy(), faces, process=False)
+            self._simple = view_mesh(mesh)
             self.view_renderer = make_renderer(self._simple, renderer)
         self._set(settings)
 

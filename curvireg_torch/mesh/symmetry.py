@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import rotation_from_axis_angle
-from .mesh import mesh_radius
+from .mesh import cached_in_mesh, mesh_radius
 
 POINTS, TESTED = 40_000, 2_000  # Random points of the surface, and how many of them are compared with all
 # A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the surface: about 2 px of a
@@ -33,6 +33,7 @@ DEFINED = 0.05
 NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
 
 
+@cached_in_mesh
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
     """Rotations of a mesh that leave its shape as it is, up to small details, without colours. (S, 4, 4) float64
     transforms of the model frame, the identity first; S = 1 for a mesh without symmetries.

@@ -268,11 +268,7 @@ class Registrar:
         if not exact or self.symmetries is not None:
             return self.symmetries
         with _SHAPE_LOCK:  # photographs share them
-            return self._shape_symmetries
-
-    @cached_property
-    def _shape_symmetries(self) -> Tensor | None:
-        return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
+            return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
     @property
     def fits_landmarks(self) -> bool:

@@ -110,7 +110,7 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh with vertex colours; faces share no vertices, so that edges stay sharp."""
     faces = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
     plain = trimesh.Trimesh(np.asarray(mesh.triangles).reshape(-1, 3), faces, process=False)
-    rgb = np.full((len(faces), 3, 3), 190 / 255)
+    rgb = np.full(3, 190 / 255)
     colours = surface_colours(mesh)
     if colours is not None:
         index, zero = np.arange(len(faces), dtype=np.int32), np.zeros(len(faces), np.float32)
@@ -118,8 +118,9 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         rgb = np.stack(corners, axis=1)
     # From sRGB: the vertex colours of glTF are linear.
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    vertex_colors = (linear.reshape(-1, 3) * 255).round().astype(np.uint8)
-    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=vertex_colors)
+    rgba = np.full((*faces.shape, 4), 255, np.uint8)
+    rgba[..., :3] = (linear * 255).round()
+    plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgba.reshape(-1, 4))
     return plain
 
 

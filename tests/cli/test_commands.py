@@ -1,5 +1,6 @@
 """``curvireg demo``, ``bank``, ``cache`` and ``plot``; and the wrong inputs of scripts/robustness/wrong_inputs.txt."""
 
+import gc
 import json
 import shlex
 import warnings
@@ -10,6 +11,7 @@ import pytest
 import torch
 import trimesh
 
+from curvireg_torch import __main__
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning
 from curvireg_torch.evaluation.opening import RegisterOptions
@@ -21,6 +23,17 @@ from scripts.robustness.wrong_inputs import cases
 from tests._support.scenes import truck_bank
 from tests.evaluation.small import SMALL
 from tests.viewer.test_session import write_scene
+
+
+def test_the_process_seldom_looks_for_cycles_and_leaves_them_at_exit(monkeypatch):
+    usual = gc.get_threshold()
+    monkeypatch.setattr(__main__, "run", lambda: gc.get_threshold()[0])
+    try:
+        assert __main__.main() > usual[0]
+        assert gc.get_freeze_count() > 1000
+    finally:
+        gc.unfreeze()
+        gc.set_threshold(*usual)
 
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):

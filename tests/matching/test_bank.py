@@ -3,15 +3,22 @@ import stat
 from dataclasses import replace
 from types import SimpleNamespace
 
+import fast_simplification
 import numpy as np
 import pytest
+import scipy.spatial
 import torch
+import trimesh
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from curvireg_torch.errors import BankError, MissingFileError
+from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.matching import bank as bank_module
+from curvireg_torch.matching.describe import view_mesh
+from curvireg_torch.mesh import mesh_symmetries, symmetry
+from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
@@ -124,7 +131,10 @@ def with_nan(x):
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
         ("appearance", with_nan, "appearance: .* not finite"),
-        ("mesh.faces", lambda x: x + 10**6, "not a mesh"),
+        ("mesh.faces", lambda x: x + 10**6, "mesh: not a mesh"),
+        ("view_mesh.faces", lambda x: x + 10**6, "view_mesh: not a mesh"),
+        ("extreme_points", lambda x: x[:, 1:], "extreme_points: expected shape"),
+        ("mesh_symmetries", lambda x: 2 * x, "symmetries: expected"),
     ],
 )
 def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
@@ -133,6 +143,22 @@ def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
     rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
     with pytest.raises(BankError, match=message):
         ViewBank.load(saved)
+
+
+def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
+    bank = build(trimesh.creation.icosphere(5, radius=3.0), sample_views(azimuth_step=180, elevations=[0]))
+    bank.save(tmp_path / "bank.safetensors")
+    for module, name in ((scipy.spatial, "ConvexHull"), (fast_simplification, "simplify"), (symmetry, "_Surface")):
+        monkeypatch.setattr(module, name, None)  # would fail
+    mesh = ViewBank.load(tmp_path / "bank.safetensors").mesh
+    assert torch.equal(extreme_points(mesh), extreme_points(bank.mesh))
+    assert torch.equal(mesh_symmetries(mesh), mesh_symmetries(bank.mesh))
+    for part in ("vertices", "faces"):
+        np.testing.assert_array_equal(getattr(view_mesh(mesh), part), getattr(view_mesh(bank.mesh), part))
+    mesh.vertices *= 2.0
+    for function in (extreme_points, mesh_symmetries, view_mesh):
+        with pytest.raises(TypeError):
+            function(mesh)
 
 
 def test_float16_storage_changes_no_ranking(small_bank, saved):

@@ -92,13 +92,13 @@ def test_cached_bank_replaces_damaged_and_mislabelled_files(tmp_path):
 
 
 def test_cached_bank_removes_the_least_recently_used(tmp_path, monkeypatch):
-    for i, edge in enumerate((1.0, 2.0, 3.0)):
+    for i, edge in enumerate((1.5, 2.0, 3.0)):
         cached_box(tmp_path, edge)
         for file in list_cache(tmp_path):
             if file.used > time.time() - 50:  # the new one
                 os.utime(file.path, (1000.0 + i, 1000.0 + i))
     first, second, third = sorted(list_cache(tmp_path), key=lambda file: file.used)
-    cached_box(tmp_path, 1.0)  # used again
+    cached_box(tmp_path, 1.5)  # used again
     assert list_cache(tmp_path)[0].path == first.path
     incomplete = [first.path.with_name(f"{first.path.name}.{k:08x}.tmp") for k in range(2)]
     for path in incomplete:

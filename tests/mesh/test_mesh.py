@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.mesh.edges import MeshEdges, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
 from curvireg_torch.pipeline import PRESETS, ViewPolicy
@@ -23,6 +23,15 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float
     whole, few = (x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points))
     width = whole.amax(dim=0) - whole.amin(dim=0)
     assert float(((whole.amax(dim=0) - few.amax(dim=0)) / width).max()) < 0.0015
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_mesh_is_as_large_as_its_longest_side(axis: int) -> None:
+    sides = np.full(3, 5e-7)
+    sides[axis] = 2e-6
+    assert len(as_mesh(trimesh.creation.box(sides)).faces) == 12
+    with pytest.raises(MeshError, match="only 8e-07 units across"):
+        as_mesh(trimesh.creation.box(0.4 * sides))
 
 
 @pytest.mark.parametrize(("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")])

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -59,3 +60,11 @@ def test_registration_sheet_draws_rivals_at_their_poses(registered):
     rows, columns = np.nonzero((sheet != other).any(axis=2))
     assert np.ptp(rows) < SIDE, "nothing else changes"
     assert np.ptp(columns) < SIDE
+
+
+def test_small_pictures_are_drawn_from_the_simplified_mesh(registered, monkeypatch):
+    registrar, result, image, box = registered
+    whole = Mock(wraps=registrar.describer.renderer)
+    monkeypatch.setattr(registrar.describer, "renderer", whole)
+    registration_sheet(registrar, result, image, box)
+    assert len(whole.method_calls) == 1, "the photograph"
