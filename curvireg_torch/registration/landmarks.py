@@ -24,6 +24,7 @@ VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and
 VIEW_DISTANCE = 4.0  # of the camera from the object's centre in these views, in object radii
 SILHOUETTE_BORDER = 4  # Width in px of the rim of the silhouette, where the background has a part in the features
 MIN_CONTRAST = 0.02  # of features, SIFT's threshold: prints are fainter in photographs than in views
+TONES, MIN_TONES = (0.01, 0.99), 0.05  # Quantiles of grey that become black and white, and their least distance
 CROP_SIDE, MAX_SIDE = 400, 1920  # Longer side in px to which crops are resized, and of the largest whole photograph
 CROP_MARGIN = 0.05  # Space around a given box, as a fraction of its longer side
 SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look alike
@@ -51,7 +52,10 @@ class _Features:
     @staticmethod
     def of(picture: Tensor, mask: np.ndarray | None = None) -> "_Features":
         """RootSIFT features of a picture (C, H, W) in [0, 1]; a place has one for each of its main orientations."""
-        grey = (255.0 * picture.mean(dim=0)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+        grey = picture.mean(dim=0).cpu().numpy()
+        # SIFT's threshold is one of contrast, of which a dark photograph has little.
+        low, high = np.quantile(grey, TONES)
+        grey = (255.0 * (grey - low) / max(high - low, MIN_TONES)).round().clip(0.0, 255.0).astype(np.uint8)
         points, vectors = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST).detectAndCompute(grey, mask)
         if vectors is None or not len(points):
             return _Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.float32))

@@ -100,6 +100,16 @@ def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
     assert float((found.T - T)[:3, 3].norm()) < 0.02 * 4.0
 
 
+def test_photograph_may_be_dark():
+    T = pose(20.0, 0.3, 6.0)
+    bright = photograph(T)
+    dark = (255 * 0.1 * bright).round() / 255
+    most, found = (landmarks().matches(image, K, box_of(T)).poses()[0] for image in (bright, dark))
+    assert found.count > 0.5 * most.count
+    assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
+    assert not len(landmarks().matches(torch.full_like(bright, 0.3), K).uv)  # nor does one of a single colour fail
+
+
 def test_each_copy_has_a_pose():
     there = [pose(20.0, -0.9, 4.5), pose(150.0, 0.9, 4.5)]
     found = landmarks().matches(photograph(*there), K).poses()
