@@ -112,7 +112,7 @@ def test_video_without_a_box_believes_no_wrong_pose(cube):
     """The cube stands among other things on a desk, and is not found."""
     registrar, K, images, poses = cube
     follow, symmetries = Follower(registrar, K), registrar.symmetries_of(exact=True)
-    for image, T in zip(images, poses, strict=True):
+    for image, T in zip(images[::4], poses[::4], strict=True):  # each search takes seconds
         result = follow(image)
         if not result.ok:
             assert isinstance(result.error, LostObjectError)
