@@ -140,9 +140,9 @@ class ContourProblem:
 
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
         """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and ``others`` measurements."""
-        uv, du = project(points.model, T, self.K, self.centre)
+        uv, J = project(points.model, points.normals, T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, radius)
-        J = (points.normals[..., None, :] @ du)[..., 0, :].to(distance.dtype)
+        J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
@@ -198,12 +198,12 @@ class ContourProblem:
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
         points = state.points
-        uv, du = project(points.model, state.T, self.K, self.centre)
+        uv, J = project(points.model, points.normals, state.T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, radius)
         index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
         d = distance.gather(-1, index).double()
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
-        return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+        return Measurements(J, d, W)
 
 
 def _offsets(radius: float) -> Tensor:

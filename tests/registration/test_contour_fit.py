@@ -86,8 +86,7 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
     """Edges at the points of the moved object, and for every third point a stronger one 4 px beside it."""
     points = state(120).points
     motion = torch.tensor([0.006, -0.008, 0.01, 0.01, -0.015, 0.06], dtype=torch.float64)
-    _, by_motion = project(points.model, T, K[None], CENTRE)
-    distance = (points.normals[..., None, :] @ by_motion)[..., 0, :] @ motion
+    distance = project(points.model, points.normals, T, K[None], CENTRE)[1] @ motion
     assert float(distance.abs().max()) > 1.5
     sides = torch.where(torch.arange(120) % 2 == 0, 4.0, -4.0)
     wrong = torch.where(torch.arange(120) % 3 == 0, distance + sides, 90.0)
