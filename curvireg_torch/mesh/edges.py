@@ -65,7 +65,8 @@ class MeshEdges:
         the third corners of all faces lie on one side of the plane through camera and edge. (N, E) bool: whether
         ((a - eye) x (b - eye)) . (corner - eye) is positive there."""
         behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
-        first, *others = (behind[:, faces] ^ flip for faces, flip in zip(self._edge_faces.T, self._flips, strict=True))
+        flips = zip(self._edge_faces.T, self._flips, strict=True)
+        first, *others = (behind.take(faces, axis=1) ^ flip for faces, flip in flips)
         all_same = np.ones_like(first)
         for other in others:
             all_same &= first == other

@@ -140,9 +140,9 @@ class ContourProblem:
 
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
         """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and ``others`` measurements."""
-        uv, du = project(points.model, T, self.K, self.centre)
+        uv, J = project(points.model, points.normals, T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, radius)
-        J = (points.normals[..., None, :] @ du)[..., 0, :].to(distance.dtype)
+        J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
@@ -198,12 +198,12 @@ class ContourProblem:
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
         points = state.points
-        uv, du = project(points.model, state.T, self.K, self.centre)
+        uv, J = project(points.model, points.normals, state.T, self.K, self.centre)
         distance, strength = self._candidates(uv, points, radius)
         index = (strength * torch.exp(-0.5 * distance**2)).argmax(dim=-1, keepdim=True)
         d = distance.gather(-1, index).double()
         W = strength.gather(-1, index) * (1.0 - (d / radius) ** 2).clamp(min=0.0) ** 2
-        return Measurements((points.normals[..., None, :] @ du)[..., 0, :], d, W)
+        return Measurements(J, d, W)
 
 
 def _offsets(radius: float) -> Tensor:
@@ -332,18 +332,25 @@ def fit_to_edges(
     *,
     finish: int | None = None,
     wide_angles: Sequence[float] = (),
+    quick: Tensor | None = None,
+    again: bool = False,
 ) -> ContourFit:
-    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras ``K`` (N, 3, 3)."""
+    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras ``K`` (N, 3, 3).
+    ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there was one. A pose that is fitted
+    ``again`` is kept if the best fit at half size returns to it."""
     N = len(T0)
-    full, half, quarter = (ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2, 4))
-    before, weighted_before = half.supports(half.state(T0))
-    wide = _turned(T0, half.centre, wide_angles)
-    every = torch.arange(N).repeat_interleave(wide.shape[1])
-    wide = quarter[every].descend(quarter[every].state(wide.flatten(0, 1)), QUARTER_SIZE_RADII).T.view(wide.shape)
-    around = torch.cat([_turned(T0, half.centre, (START_ANGLE,), roll=START_ROLL), wide], dim=1)
+    full, half = (ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2))
+    if quick is None:
+        wide = _turned(T0, half.centre, wide_angles)
+        every = torch.arange(N).repeat_interleave(wide.shape[1])
+        quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
+    around = torch.cat([_turned(T0, half.centre, (START_ANGLE,), roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1)
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    fits = half[every].descend(half[every].state(around.flatten(0, 1)), FIRST_RADII[:1])
+    fits = half[every].state(around.flatten(0, 1))
+    begun = fits[M * torch.arange(N)]
+    before, weighted_before = half.supports(begun)
+    fits = half[every].descend(fits, FIRST_RADII[:1])
     kept = half[every].supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
     fits = fits[(kept + M * torch.arange(N)[:, None]).flatten()]
     M = kept.shape[1]
@@ -355,6 +362,9 @@ def fit_to_edges(
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
     source, T = _two_best(half, fits, supports, index)
+    if again:
+        leaves = half[index].mean_shift(begun.points[index], T0[index], T[: len(index)]) > SAME_POSE_SHIFT
+        source, T = source[leaves[source]], T[leaves[source]]
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
@@ -386,11 +396,14 @@ def measure_contours(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Ten
 
 
 @torch.no_grad()
-def quick_support(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor) -> Tensor:
-    """(N,) edge support, with the weights of the mask, that poses ``T`` (N, 4, 4) with cameras ``K`` (N, 3, 3) reach by
-    a short fit at a quarter of the size; it tells in a tenth of the time which of them are worth a fit."""
-    quarter = ContourProblem.of(contours, crops, K, factor=4)
-    return quarter.supports(quarter.descend(quarter.state(T), QUARTER_SIZE_RADII))[1]
+def quick_fit(
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Poses (N, 4, 4) that a short fit at a quarter of the size reaches from ``T`` (N, 4, 4), in a tenth of the time of
+    a fit, and their edge support (N,) with the weights of the mask, which tells where a fit is worth it."""
+    quarter = ContourProblem.of(contours, crops, K, image_index, factor=4)
+    state = quarter.descend(quarter.state(T), QUARTER_SIZE_RADII)
+    return state.T, quarter.supports(state)[1]
 
 
 @torch.no_grad()

@@ -125,9 +125,9 @@ def _sampled_lines(
     start, along = (scale * uv + (0.5 * scale - 1.0)).float(), (scale * normals).float()
     grid = torch.addcmul(start[:, :, None], offsets.float()[:, None], along[:, :, None])
     out = grid.new_empty(len(uv), pictures.shape[1], *grid.shape[1:3])
-    for b in image_index.unique().tolist():  # an expanded picture is not copied for every pose
-        mine = (image_index == b).nonzero()[:, 0]
-        picture = pictures[b].expand(len(mine), -1, -1, -1)
+    for b in (seen := image_index.unique().tolist()):  # an expanded picture is not copied for every pose
+        mine = slice(None) if len(seen) == 1 else (image_index == b).nonzero()[:, 0]
+        picture = pictures[b].expand(len(grid[mine]), -1, -1, -1)
         out[mine] = F.grid_sample(picture, grid[mine], padding_mode=padding, align_corners=False)
     return out
 

@@ -54,10 +54,11 @@ class PointMatches:
 
     def measurements(self, T: Tensor, K: Tensor, centre: Tensor, scale: float) -> Measurements:
         """Two for each point, along x and y, with Geman-McClure weights of ``scale`` px."""
-        uv, J = project(self.model, T, K, centre)
-        residual = self.uv - uv
+        axes = torch.eye(2, dtype=T.dtype).repeat(self.model.shape[1], 1)[None]
+        uv, J = project(self.model.repeat_interleave(2, dim=1), axes, T, K, centre)
+        residual = self.uv - uv[:, ::2]
         weight = (self.weight * _geman_mcclure(residual, scale)).repeat_interleave(2, dim=1)
-        return Measurements(J.flatten(1, 2), residual.flatten(1)[..., None], weight[..., None])
+        return Measurements(J, residual.flatten(1)[..., None], weight[..., None])
 
     def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE) -> float:
         """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter of it counts at
@@ -108,16 +109,15 @@ def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
     return solution
 
 
-def project(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (N, P, 2) of model points, and their derivative (N, P, 2, 6) by rotation about and translation of the
-    centre."""
-    K = K.expand(len(T), 3, 3)
+def project(points: Tensor, normals: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of model points, and the derivative (N, P, 6) of their shift along unit vectors ``normals``
+    (N, P, 2) by rotation about and translation of the centre."""
     arms = (points - centre) @ T[:, :3, :3].mT
     cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
     z = cam[..., 2:].clamp(min=1e-9)
     uv = cam @ K[:, :2].mT / z
-    by_cam = (K[:, None, :2] - uv[..., None] * K[:, None, 2:]) / z[..., None]
-    by_rotation = torch.linalg.cross(arms[..., None, :].expand_as(by_cam), by_cam)  # b . (w x a) = w . (a x b)
+    by_cam = (normals @ K[:, :2] - (normals * uv).sum(dim=-1, keepdim=True) * K[:, None, 2]) / z
+    by_rotation = torch.linalg.cross(arms, by_cam)  # b . (w x a) = w . (a x b)
     return uv, torch.cat([by_rotation, by_cam], dim=-1)
 
 
@@ -179,9 +179,8 @@ def pose_covariance(
         (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were matched; (N,) number
         of known directions, 0 to 6.
     """
-    uv, du = project(points.model, T, K, centre)
     n, W = points.normals, measured.weight
-    along = (torch.stack([-n[..., 1], n[..., 0]], dim=-1)[..., None, :] @ du)[..., 0, :]
+    uv, along = project(points.model, torch.stack([-n[..., 1], n[..., 0]], dim=-1), T, K, centre)
     cam = (points.model - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
     ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
     sight = torch.zeros_like(along)

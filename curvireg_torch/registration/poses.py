@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
-from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges
+from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges, quick_fit
 from .edges import EdgeCrops
 from .result import Hypothesis
 from .texture_fit import fit_texture, turned
@@ -34,6 +34,7 @@ __all__ = [
     "projected_box",
     "similarities",
     "with_edge_support",
+    "with_quick_fit",
 ]
 
 SAME_POSE_ANGLE = 15.0
@@ -70,6 +71,7 @@ class Poses:
         covariance: (H, 6, 6) of a fit, NaN without one, see :func:`fit_contours`.
         edge_support, start_support: (H,) of a fit, NaN without one.
         observable: (H,) number of directions that a fit determines.
+        quick: (H, 4, 4) the poses after a :func:`quick_fit`, NaN without one.
     """
 
     crop_index: Tensor
@@ -83,13 +85,14 @@ class Poses:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
+    quick: Tensor
 
     @staticmethod
     def at(T: Tensor, cameras: Tensor, centre: Tensor, view: Tensor, rank: Tensor) -> "Poses":
         """Poses ``T`` of an object with this centre (3,), which are not fitted, in the same box."""
         nan, none = torch.full((len(T),), torch.nan, dtype=torch.float64), torch.zeros_like(view)
-        unknown = nan[:, None, None].repeat(1, 6, 6)
-        return placed(Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none), T, centre)
+        unknown, quick = nan[:, None, None].repeat(1, 6, 6), torch.full_like(T, torch.nan)
+        return placed(Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none, quick), T, centre)
 
     @staticmethod
     def in_box(
@@ -161,9 +164,15 @@ def best_views(
 
 
 def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
-    """Fit the contours of poses to crops, see :func:`fit_contours` and its ``options``."""
+    """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
     given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
     return poses.with_fit(fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre)
+
+
+def with_quick_fit(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> tuple[Poses, Tensor]:
+    """Return the poses with their short fits, and the edge supports (H,) that these reach, see :func:`quick_fit`."""
+    T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    return replace(poses, quick=T), support
 
 
 def fit_texture_of(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, h: int) -> Poses | None:

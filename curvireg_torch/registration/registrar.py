@@ -32,7 +32,7 @@ from .confidence import (
     is_calibrated,
     registration_confidence,
 )
-from .contour_fit import measure_contours, quick_support
+from .contour_fit import measure_contours
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
@@ -53,6 +53,7 @@ from .poses import (
     projected_box,
     similarities,
     with_edge_support,
+    with_quick_fit,
 )
 from .priors import Limits
 from .refinement import nearest_view, refine
@@ -387,7 +388,9 @@ class Registrar:
                 poses = work.limits.moved_inside(poses)
         if work.crops is not None:
             self.report_progress("contours")
-            poses = self._fitted(work, work.crops, poses)
+            unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
+            poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
+            poses = self._fitted(work, work.crops, poses, quick=poses.quick)
         features = self._features(work, poses)
         if work.crops is not None and work.exact:
             poses, features = self._fitted_again(work, work.crops, poses, features, outside)
@@ -458,7 +461,8 @@ class Registrar:
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
-        score = poses.rank + SCREENING_WEIGHT * quick_support(self.describer.contours, crops, poses.cameras, poses.T)
+        poses, support = with_quick_fit(self.describer, crops, poses)
+        score = poses.rank + SCREENING_WEIGHT * support
         return poses[score.argsort(descending=True, stable=True)[:count]]
 
     def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
@@ -491,9 +495,9 @@ class Registrar:
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
         return pose_features(poses, similarity, appearance, landmarks)
 
-    def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses) -> Poses:
+    def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
-        poses = fit_poses(self.describer, crops, starts)
+        poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
             before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
             left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
@@ -508,7 +512,9 @@ class Registrar:
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose again from where it is, and keep the result if it has a higher score."""
         best = _best_inside(features, outside)
-        fitted = self._fitted(work, crops, poses[best])
+        fitted = self._fitted(work, crops, poses[best], again=True)
+        if bool((poses.T[best] == fitted.T).all()):
+            return poses, features
         new = self._features(work, fitted)
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features

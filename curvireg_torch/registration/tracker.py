@@ -329,7 +329,7 @@ class Tracker:
         flat = math.ceil(radius) ** 2 / 3.0  # variance of lines along which colours say nothing
         information = (1.0 / (variance + REGION_VARIANCE) - 1.0 / flat).clamp(min=0.0)
         model, normals = _silhouette(state)
-        J = (normals[None, :, None] @ project(model[None], state.T, frame.K, self.centre)[1])[..., 0, :]
+        _, J = project(model[None], normals[None], state.T, frame.K, self.centre)
         colours = Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
         points = [flow.measurements(state.T, frame.K, self.centre, INLIER_SCALE).scaled(w) for w, flow in flows]
         return [colours, *points]

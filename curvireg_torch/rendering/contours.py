@@ -58,8 +58,8 @@ class _Level:
     def seen(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
         """(N, V, 3) float32 vertices in the cameras' frames, and (N, E) float32 lengths of the edges in px; 0 for those
         outside the crop and behind the camera."""
-        vertices = self._vertices @ R.transpose(0, 2, 1) + position[:, None]
-        x, y, z = np.moveaxis(vertices, -1, 0)
+        vertices = R @ self._vertices.T + position[..., None]
+        x, y, z = vertices.transpose(1, 0, 2)
         behind = z <= NEAR_PLANE * self.radius
         z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
         fx, fy, cx, cy = (K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -67,17 +67,19 @@ class _Level:
         beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
         a, b = self.edges.edges.T
         beyond = beyond.astype(np.uint8)
-        outside = (beyond[:, a] & beyond[:, b]) | ((beyond[:, a] | beyond[:, b]) & 16)
-        length: np.ndarray = np.hypot(u[:, b] - u[:, a], v[:, b] - v[:, a]) * (outside == 0)
-        return vertices, length
+        (ua, ub), (va, vb), (at_a, at_b) = ((x.take(a, axis=1), x.take(b, axis=1)) for x in (u, v, beyond))
+        outside = (at_a & at_b) | ((at_a | at_b) & 16)
+        length: np.ndarray = np.sqrt((ub - ua) ** 2 + (vb - va) ** 2) * (outside == 0)
+        return vertices.transpose(0, 2, 1), length
 
-    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray) -> np.ndarray:
-        """Depth (N, M) of the mesh at pixels (N, M, 2); inf where it is not seen."""
+    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Depth (N, M) of the mesh at pixels (N, M, 2) that ``at`` (N, M) marks; inf elsewhere and beside the mesh."""
         xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
         origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
-        depth = self._scene.distance(origins.reshape(-1, 3), rays.reshape(-1, 3)).reshape(rays.shape[:2])
-        return depth * self.radius
+        depth = np.full(at.shape, np.inf, np.float32)
+        depth[at] = self._scene.distance(origins[at], rays[at]) * self.radius
+        return depth
 
 
 class MeshContours:
@@ -136,14 +138,13 @@ class MeshContours:
                 normal = np.where(agree[..., None], np.sign(agreement)[..., None] * smooth, normal)
             pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(z, np.float32(NEAR_PLANE * self.radius))[..., None]
             if occluding:
-                hit = level.depth_at(pixel + np.float32(ASIDE) * normal, K, R, eye)
+                hit = level.depth_at(pixel + np.float32(ASIDE) * normal, K, R, eye, valid)
                 valid &= hit - z > OCCLUSION_JUMP * self.radius
                 outline = valid & np.isinf(hit)
             else:
                 step = np.float32(CREASE_SCALE * size)
-                beside = np.concatenate([pixel, pixel + step * normal, pixel - step * normal], axis=1)
-                here, ahead, back = np.split(level.depth_at(beside, K, R, eye), 3, axis=1)
-                valid &= here > z - VISIBLE_TOLERANCE * self.radius
+                valid &= level.depth_at(pixel, K, R, eye, valid) > z - VISIBLE_TOLERANCE * self.radius
+                ahead, back = (level.depth_at(pixel + k * normal, K, R, eye, valid) for k in (step, -step))
                 with np.errstate(invalid="ignore"):
                     bend = np.abs(ahead - 2.0 * z + back) / step * K[:, :1, 0] / z
                     flat = np.maximum(np.abs(ahead - z), np.abs(back - z)) < 2.0 * OCCLUSION_JUMP * self.radius

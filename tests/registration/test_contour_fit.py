@@ -12,7 +12,13 @@ from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
-from curvireg_torch.registration.contour_fit import ContourProblem, ContourState, contour_support, quick_support
+from curvireg_torch.registration.contour_fit import (
+    ContourProblem,
+    ContourState,
+    contour_support,
+    fit_to_edges,
+    quick_fit,
+)
 from curvireg_torch.registration.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
 from curvireg_torch.registration.least_squares import apply_twist, project
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
@@ -86,8 +92,7 @@ def test_step_undoes_a_motion_despite_stronger_wrong_edges():
     """Edges at the points of the moved object, and for every third point a stronger one 4 px beside it."""
     points = state(120).points
     motion = torch.tensor([0.006, -0.008, 0.01, 0.01, -0.015, 0.06], dtype=torch.float64)
-    _, by_motion = project(points.model, T, K[None], CENTRE)
-    distance = (points.normals[..., None, :] @ by_motion)[..., 0, :] @ motion
+    distance = project(points.model, points.normals, T, K[None], CENTRE)[1] @ motion
     assert float(distance.abs().max()) > 1.5
     sides = torch.where(torch.arange(120) % 2 == 0, 4.0, -4.0)
     wrong = torch.where(torch.arange(120) % 3 == 0, distance + sides, 90.0)
@@ -300,7 +305,7 @@ def test_fit_rejects_bad_input():
             fitted(noise(), start, **options)
 
 
-def test_quick_support_reaches_far_and_counts_the_mask():
+def test_a_quick_fit_reaches_far_and_counts_the_mask():
     """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size does not reach."""
     image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
     crops = EdgeCrops.cut([image], BOX[None], 0.1)
@@ -308,11 +313,27 @@ def test_quick_support_reaches_far_and_counts_the_mask():
     focal, depth = float(crop.K[0, 0, 0]), float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
     beside = CUBE_POSE.clone()
     beside[0, 3] += 28.0 / focal * depth
-    right, far = quick_support(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside])).tolist()
+    right, far = quick_fit(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside]))[1].tolist()
     assert far > 0.95 * right
     inside = crop_regions([image], BOX[None, None], size=64, margin=0.1)[0, :, :1].clamp(0, 1)
     with_mask, against = (
-        float(quick_support(contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None]))
+        float(quick_fit(contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None])[1])
         for mask in (inside, 1.0 - inside)
     )
     assert with_mask > 1.5 * against
+
+
+def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
+    """A pose that is fitted again moves only if fits around it end elsewhere."""
+    image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
+    crops = EdgeCrops.cut([image], BOX[None], 0.1)
+    starts = apply_twist(CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(torch.eye(6).double()[:2] * 6), contours.centre)
+    problem = contours, crops, K.expand(2, 3, 3)
+    first = fit_to_edges(*problem, starts, FIRST.repeat(2))
+    known = fit_to_edges(*problem, starts, FIRST.repeat(2), quick=quick_fit(*problem, starts)[0])
+    assert known.transform.equal(first.transform)
+    assert known.edge_support.equal(first.edge_support)
+    mixed = torch.stack([first.transform[0], starts[1]])
+    again = fit_to_edges(*problem, mixed, FIRST.repeat(2), again=True)
+    assert again.transform[0].equal(mixed[0])
+    assert float(rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3])) < 1

@@ -17,15 +17,16 @@ ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 def test_project_and_its_derivative():
-    points = torch.rand(1, 7, 3, dtype=torch.float64)
+    points, normals = torch.rand(1, 7, 3, dtype=torch.float64), torch.rand(1, 7, 2, dtype=torch.float64)
     T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
 
     def moved(step: torch.Tensor) -> torch.Tensor:
-        return ls.project(points, ls.apply_twist(T, step[None], centre), K[None], centre)[0][0]
+        uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), K[None], centre)
+        return (uv * normals).sum(dim=-1)[0]
 
     # Not at zero, where the angle of an axis-angle vector is not differentiable.
     expected = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
-    uv, derivative = ls.project(points, T, K[None], centre)
+    uv, derivative = ls.project(points, normals, T, K[None], centre)
     torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
     torch.testing.assert_close(ls.pixels(points, T, K[None], centre), uv)
     torch.testing.assert_close(derivative[0], expected, rtol=1e-4, atol=1e-3)
@@ -83,7 +84,7 @@ def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.
     T, centre = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None], torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
     normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
-    J = (normals[..., None, :] @ ls.project(model, T, K[None], centre)[1])[..., 0, :]
+    _, J = ls.project(model, normals, T, K[None], centre)
     everywhere = torch.ones(1, count, dtype=torch.bool)
     return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
 

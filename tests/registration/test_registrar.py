@@ -1,3 +1,4 @@
+import math
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -13,7 +14,8 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower
+from curvireg_torch.registration import FailedRegistration, Follower, contour_fit
+from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.confidence import are_near
@@ -83,9 +85,9 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
 def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     fit_poses, counts = registrar_module.fit_poses, []
 
-    def counted(describer, images, poses, *rest):
+    def counted(describer, images, poses, **options):
         counts.append(len(poses))
-        return fit_poses(describer, images, poses, *rest)
+        return fit_poses(describer, images, poses, **options)
 
     monkeypatch.setattr(registrar_module, "fit_poses", counted)
     assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
@@ -115,13 +117,37 @@ def test_the_best_pose_is_not_one_outside_the_limits():
     assert registrar_module._best_inside(features, outside).tolist() == [1]
 
 
+@pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
+def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monkeypatch, shift, calls):
+    """The descriptions: of all poses, of the one that is fitted again if it moves, and of those that merged."""
+    registrar, quick_fit, fits, described = truck_registrar(), contour_fit.quick_fit, [], []
+    features_of = type(registrar)._features
+
+    def counted(contours, crops, K, T, *index):
+        fits.append(len(T))
+        return quick_fit(contours, crops, K, T, *index)
+
+    def features(self, work, poses):
+        described.append(len(poses))
+        return features_of(self, work, poses)
+
+    for module in (contour_fit, poses_module):
+        monkeypatch.setattr(module, "quick_fit", counted)
+    monkeypatch.setattr(type(registrar), "_features", features)
+    monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
+    registrar([IMAGE], BOX[None], CAMERA)
+    assert fits == [registrar_module.SCREENED_VIEWS, 0, 1]
+    assert len(described) == calls
+
+
 @pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
 def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
     fit_poses = registrar_module.fit_poses
 
-    def pretended(describer, crops, poses):
-        fitted = fit_poses(describer, crops, poses)
-        return replace(fitted, edge_support=torch.full_like(fitted.rank, support)) if len(poses) == 1 else fitted
+    def pretended(describer, crops, poses, **options):
+        fitted = fit_poses(describer, crops, poses, **options)
+        other = replace(fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support))
+        return other if options.get("again") else fitted
 
     monkeypatch.setattr(registrar_module, "fit_poses", pretended)
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
@@ -140,10 +166,10 @@ def test_default_dtype_does_not_matter():
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
     fit_poses = registrar_module.fit_poses
 
-    def fail(describer, crops, poses):
+    def fail(describer, crops, poses, **options):
         if float(crops.crops.amax()) <= 0.25:
             raise CurviregError("no fit")
-        return fit_poses(describer, crops, poses)
+        return fit_poses(describer, crops, poses, **options)
 
     monkeypatch.setattr(registrar_module, "fit_poses", fail)
     results = truck_registrar()([IMAGE, 0.25 * IMAGE, IMAGE], BOX.repeat(3, 1), CAMERA)

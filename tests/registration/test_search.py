@@ -27,7 +27,7 @@ def searched(truth: Tensor, start: Tensor) -> Tensor:
     """(3, 3) rotation that a search for ``truth`` finds."""
     none = torch.zeros(1, dtype=torch.float64)
     index = torch.zeros(1, dtype=torch.long)
-    poses = Poses(index, index, none, start[None], none, none, none, none, none, none, none)
+    poses = Poses(index, index, none, start[None], none, none, none, none, none, none, none, none)
     describer: Any = RotationDescriber()
     return search(describer, truth.flatten()[None], poses)[0]
 
