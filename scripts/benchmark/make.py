@@ -17,6 +17,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -177,9 +178,7 @@ def compose(objects: Packages, options: argparse.Namespace, index: int, attempt:
     if options.frames > 1:
         points = np.concatenate([shape.hull for shape in scene.shapes if shape.obj_id is not None])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        scene = Scene(
-            scene.shapes, scene.light, scene.background, camera_path(scene.views[0], middle, options.frames, rng)
-        )
+        scene = replace(scene, views=camera_path(scene.views[0], middle, options.frames, rng))
     return scene, annotated
 
 
@@ -293,12 +292,8 @@ def main() -> None:
     objects = _state[0]
     (options.out / "test").mkdir(parents=True, exist_ok=True)
     write_models(objects, options.out / "models")
-    if options.jobs == 1:
-        for index in tqdm(range(options.count), desc="scenes"):
-            make_scene(objects, options, index)
-    else:
-        with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
-            list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
+    with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
+        list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
     kept = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items() if k not in ("out", "jobs")}
     groups = {obj_id: objects.group(obj_id) for obj_id in objects.ids}
     write_json(options.out / "benchmark.json", kept | {"groups": groups})

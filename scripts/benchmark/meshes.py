@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from scripts._shared import write_json
@@ -156,12 +157,8 @@ def candidate_rotations() -> np.ndarray:
     orders = [np.eye(3)[list(p)] for p in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))]
     cube = [s @ o for o in orders for s in signs if np.linalg.det(s @ o) > 0]
     cube.sort(key=lambda R: -np.trace(R))
-    about_z = []
-    for k in range(1, 12):
-        if k % 3:
-            c, s = np.cos(np.pi * k / 6), np.sin(np.pi * k / 6)
-            about_z.append(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
-    return np.array(cube + about_z)
+    about_z = Rotation.from_euler("z", [[30 * k] for k in range(1, 12) if k % 3], degrees=True).as_matrix()
+    return np.concatenate([cube, about_z])
 
 
 def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:

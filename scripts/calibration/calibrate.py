@@ -95,17 +95,14 @@ def errors_of(R: Tensor, sample: Row) -> Tensor:
 
 def truth_of(sample: Row) -> Tensor:
     """(4, 4) true pose of a sample."""
-    T = torch.eye(4, dtype=torch.float64)
-    T[:3, :3], T[:3, 3] = sample["rotation"].double(), sample["translation"].double()
-    return T
+    return cr.geometry.transform(sample["rotation"].double(), sample["translation"].double())
 
 
 def fine(T: Tensor, sample: Row) -> bool:
     """Whether a pose (4, 4) is near the truth."""
     t = sample["translation"].double()
-    return bool(
-        errors_of(T[None, :3, :3], sample) <= FINE_DEGREES and (T[:3, 3] - t).norm() <= FINE_FRACTION * t.norm()
-    )
+    near = (T[:3, 3] - t).norm() <= FINE_FRACTION * t.norm()
+    return bool(near and errors_of(T[None, :3, :3], sample) <= FINE_DEGREES)
 
 
 def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
@@ -297,9 +294,8 @@ def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str]) -
         fitted, quality[name] = fit_logistic(rows, weight)
         constants[name] = fitted | fit_rivals([row for row in rows if row["set"] != "wrong"])
         model = LogisticModel(fitted["weights"], fitted["bias"])
-        distances = [
-            r["distance2"] for r in rows if r["right"] and "distance2" in r and model(r["features"]) >= RELIABLE
-        ]
+        right = [row for row in rows if row["right"] and "distance2" in row]
+        distances = [row["distance2"] for row in right if model(row["features"]) >= RELIABLE]
         if distances:
             scale = constants["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
             constants["covariance_scale"] = round(scale, 3)

@@ -223,9 +223,7 @@ def curve_table(cases: list[Case], settings: BankSettings, eps_px: float, progre
     for _, depth, crop in _views(cases, settings, "curve", progress, rotations):
         views = _view_points(depth, settings)
         for k, detect in enumerate(detectors.values()):
-            sums[k] += (
-                intersection_percentage(views, detect(crop).expand_as(views), eps_px=eps_px).nan_to_num().double()
-            )
+            sums[k] += intersection_percentage(views, detect(crop).expand_as(views), eps_px=eps_px).nan_to_num()
     means = (sums / len(cases)).T.tolist()
     text = (
         f"Fraction of the points of the view with a point of the photograph within {eps_px:g} px, with the object "

@@ -26,6 +26,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from scripts import _shared
+
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow", "layers")
 FRAMES, POSES = 12, 4
@@ -43,6 +45,7 @@ def write_inputs(folder: str) -> None:
     import torch
     import trimesh
 
+    import curvireg_torch as cr
     from curvireg_torch.synthetic import random_pose, synthesize_photograph
 
     mesh = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
@@ -50,7 +53,8 @@ def write_inputs(folder: str) -> None:
     bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
     mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
     mesh.export(Path(folder, "mesh.ply"))
-    generator, K, size, boxes = torch.Generator().manual_seed(0), camera(), (480, 640), []
+    K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
+    generator, size, boxes = torch.Generator().manual_seed(0), (480, 640), []
     for k in range(POSES):
         pose = random_pose(mesh, K, size, generator)
         photograph, box = synthesize_photograph(mesh, pose, K, size, generator)
@@ -58,14 +62,6 @@ def write_inputs(folder: str) -> None:
         cv2.imwrite(str(Path(folder, f"photo{k}.png")), pixels)
         boxes.append(box.tolist())
     Path(folder, "boxes.json").write_text(json.dumps(boxes))
-
-
-def camera() -> Any:
-    """(3, 3) camera matrix."""
-    import torch
-
-    fx, fy, cx, cy = CAMERA
-    return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
 def measure_layers(photographs: int, device: str) -> float:
@@ -79,15 +75,11 @@ def measure_layers(photographs: int, device: str) -> float:
     images = torch.rand(photographs, 1, 480, 640, generator=torch.Generator().manual_seed(0)).to(device)
     seconds = []
     for _ in range(3):
-        if images.is_cuda:
-            torch.cuda.synchronize()
         start = time.perf_counter()
         for layer in layers:
             pixels = images.clone().requires_grad_()
             hog(layer.to(device)(pixels)).sum().backward()
-            assert pixels.grad is not None
-        if images.is_cuda:
-            torch.cuda.synchronize()
+            assert pixels.grad.isfinite().all()  # waits for a GPU
         seconds.append(time.perf_counter() - start)
     return min(seconds) / photographs
 
@@ -102,7 +94,7 @@ def measure(step: str, folder: str, photographs: int, device: str) -> float:
 
     if step == "layers":
         return measure_layers(photographs, device)
-    mesh, K = cr.load_mesh(Path(folder, "mesh.ply")), camera()
+    mesh, K = cr.load_mesh(Path(folder, "mesh.ply")), cr.camera_matrix(*CAMERA, dtype=torch.float64)
     paths = [str(Path(folder, f"photo{k}.png")) for k in range(POSES)]
     if step == "bank":
         start = time.perf_counter()
@@ -138,8 +130,6 @@ def measure(step: str, folder: str, photographs: int, device: str) -> float:
 
 def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str) -> dict[str, float]:
     """Seconds and MB of a step in a checkout."""
-    from scripts._shared import run_process
-
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
     if step in ("cold", "warm"):
         box = json.loads((folder / "boxes.json").read_text())[0]
@@ -147,22 +137,20 @@ def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: 
         words += ["--camera", *map(str, CAMERA)]
         if step == "cold":
             environment["CURVIREG_CACHE"] = tempfile.mkdtemp(dir=folder)
-        seconds, usage, _ = run_process(words, folder, environment)
+        seconds, usage, _ = _shared.run_process(words, folder, environment)
     else:
         words = ["-c", f"{HERE}; print(measure({step!r}, {str(folder)!r}, {photographs}, {device!r}))"]
-        _, usage, output = run_process(words, folder, environment)
+        _, usage, output = _shared.run_process(words, folder, environment)
         seconds = float(output.split()[-1])
     return {"seconds": seconds, "megabytes": usage.ru_maxrss / 1024}
 
 
 def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
-    from scripts._shared import run_process
-
     found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        run_process(["-c", f"{HERE}; write_inputs({temporary!r})"], folder, {**os.environ, "PYTHONPATH": str(ROOT)})
+        folder, environment = Path(temporary), {**os.environ, "PYTHONPATH": str(ROOT)}
+        _shared.run_process(["-c", f"{HERE}; write_inputs({temporary!r})"], folder, environment)
         for name, checkout in checkouts.items():  # the first registration caches the bank
             measured("one", checkout, folder, folder / name, photographs, device)
         for step in tuple(steps) * rounds:
@@ -175,26 +163,21 @@ def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, 
 
 def table(record: dict[str, Any]) -> str:
     """Seconds and memory of each step in Markdown, with the ratio if there are two checkouts."""
-    from scripts._shared import table_lines
-
     times = record["times"]
-    rows = [
-        ["step", *(f"{name} ({record['commits'][name]})" for name in times), *(["ratio"] if len(times) > 1 else [])]
-    ]
-    for step in next(iter(times.values())):
-        both = [found[step] for found in times.values()]
-        cells = [f"{each['seconds']:.2f} s, {each['megabytes']:.0f} MB" for each in both]
-        ratio = [f"{both[-1]['seconds'] / both[0]['seconds']:.2f}"] if len(both) > 1 else []
-        rows.append([f"`{step}`", *cells, *ratio])
+    rows = [["step", *(f"{name} ({record['commits'][name]})" for name in times), "ratio"]]
+    for step in times["now"]:
+        each = [found[step] for found in times.values()]
+        cells = [f"{one['seconds']:.2f} s, {one['megabytes']:.0f} MB" for one in each]
+        rows.append([f"`{step}`", *cells, f"{each[-1]['seconds'] / each[0]['seconds']:.2f}"])
+    if len(times) == 1:
+        rows = [row[:-1] for row in rows]
     many = f"{record['photographs']} photographs in `many`"
     stamp = f"{20 * 4**SUBDIVISIONS} faces, {many}; {record['processor']}, {record['date']}."
-    return "\n".join([*table_lines(rows), "", stamp, ""])
+    return "\n".join([*_shared.table_lines(rows), "", stamp, ""])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     import torch
-
-    from scripts._shared import REPOSITORY, RESULTS, commit, processor, today, update_page, write_json
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
@@ -207,16 +190,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     checkouts = {"before": options.against.resolve()} if options.against else {}
     checkouts["now"] = ROOT
     record = {
-        "date": today(),
-        "commits": {name: commit(root) for name, root in checkouts.items()},
-        "processor": processor() if options.device == "cpu" else torch.cuda.get_device_name(options.device),
+        "date": _shared.today(),
+        "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
+        "processor": _shared.processor() if options.device == "cpu" else torch.cuda.get_device_name(options.device),
         "photographs": options.photographs,
         "times": compare(checkouts, options.steps, options.photographs, options.rounds, options.device),
     }
-    write_json(options.out or RESULTS / "speed.json", record)
+    _shared.write_json(options.out or _shared.RESULTS / "speed.json", record)
     print(table(record))
     if options.out is None:
-        update_page(REPOSITORY / "docs" / "performance.md", "speed", table(record))
+        _shared.update_page(_shared.REPOSITORY / "docs" / "performance.md", "speed", table(record))
 
 
 if __name__ == "__main__":

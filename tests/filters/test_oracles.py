@@ -110,13 +110,16 @@ def test_principal_curvature_image_against_scikit_image() -> None:
         np.testing.assert_allclose(np.hypot(*got.numpy()), want, atol=1e-12)
 
 
-def test_central_derivatives_and_gaussian_against_scipy() -> None:
+def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loops() -> None:
     image = photos(1, 33, dtype=torch.float64)
     x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel; gaussian_smooth rounds it up.
     np.testing.assert_allclose(x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12)
     xx, yy, xy = (h[0, 0].numpy() for h in central_derivatives(smooth(image, 1.7))[2:])
-    gx, _ = _gradient(image[0, 0].numpy(), 1.7)
+    gx, gy = _gradient(image[0, 0].numpy(), 1.7)
+    np.testing.assert_allclose(filters.image_gradient(image, sigma=1.7)[0], [gx, gy], atol=1e-14)
+    saliency = filters.image_curvilinear_saliency(image, sigma=1.7)[0]
+    np.testing.assert_allclose(saliency, np.hypot(gx, gy) * [gx, gy], atol=1e-14)
     np.testing.assert_allclose(xy[1:-1], np.gradient(gx, axis=0)[1:-1], atol=1e-14)
     np.testing.assert_allclose(xx[:, 1:-1], np.diff(x, 2, axis=1), atol=1e-14)
     np.testing.assert_allclose(yy[1:-1], np.diff(x, 2, axis=0), atol=1e-14)

@@ -14,37 +14,28 @@ FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 
 
 @pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
-def test_photograph_is_undistorted_as_by_opencv(camera):
-    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+def test_photograph_and_box_are_undistorted_as_by_opencv(camera):
+    image, box = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)), torch.tensor([12.0, 8, 150, 100])
     K, D, pixels = camera.matrix.numpy(), np.array(camera.distortion), image.permute(1, 2, 0).numpy()
+    side = np.linspace(0.0, 1.0, 500)
+    outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
+    points = np.array(outline, np.float64)[:, None]
     if camera.model == "fisheye":
         expected = cv2.fisheye.undistortImage(pixels, K, D, Knew=K)
+        points = cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
     else:
         expected = cv2.undistort(pixels, K, D)
-    seen = undistorted(image, camera)
+        points = cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
+    seen = undistorted(image, camera, box)
     assert not seen.missing.any()
     torch.testing.assert_close(seen.image, torch.from_numpy(expected).permute(2, 0, 1), atol=0.05, rtol=0)
     assert undistorted(image.double(), camera).image.dtype == torch.float64
     in_bytes = undistorted((image * 255).round().byte(), camera).image
     assert in_bytes.dtype == torch.uint8
     torch.testing.assert_close(in_bytes.float() / 255, seen.image, atol=2 / 255, rtol=0)
-
-
-@pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
-def test_box_is_around_its_undistorted_outline(camera):
-    box = torch.tensor([12.0, 8.0, 150.0, 100.0])
-    moved = undistorted(torch.zeros(1, *SIZE), camera, box).box
-    side = np.linspace(0.0, 1.0, 500)
-    outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
-    K, D, points = camera.matrix.numpy(), np.array(camera.distortion), np.array(outline, np.float64)[:, None]
-    if camera.model == "fisheye":
-        points = cv2.fisheye.undistortPoints(points, K, D, P=K)[:, 0]
-    else:
-        points = cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
-    expected = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
-    torch.testing.assert_close(moved, expected, atol=0.01, rtol=0)
-    beyond = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-40.0, 8.0, 150.0, 100.0])).box
-    border = undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([-0.5, 8.0, 150.0, 100.0])).box
+    around = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
+    torch.testing.assert_close(seen.box, around, atol=0.01, rtol=0)
+    beyond, border = (undistorted(image, camera, torch.tensor([x, 8.0, 150, 100])).box for x in (-40.0, -0.5))
     assert float(beyond[0]) == pytest.approx(float(border[0]) - 39.5, abs=0.1)
 
 

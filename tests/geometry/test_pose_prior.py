@@ -12,6 +12,11 @@ def rotations(azimuth, elevation=0.0, theta=0.0):
     return rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta)))
 
 
+def random_rotations(count):
+    a, e, t = torch.rand(3, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
+
+
 WRAPPED = [((300, 60), 0, 0), ((300, 60), 290, 10), ((300, 60), 180, 120), ((60, 300), 0, 60), ((0, 360), 123, 0)]
 
 
@@ -48,9 +53,7 @@ PRIORS += [PosePrior(azimuth=(100, 140), theta=(-15, 15)), PosePrior(rotation=ro
 
 @pytest.mark.parametrize("prior", PRIORS, ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"])
 def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
-    generator = torch.Generator().manual_seed(0)
-    a, e, t = torch.rand(3, 4000, generator=generator, dtype=torch.float64)
-    R = rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
+    R = random_rotations(4000)
     before, moved = prior.excess(R), prior.nearest(R)
     assert float(prior.excess(moved).max()) < 1e-5
     inside = before <= 0.0
@@ -65,9 +68,7 @@ def test_nearest_satisfies_limits_together():
     """One pass leaves limits that were satisfied before by up to the tolerance of a later one."""
     centre = rotations(70.0, 35.0, 12.0)
     prior = PosePrior(azimuth=(30, 60), elevation=(0, 25), theta=(-8, 8), rotation=centre, within=25.0)
-    generator = torch.Generator().manual_seed(0)
-    a, e, t = torch.rand(3, 500, generator=generator, dtype=torch.float64)
-    R = rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
+    R = random_rotations(500)
     assert float(prior.excess(prior._moved_once(R, None)).max()) > 1.0
     assert float(prior.excess(prior.nearest(R)).max()) < 0.1
 

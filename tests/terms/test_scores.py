@@ -8,10 +8,10 @@ import sklearn.covariance
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
-from torch import nn
 
 from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.filters import ImageGradient
 from tests._support.scenes import scene
 
 
@@ -99,13 +99,10 @@ def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_bor
         assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
 
 
-def test_whitening_decorrelates():
-    x = sample(4000)
-    white = terms.Whitening(x.mean(dim=0), x.T.cov(correction=0))(x)
-    torch.testing.assert_close(white.mean(dim=0), torch.zeros(12), atol=1e-3, rtol=0)
-    torch.testing.assert_close(white.T @ white / len(white), torch.eye(12), atol=1e-2, rtol=0)
+def test_whitening_refuses_covariances_that_cannot_be_inverted():
+    x = sample(5)
     with pytest.raises(InvalidInputError, match="positive definite"):
-        terms.Whitening(x[:5].mean(dim=0), x[:5].T.cov())
+        terms.Whitening(x.mean(dim=0), x.T.cov())
     with pytest.raises(InvalidInputError, match="covariance"):
         terms.Whitening(torch.zeros(3), torch.eye(2))
 
@@ -130,13 +127,8 @@ def test_box_jitter_recovers_a_shifted_view(bank):
     box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
     shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
     pipelines = (replace(bank.pipeline, box_jitter=jitter) for jitter in (0.0, 0.1))
-    exact, jitter = (ViewMatcher(bank, field=_Gradient(), pipeline=pipeline) for pipeline in pipelines)
+    exact, jitter = (ViewMatcher(bank, field=ImageGradient(), pipeline=pipeline) for pipeline in pipelines)
     cases = ((exact, box), (exact, shifted), (jitter, shifted))
     reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
     assert lost < reference - 0.05
     assert recovered > reference - 0.01
-
-
-class _Gradient(nn.Module):
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        return torch.stack(torch.gradient(image[:, 0], dim=(2, 1)), dim=1)
