@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
@@ -11,10 +11,14 @@ from torch import Tensor
 
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
+from ..terms import Appearance, QueryFeatures
 from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges, quick_fit
 from .edges import EdgeCrops
 from .result import Hypothesis
 from .texture_fit import fit_texture, turned
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
 
 __all__ = [
     "POSE_FEATURES",
@@ -22,6 +26,7 @@ __all__ = [
     "Poses",
     "best_views",
     "common_score",
+    "compared",
     "distinct_poses",
     "fit_poses",
     "fit_texture_of",
@@ -193,10 +198,22 @@ def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) 
     return replace(poses, edge_support=support)
 
 
-def similarities(views: Tensor, descriptors: Tensor, poses: Poses) -> Tensor:
-    """(H,) normalised correlations of descriptors (H, D) of the poses' views with those (B, D) of their crops."""
-    queries = F.normalize(descriptors, dim=1)[poses.crop_index.to(descriptors.device)]
-    return (F.normalize(views, dim=1) * queries).sum(dim=1).double().cpu()
+def similarities(views: Tensor, descriptors: Tensor) -> Tensor:
+    """(H,) normalised correlations of descriptors (H, D) of views with those (H, D) or (1, D) of photographs."""
+    return (F.normalize(views, dim=1) * F.normalize(descriptors, dim=1)).sum(dim=1).double().cpu()
+
+
+def compared(
+    registrar: "Registrar", query: QueryFeatures, descriptor: Tensor, ranking: Ranking, *at: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Similarities (H,) of poses with a photograph that is described as ``query`` and, on a grid twice as fine as the
+    bank's, by ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that term. The
+    poses are ``at`` allocentric rotations (H, 3, 3) and distances (H,)."""
+    if Appearance.name not in ranking.terms:
+        similarity = similarities(registrar.describer.descriptors(*at), descriptor)
+        return similarity, torch.zeros_like(similarity)
+    views, pictures = registrar.describer.described(*at)
+    return similarities(views, descriptor), registrar.matcher.appearance_score(query, ranking, pictures)
 
 
 def pose_features(

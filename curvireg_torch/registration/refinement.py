@@ -100,7 +100,7 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
 
     def features_of(poses: Poses) -> Tensor:
         views = describer.descriptors(poses.rotation, poses.distance)
-        return pose_features(poses, similarities(views, descriptors, poses))
+        return pose_features(poses, similarities(views, descriptors))
 
     best = pose_scores(features_of(poses), exact=True).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:

@@ -19,7 +19,7 @@ from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_ban
 from ..mesh import has_colours, mesh_symmetries
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..terms import Appearance, QueryFeatures
+from ..terms import QueryFeatures
 from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
@@ -42,6 +42,7 @@ from .poses import (
     Poses,
     best_views,
     common_score,
+    compared,
     distinct_poses,
     fit_poses,
     fit_texture_of,
@@ -51,7 +52,6 @@ from .poses import (
     pose_features,
     pose_scores,
     projected_box,
-    similarities,
     with_edge_support,
     with_quick_fit,
 )
@@ -85,13 +85,13 @@ _SHAPE_LOCK = threading.Lock()
 
 @dataclass(frozen=True)
 class _Work:
-    """A photograph under work, with ``descriptors`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
+    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
     fits, and ``landmarks`` in the box, if there are any."""
 
     item: ImageItem
     query: QueryFeatures
     ranking: Ranking
-    descriptors: Tensor
+    descriptor: Tensor
     limits: Limits | None
     exact: bool
     symmetries: Tensor | None
@@ -272,7 +272,7 @@ class Registrar:
             return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
     @property
-    def fits_landmarks(self) -> bool:
+    def uses_landmarks(self) -> bool:
         """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
         return self.is_exact(with_camera=True) and self.pipeline.contours
 
@@ -382,7 +382,7 @@ class Registrar:
         poses = starts
         if self.pipeline.search:
             self.report_progress("search")
-            rotation = search(self.describer, work.descriptors, poses)
+            rotation = search(self.describer, work.descriptor, poses)
             poses = self._in_box(work, rotation, poses.distance, poses.view, poses.rank)
             if work.limits is not None:
                 poses = work.limits.moved_inside(poses)
@@ -423,9 +423,9 @@ class Registrar:
         if self.pipeline.contours:
             mask = self.object_mask(query, [item])
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
-        landmarks = self.landmark_matches(item, item.box) if self.fits_landmarks else None
-        descriptors = self.describer.descriptor(query.field)
-        return _Work(item, query, ranking, descriptors, limits, exact, symmetries, crops, landmarks)
+        landmarks = self.landmark_matches(item, item.box) if self.uses_landmarks else None
+        descriptor = self.describer.descriptor(query.field)
+        return _Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
 
     def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
@@ -485,13 +485,8 @@ class Registrar:
 
     def _features(self, work: _Work, poses: Poses) -> Tensor:
         """(H, 5) :data:`POSE_FEATURES`."""
-        at, appearance = (poses.rotation, poses.distance), None
-        if Appearance.name in work.ranking.terms:
-            views, pictures = self.describer.described(*at)
-            appearance = self.matcher.appearance_score(work.query, work.ranking, pictures)
-        else:
-            views = self.describer.descriptors(*at)
-        similarity = similarities(views, work.descriptors, poses)
+        at = poses.rotation, poses.distance
+        similarity, appearance = compared(self, work.query, work.descriptor, work.ranking, *at)
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
         return pose_features(poses, similarity, appearance, landmarks)
 

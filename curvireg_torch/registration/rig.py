@@ -15,14 +15,14 @@ from ..geometry.cameras import rotation_towards, transform
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
 from ..rendering.contours import ContourPoints
-from ..terms import Appearance, QueryFeatures, crop_regions
+from ..terms import QueryFeatures, crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
 from .contour_fit import FIRST_RADII, FULL_SIZE_RADII, QUARTER_SIZE_RADII, ContourProblem, ContourState
 from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
 from .landmarks import LandmarkMatches
 from .least_squares import Measurements, pose_covariance
-from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, landmark_evidence
+from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, compared, landmark_evidence
 from .refinement import LOST_CONFIDENCE, nearest_view
 from .result import Hypothesis, Registration
 from .tracker import boxes_at
@@ -127,8 +127,8 @@ class RigPhotograph:
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
-            descriptor=F.normalize(registrar.describer.descriptor(query.field), dim=1)[0],
-            landmarks=registrar.landmark_matches(item, box) if registrar.fits_landmarks else None,
+            descriptor=registrar.describer.descriptor(query.field),
+            landmarks=registrar.landmark_matches(item, box) if registrar.uses_landmarks else None,
             result=result,
         )
 
@@ -367,17 +367,12 @@ class Rig:
 
     def evidence(self, T: Tensor, support: Tensor) -> Tensor:
         """(V, M, 5) :data:`POSE_FEATURES` of world poses with edge supports (V, M)."""
-        matcher, parts = self.registrar.matcher, []
+        parts = []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
-            compares = Appearance.name in (ranking := photograph.result.ranking).terms
-            views, pictures = (
-                self.describer.described(R, distance) if compares else (self.describer.descriptors(R, distance), None)
-            )
-            similarity = (F.normalize(views, dim=1) @ photograph.descriptor).double().cpu()
-            appearance = landmarks = torch.zeros_like(similarity)
-            if pictures is not None:
-                appearance = matcher.appearance_score(photograph.query, ranking, pictures)
+            given = photograph.query, photograph.descriptor, photograph.result.ranking
+            similarity, appearance = compared(self.registrar, *given, R, distance)
+            landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
             parts.append(torch.stack([similarity, appearance, landmarks]))

@@ -17,14 +17,14 @@ MAX_ROUNDS = 8  # Largest number of rounds of six poses each
 
 
 @torch.no_grad()
-def search(describer: ViewDescriber, descriptors: Tensor, starts: Poses) -> Tensor:
-    """Return (H, 3, 3) allocentric rotations whose views match (B, D) photographs' ``descriptors`` best, near the
+def search(describer: ViewDescriber, descriptor: Tensor, starts: Poses) -> Tensor:
+    """Return (H, 3, 3) allocentric rotations whose views match a photograph's ``descriptor`` (1, D) best, near the
     starts. Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is
     halved where none of them is better, and the search ends where the pose stops moving at the finest step."""
     axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
 
     def scores_of(poses: Poses) -> Tensor:
-        return similarities(describer.descriptors(poses.rotation, poses.distance), descriptors, poses)
+        return similarities(describer.descriptors(poses.rotation, poses.distance), descriptor)
 
     best, score = starts.rotation, scores_of(starts)
     step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
