@@ -333,9 +333,11 @@ def fit_to_edges(
     finish: int | None = None,
     wide_angles: Sequence[float] = (),
     quick: Tensor | None = None,
+    again: bool = False,
 ) -> ContourFit:
     """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras ``K`` (N, 3, 3).
-    ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there was one."""
+    ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there was one. A pose that is fitted
+    ``again`` is kept if the best fit at half size returns to it."""
     N = len(T0)
     full, half = (ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2))
     if quick is None:
@@ -346,7 +348,8 @@ def fit_to_edges(
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
     fits = half[every].state(around.flatten(0, 1))
-    before, weighted_before = half.supports(fits[M * torch.arange(N)])
+    begun = fits[M * torch.arange(N)]
+    before, weighted_before = half.supports(begun)
     fits = half[every].descend(fits, FIRST_RADII[:1])
     kept = half[every].supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
     fits = fits[(kept + M * torch.arange(N)[:, None]).flatten()]
@@ -359,6 +362,9 @@ def fit_to_edges(
     chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
     index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
     source, T = _two_best(half, fits, supports, index)
+    if again:
+        leaves = half[index].mean_shift(begun.points[index], T0[index], T[: len(index)]) > SAME_POSE_SHIFT
+        source, T = source[leaves[source]], T[leaves[source]]
     # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])

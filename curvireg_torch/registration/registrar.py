@@ -516,7 +516,9 @@ class Registrar:
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose again from where it is, and keep the result if it has a higher score."""
         best = _best_inside(features, outside)
-        fitted = self._fitted(work, crops, poses[best])
+        fitted = self._fitted(work, crops, poses[best], again=True)
+        if bool((poses.T[best] == fitted.T).all()):
+            return poses, features
         new = self._features(work, fitted)
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features

@@ -323,7 +323,8 @@ def test_a_quick_fit_reaches_far_and_counts_the_mask():
     assert with_mask > 1.5 * against
 
 
-def test_known_quick_fits_change_nothing():
+def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
+    """A pose that is fitted again moves only if fits around it end elsewhere."""
     image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
     crops = EdgeCrops.cut([image], BOX[None], 0.1)
     starts = apply_twist(CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(torch.eye(6).double()[:2] * 6), contours.centre)
@@ -332,3 +333,7 @@ def test_known_quick_fits_change_nothing():
     known = fit_to_edges(*problem, starts, FIRST.repeat(2), quick=quick_fit(*problem, starts)[0])
     assert known.transform.equal(first.transform)
     assert known.edge_support.equal(first.edge_support)
+    mixed = torch.stack([first.transform[0], starts[1]])
+    again = fit_to_edges(*problem, mixed, FIRST.repeat(2), again=True)
+    assert again.transform[0].equal(mixed[0])
+    assert float(rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3])) < 1

@@ -1,3 +1,4 @@
+import math
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -116,17 +117,27 @@ def test_the_best_pose_is_not_one_outside_the_limits():
     assert registrar_module._best_inside(features, outside).tolist() == [1]
 
 
-def test_starts_have_one_quick_fit(monkeypatch):
-    quick_fit, fits = contour_fit.quick_fit, []
+@pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
+def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monkeypatch, shift, calls):
+    """The descriptions: of all poses, of the one that is fitted again if it moves, and of those that merged."""
+    registrar, quick_fit, fits, described = truck_registrar(), contour_fit.quick_fit, [], []
+    features_of = type(registrar)._features
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return quick_fit(contours, crops, K, T, *index)
 
+    def features(self, work, poses):
+        described.append(len(poses))
+        return features_of(self, work, poses)
+
     for module in (contour_fit, poses_module):
         monkeypatch.setattr(module, "quick_fit", counted)
-    truck_registrar()([IMAGE], BOX[None], CAMERA)
+    monkeypatch.setattr(type(registrar), "_features", features)
+    monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
+    registrar([IMAGE], BOX[None], CAMERA)
     assert fits == [registrar_module.SCREENED_VIEWS, 0, 1]
+    assert len(described) == calls
 
 
 @pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
@@ -136,7 +147,7 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
     def pretended(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
         other = replace(fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support))
-        return other if len(poses) == 1 else fitted
+        return other if options.get("again") else fitted
 
     monkeypatch.setattr(registrar_module, "fit_poses", pretended)
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
