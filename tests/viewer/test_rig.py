@@ -165,7 +165,6 @@ def test_without_the_rig_photographs_are_registered_alone_again(workspace, rig):
     [
         (9, "5", "rig.csv: row 1: 0.png: the camera's pose: expected rigid transforms"),
         (0, "some/1.png", "rig.csv: row 1: some/1.png and row 2: 1.png have the same file name"),
-        (5, "", "rig.csv: row 1: 0.png: fx, fy, cx, cy: expected all or none"),
     ],
 )
 def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, column, value, message):
