@@ -15,12 +15,15 @@ from curvireg_torch.registration.search import search
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 
+def rotation(x: float, y: float, z: float) -> Tensor:
+    """(3, 3) of an axis-angle vector in degrees."""
+    return rotation_from_axis_angle(torch.deg2rad(torch.tensor([x, y, z], dtype=torch.float64)))
+
+
 def poses(degrees: list[float]) -> Poses:
     """Poses that differ by rotations about one axis."""
-    axis_angle = torch.zeros(len(degrees), 3, dtype=torch.float64)
-    axis_angle[:, 1] = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
-    number = torch.arange(len(degrees))
-    return Poses(**{**{f.name: number for f in fields(Poses)}, "rotation": rotation_from_axis_angle(axis_angle)})
+    number, R = torch.arange(len(degrees)), torch.stack([rotation(0.0, angle, 0.0) for angle in degrees])
+    return Poses(**{**{f.name: number for f in fields(Poses)}, "rotation": R})
 
 
 def test_distinct_poses():
@@ -48,11 +51,6 @@ def test_poses_fill_their_box():
     assert float(rotation_error(again.T[0, :3, :3], T[:3, :3])) < 2.0
     assert float((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
     torch.testing.assert_close(again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None])
-
-
-def rotation(x: float, y: float, z: float) -> Tensor:
-    """(3, 3) of an axis-angle vector in degrees."""
-    return rotation_from_axis_angle(torch.deg2rad(torch.tensor([x, y, z], dtype=torch.float64)))
 
 
 class RotationDescriber:
