@@ -48,7 +48,7 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
-    Framed views are rendered from :func:`view_mesh`; ``renderer`` is one of the whole mesh."""
+    Framed views are rendered from ``view_mesh``; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
