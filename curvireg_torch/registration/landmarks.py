@@ -24,7 +24,9 @@ VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and
 VIEW_DISTANCE = 4.0  # of the camera from the object's centre in these views, in object radii
 SILHOUETTE_BORDER = 4  # Width in px of the rim of the silhouette, where the background has a part in the features
 MIN_CONTRAST = 0.02  # of features, SIFT's threshold: prints are fainter in photographs than in views
-TONES, MIN_TONES = (0.01, 0.99), 0.05  # Quantiles of grey that become black and white, and their least distance
+# Quantiles of grey that become black and white in a crop, which the object fills, and in a whole photograph, where it
+# may be brighter than all else; and the least distance of the two
+TONES, ALL_TONES, MIN_TONES = (0.01, 0.99), (0.0, 1.0), 0.05
 CROP_SIDE, MAX_SIDE = 400, 1920  # Longer side in px to which crops are resized, and of the largest whole photograph
 CROP_MARGIN = 0.05  # Space around a given box, as a fraction of its longer side
 SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look alike
@@ -50,11 +52,11 @@ class _Features:
     vectors: np.ndarray
 
     @staticmethod
-    def of(picture: Tensor, mask: np.ndarray | None = None) -> "_Features":
+    def of(picture: Tensor, mask: np.ndarray | None = None, tones: tuple[float, float] = TONES) -> "_Features":
         """RootSIFT features of a picture (C, H, W) in [0, 1]; a place has one for each of its main orientations."""
         grey = picture.mean(dim=0).cpu().numpy()
         # SIFT's threshold is one of contrast, of which a dark photograph has little.
-        low, high = np.quantile(grey, TONES)
+        low, high = np.quantile(grey, tones)
         grey = (255.0 * (grey - low) / max(high - low, MIN_TONES)).round().clip(0.0, 255.0).astype(np.uint8)
         points, vectors = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST).detectAndCompute(grey, mask)
         if vectors is None or not len(points):
@@ -181,7 +183,7 @@ class Landmarks:
         h, w = (max(1, round(scale * side)) for side in crop.shape[-2:])
         scale = max(h, w) / longer
         small = resized(crop, (h, w), mode="bicubic")  # keeps a quarter more features of small crops than bilinear
-        found = _Features.of(small.nan_to_num(0.0, 0.0, 0.0))
+        found = _Features.of(small.nan_to_num(0.0, 0.0, 0.0), tones=ALL_TONES if box is None else TONES)
         uv = (found.uv + 0.5) / scale - 0.5 + [x0, y0]
         return _Features(uv, found.size / scale, found.angle, found.vectors)
 

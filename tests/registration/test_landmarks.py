@@ -108,6 +108,10 @@ def test_photograph_may_be_dark():
     assert found.count > 0.5 * most.count
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
     assert not len(landmarks().matches(torch.full_like(bright, 0.3), K).uv)  # nor does one of a single colour fail
+    alone = render_colour(mesh(), T[None], K[None], SIZE)[0]
+    alone = torch.where(alone.amin(dim=0) < 0.999, alone, torch.full_like(alone, 0.1))
+    wide = torch.nn.functional.pad(alone, (800, 800, 600, 600), value=0.1)  # the bright object covers 0.3 %
+    assert landmarks().matches(wide, K + torch.tensor([[0, 0, 800], [0, 0, 600], [0, 0, 0]])).poses()[0].count > 50
 
 
 def test_each_copy_has_a_pose():
