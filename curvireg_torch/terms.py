@@ -280,7 +280,7 @@ class Repeatability(Term):
 def dilate_points(points: Tensor, eps: float) -> Tensor:
     """Pixels within ``eps`` >= 0 px (Euclidean) of a point: (N, H, W) bool -> (N, H, W) bool."""
     radius = int(eps)
-    if radius == 0 or len(points) == 0:
+    if radius == 0 or points.numel() == 0:
         return points
     offsets = np.arange(-radius, radius + 1)
     disc = (offsets[:, None] ** 2 + offsets**2 <= eps**2).astype(np.uint8)

@@ -1,5 +1,6 @@
 """The resumable loop that registers objects in photographs, of lists and of datasets."""
 
+import gc
 import json
 import threading
 import time
@@ -76,6 +77,7 @@ def run_entries(
             bar.update(len(part) - len(todo))
             for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
                 _register_some(list(same), meshes, store, open_registrar, bar)
+                gc.collect(1)  # meshes are in cycles, and too few objects for the collector to look soon
         group.wait()
         if group.rank:
             return None

@@ -23,7 +23,7 @@ from ..rendering import DepthRenderer
 from ..utils.checks import check_symmetries, check_tensor
 from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
-from .describe import ViewDescriber, hog_layer, view_mesh
+from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 8
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
@@ -110,7 +110,7 @@ class ViewBank:
         progress: bool | Callable[[str, int, int], object] = True,
         device: torch.device | str = "cpu",
     ) -> "ViewBank":
-        """Render, filter and describe every view, in chunks on as many threads as torch may use.
+        """Render, filter and describe every view, in chunks on several threads.
 
         Args:
             mesh: a mesh or the path of one, see :func:`curvireg_torch.load_mesh`.
@@ -185,7 +185,10 @@ class ViewBank:
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
         contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
         arrays = {f"mesh.{name}": x for name, x in colour_arrays(self.mesh).items()}
-        for kind, mesh in (("mesh", self.mesh), ("view_mesh", view_mesh(self.mesh))):
+        meshes = {"mesh": self.mesh}
+        if len(self.mesh.faces) > VIEW_FACES:
+            meshes["view_mesh"] = view_mesh(self.mesh)
+        for kind, mesh in meshes.items():
             arrays[f"{kind}.vertices"] = np.array(mesh.vertices, np.float64)
             arrays[f"{kind}.faces"] = np.array(mesh.faces, np.int32)
         contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
@@ -242,7 +245,8 @@ class ViewBank:
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     mesh = _triangles(tensors, "mesh")
     mesh._cache.update({n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors})
-    mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
+    if len(mesh.faces) > VIEW_FACES:
+        mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
     check_tensor(extreme_points(mesh), "extreme_points", (None, 3))
     if unit:
         mesh.units = unit

@@ -38,9 +38,7 @@ def hog_layer(settings: BankSettings) -> HOG:
 
 @cached_in_mesh
 def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh that framed views are rendered from, of at most ``VIEW_FACES`` faces."""
-    if len(mesh.faces) <= VIEW_FACES:
-        return mesh
+    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more than these."""
     centre = mesh_centre(mesh).numpy()
     vertices, faces = simplified(mesh, centre, VIEW_FACES)
     return trimesh.Trimesh(vertices + centre, faces, process=False)
@@ -48,7 +46,7 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
-    Framed views are rendered from ``view_mesh``; ``renderer`` is one of the whole mesh."""
+    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,

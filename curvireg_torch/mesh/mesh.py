@@ -4,9 +4,10 @@ import math
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -169,9 +170,15 @@ def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColour
 
 def cached_in_mesh(function: Callable[[trimesh.Trimesh], Found]) -> Callable[[trimesh.Trimesh], Found]:
     """Decorate a function of a mesh whose value stays in trimesh's cache, by the function's name, until vertices or
-    faces change. Banks store such values."""
-    cached: Callable[[trimesh.Trimesh], Found] = trimesh.caching.cache_decorator(function).fget
-    return cached
+    faces change; callers get copies of tensors. Banks store such values."""
+    cached = trimesh.caching.cache_decorator(function).fget
+
+    @wraps(function)
+    def value_of(mesh: trimesh.Trimesh) -> Found:
+        value = cached(mesh)
+        return cast(Found, value.clone() if isinstance(value, Tensor) else value)
+
+    return value_of
 
 
 @cached_in_mesh

@@ -123,7 +123,7 @@ class ContourProblem:
         return state
 
     def with_current_contours(self, state: ContourState) -> ContourState:
-        # Decided for each pose separately: a result must not depend on the rest of the batch.
+        # Decided for each pose separately: up to rounding, a result must not depend on the rest of the batch.
         stale = self.mean_shift(state.points, state.seen, state.T) > STALE_SHIFT
         if not bool(stale.any()):
             return state
@@ -287,7 +287,7 @@ def fit_contours(
         image_index: (N,) the photograph of each start; optional for one photograph.
         margin: added around the box, as a fraction of its longer side.
         finish: number of starts of each photograph that are fitted to the end, those with the most support after the
-            first rounds; None: all, each as if alone.
+            first rounds; None: all, each as if alone, up to rounding.
         wide_angles: degrees by which starts are rotated up, down, left and right, to begin there too at a quarter
             of the size: for starts that may be worse than views of a bank.
         object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to

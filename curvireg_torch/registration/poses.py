@@ -26,7 +26,7 @@ __all__ = [
     "Poses",
     "best_views",
     "common_score",
-    "compared",
+    "compare_with_photograph",
     "distinct_poses",
     "fit_poses",
     "fit_texture_of",
@@ -76,7 +76,7 @@ class Poses:
         covariance: (H, 6, 6) of a fit, NaN without one, see :func:`fit_contours`.
         edge_support, start_support: (H,) of a fit, NaN without one.
         observable: (H,) number of directions that a fit determines.
-        quick: (H, 4, 4) the poses after a :func:`quick_fit`, NaN without one.
+        quick: (H, 4, 4) the poses after a :func:`quick_fit`, NaN without one; those of starts.
     """
 
     crop_index: Tensor
@@ -203,16 +203,21 @@ def similarities(views: Tensor, descriptors: Tensor) -> Tensor:
     return (F.normalize(views, dim=1) * F.normalize(descriptors, dim=1)).sum(dim=1).double().cpu()
 
 
-def compared(
-    registrar: "Registrar", query: QueryFeatures, descriptor: Tensor, ranking: Ranking, *at: Tensor
+def compare_with_photograph(
+    registrar: "Registrar",
+    query: QueryFeatures,
+    descriptor: Tensor,
+    ranking: Ranking,
+    rotation: Tensor,
+    distance: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Similarities (H,) of poses with a photograph that is described as ``query`` and, on a grid twice as fine as the
-    bank's, by ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that term. The
-    poses are ``at`` allocentric rotations (H, 3, 3) and distances (H,)."""
+    """Similarities (H,) of poses, allocentric rotations (H, 3, 3) and distances (H,), with a photograph that is
+    described as ``query`` and, on a grid twice as fine as the bank's, by ``descriptor`` (1, D); and their appearance
+    scores (H,), 0 where its ``ranking`` lacks that term."""
     if Appearance.name not in ranking.terms:
-        similarity = similarities(registrar.describer.descriptors(*at), descriptor)
+        similarity = similarities(registrar.describer.descriptors(rotation, distance), descriptor)
         return similarity, torch.zeros_like(similarity)
-    views, pictures = registrar.describer.described(*at)
+    views, pictures = registrar.describer.described(rotation, distance)
     return similarities(views, descriptor), registrar.matcher.appearance_score(query, ranking, pictures)
 
 

@@ -42,7 +42,7 @@ from .poses import (
     Poses,
     best_views,
     common_score,
-    compared,
+    compare_with_photograph,
     distinct_poses,
     fit_poses,
     fit_texture_of,
@@ -389,7 +389,8 @@ class Registrar:
         if work.crops is not None:
             self.report_progress("contours")
             unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
-            poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
+            if len(unknown):
+                poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
             poses = self._fitted(work, work.crops, poses, quick=poses.quick)
         features = self._features(work, poses)
         if work.crops is not None and work.exact:
@@ -485,8 +486,8 @@ class Registrar:
 
     def _features(self, work: _Work, poses: Poses) -> Tensor:
         """(H, 5) :data:`POSE_FEATURES`."""
-        at = poses.rotation, poses.distance
-        similarity, appearance = compared(self, work.query, work.descriptor, work.ranking, *at)
+        given = work.query, work.descriptor, work.ranking
+        similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
         return pose_features(poses, similarity, appearance, landmarks)
 

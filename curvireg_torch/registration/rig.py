@@ -22,7 +22,7 @@ from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
 from .landmarks import LandmarkMatches
 from .least_squares import Measurements, pose_covariance
-from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, compared, landmark_evidence
+from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, compare_with_photograph, landmark_evidence
 from .refinement import LOST_CONFIDENCE, nearest_view
 from .result import Hypothesis, Registration
 from .tracker import boxes_at
@@ -371,7 +371,7 @@ class Rig:
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
             given = photograph.query, photograph.descriptor, photograph.result.ranking
-            similarity, appearance = compared(self.registrar, *given, R, distance)
+            similarity, appearance = compare_with_photograph(self.registrar, *given, R, distance)
             landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))

@@ -21,7 +21,8 @@ _threads_for_jobs = 1
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Within, torch computes on one thread in each job, and as many jobs run at a time as torch had threads before.
+    """Within, torch computes on one thread in each job, and as many jobs run at a time as torch had threads before, up
+    to ``MAX_THREADS``.
 
     Threads that divide an operation of torch all wait for the slowest, busily; threads with jobs of their own wait
     once, at the end. Commands compute like this; for its caller, a library changes nothing.
@@ -66,9 +67,9 @@ def available_threads() -> int:
 def map_on_threads(
     job: Callable[[Item], Result], items: Sequence[Item], *, device: torch.device | str = "cpu"
 ) -> list[Result]:
-    """``job`` of every item, in order, each on a thread on which torch computes single-threaded.
+    """``job`` of every item, in order, on a CPU each on a thread on which torch computes single-threaded.
 
-    A result depends neither on the number of items nor on the number of threads, which would change its rounding.
+    There a result depends neither on the number of items nor on the number of threads, which would change its rounding.
     Threads that are left over help with :func:`for_each`. For other devices than the CPU, jobs run in sequence here.
     """
     threads = available_threads()

@@ -1,5 +1,6 @@
 """The loop over entries, with a function in place of the registration."""
 
+import weakref
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ def entries(tmp_path, threads):
 
 def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
     """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after`` of them."""
-    labels = []
+    labels, opened = [], []
 
     def register(entry, registrar, _, *, bank_seconds):
         if len(labels) == stop_after:
@@ -44,7 +45,10 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         return {"status": "ok"}
 
     def open_registrar(meshes):
-        raise MeshError(meshes[0].name)
+        assert not any(reference() for reference in opened), "that of the mesh before is still in memory"
+        error = MeshError(meshes[0].name)  # in a cycle, by its traceback, as a mesh is
+        opened.append(weakref.ref(error))
+        raise error
 
     options = {"settings": settings or {}, "label": "", "progress": False}
     try:

@@ -136,7 +136,7 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monke
     monkeypatch.setattr(type(registrar), "_features", features)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
-    assert fits == [registrar_module.SCREENED_VIEWS, 0, 1]
+    assert fits == [registrar_module.SCREENED_VIEWS, 1]
     assert len(described) == calls
 
 
