@@ -7,7 +7,7 @@
 
 Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every measurement has a process
 of its own; each step counts with its least time and memory over the rounds. Ratios are fair on a busy machine, times
-only on an idle one.
+only on an idle one. The other checkout is of 2026-11-23 or later.
 
 - cold, warm: ``curvireg register`` from process start to its files, without and with a cached bank
 - bank: ``ViewBank.build`` of all views
