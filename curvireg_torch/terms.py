@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from .errors import InvalidInputError
 from .features.backbone import SHA256, Backbone, describe, similarity
+from .features.learned_field import LearnedCurvilinearSaliency
 from .filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
 from .geometry.crops import check_boxes, crop_squares, square_boxes
 from .utils.checks import check_integer, check_option, check_photograph, check_positive, check_tensor
@@ -22,7 +23,7 @@ from .utils.threads import map_on_threads
 
 __all__ = ["TERMS", "Appearance", "BoxShape", "Correlation", "QueryFeatures", "Repeatability", "Term", "Whitening"]
 BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
-VIEWS_AT_A_TIME = 64  # whose points are compared
+VIEWS_AT_A_TIME, CELLS_AT_A_TIME = 64, 64  # whose points are counted, and in which they are compared
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
 
@@ -37,6 +38,7 @@ class QueryFeatures:
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
+        mask: (B, 1, S, S) probability that pixels of the first crop belong to the object, where the field predicts it.
         computed: features of the crops that terms have computed, by the term's name.
     """
 
@@ -45,6 +47,7 @@ class QueryFeatures:
     descriptors: Tensor
     points: Tensor
     shapes: Tensor
+    mask: Tensor | None = None
     computed: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
     @property
@@ -53,14 +56,16 @@ class QueryFeatures:
         return self.regions[:, 0]
 
 
-def photograph_field(field: nn.Module, crops: Tensor) -> Tensor:
-    """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``.
+def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:
+    """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``, and
+    the mask (B, 1, S, S) that the learned field predicts with it.
     Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there."""
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
     holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
-    out: Tensor = field(to_grey(crops) if grey else crops)
-    return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0)
+    crops = to_grey(crops) if grey else crops
+    out, mask = field.field_and_mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else (field(crops), None)
+    return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0), mask
 
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
@@ -255,19 +260,21 @@ class Repeatability(Term):
             points = dilate_points(views.points_at(slice(start, start + VIEWS_AT_A_TIME)), self.eps * S)
             return cell_counts(points, cell).flatten(1)
 
-        # Pixels of each cell within eps of a view's points, (N, cells), and all of its pixels, (1, cells)
+        # Pixels of each cell within eps of a view's points, (cells, N), and all of its pixels, (1, cells)
         near = torch.cat(map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device))
+        near = near.T.contiguous()
         area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=near.device), cell).flatten(1)
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.points.shape[:2]
             # A point in a cut cell counts as much as any other.
             points = cell_counts(query.points.flatten(0, 1), cell).flatten(1).float()
-            queries = points / area
-            # A float32 copy of all views would take longer than the product.
-            matched = torch.cat([queries @ few.float().T for few in near.split(VIEWS_AT_A_TIME)], dim=1)
+            # Most cells have no points. A float32 copy of the others at once would take longer than the product.
+            matched = points.new_zeros(len(points), near.shape[1])
+            for few in points.any(dim=0).nonzero()[:, 0].split(CELLS_AT_A_TIME):
+                matched.addmm_(points[:, few] / area[:, few], near[few].float())
             rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-            return rep.view(B, K, len(near)).amax(dim=1)
+            return rep.view(B, K, -1).amax(dim=1)
 
         return compare
 

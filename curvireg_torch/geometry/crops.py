@@ -10,7 +10,7 @@ from torch import Tensor
 from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
 
-SAMPLES_AT_A_TIME = 16  # of a matrix product: fewer are slow, more multiply by many zeros
+SAMPLES_AT_A_TIME = 64  # of a matrix product: fewer are slow, more multiply by many zeros
 
 
 def whole_image_box(image: Tensor) -> Tensor:

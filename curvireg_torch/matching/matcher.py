@@ -1,10 +1,12 @@
 """All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -26,6 +28,7 @@ from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
 MAX_CACHED_VIEWS = 2048  # Views whose appearance is cached, 35 kB each at 128 px
+ROUNDING_OF_TRACE = 1e-5  # Views of a grid are exactly as far apart as its steps
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
 
@@ -87,17 +90,17 @@ def distinct_views(
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
-    symmetries = symmetries[:, :3, :3].to(rotations)
+    R, S = rotations.cpu().numpy(), symmetries[:, :3, :3].to(rotations).cpu().numpy()  # many small steps
+    flat, least = R.reshape(-1, 9).T, 1.0 + 2.0 * math.cos(math.radians(angle)) - ROUNDING_OF_TRACE
     selected: list[int] = []
-    available = torch.ones(len(rotations), dtype=torch.bool, device=order.device)
-    while len(selected) < count and len(candidates := order[available[order]]):
-        best = int(candidates[0])
-        selected.append(best)
-        equivalent = rotations[best] @ symmetries
-        traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
-        near = torch.rad2deg(torch.acos((0.5 * (traces - 1.0)).clamp(-1.0, 1.0))) <= angle
-        available &= ~near
-        available[best] = False
+    available = np.ones(len(R), bool)
+    for view in order.tolist():
+        if len(selected) == count:
+            break
+        if available[view]:
+            selected.append(view)
+            available &= ((R[view] @ S).reshape(-1, 9) @ flat).max(axis=0) < least
+            available[view] = False
     return torch.tensor(selected, dtype=torch.long, device=order.device)
 
 
@@ -177,7 +180,7 @@ class ViewMatcher(nn.Module):
     def describe(self, regions: Tensor, shapes: Tensor) -> QueryFeatures:
         """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
         B, K = regions.shape[:2]
-        field = photograph_field(self.field, regions.flatten(0, 1))
+        field, mask = photograph_field(self.field, regions.flatten(0, 1))
         points = field_points(field, fraction=self.bank.settings.point_fraction)[:, 0]
         return QueryFeatures(
             regions=regions,
@@ -185,6 +188,7 @@ class ViewMatcher(nn.Module):
             descriptors=self.descriptor(field).unflatten(0, (B, K)),
             points=points.unflatten(0, (B, K)),
             shapes=shapes.to(regions),
+            mask=None if mask is None else mask.unflatten(0, (B, K))[:, 0],
         )
 
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:

@@ -124,11 +124,17 @@ def _sampled_lines(
     scale = 2.0 / (size or pictures.shape[-1])
     start, along = (scale * uv + (0.5 * scale - 1.0)).float(), (scale * normals).float()
     grid = torch.addcmul(start[:, :, None], offsets.float()[:, None], along[:, :, None])
+
+    def sampled(picture: Tensor, grid: Tensor) -> Tensor:
+        picture = picture.expand(len(grid), -1, -1, -1)  # not copied for every pose
+        return F.grid_sample(picture, grid, padding_mode=padding, align_corners=False)
+
+    if len(pictures) == 1:
+        return sampled(pictures[0], grid)
     out = grid.new_empty(len(uv), pictures.shape[1], *grid.shape[1:3])
-    for b in (seen := image_index.unique().tolist()):  # an expanded picture is not copied for every pose
-        mine = slice(None) if len(seen) == 1 else (image_index == b).nonzero()[:, 0]
-        picture = pictures[b].expand(len(grid[mine]), -1, -1, -1)
-        out[mine] = F.grid_sample(picture, grid[mine], padding_mode=padding, align_corners=False)
+    for b in image_index.unique().tolist():
+        mine = (image_index == b).nonzero()[:, 0]
+        out[mine] = sampled(pictures[b], grid[mine])
     return out
 
 

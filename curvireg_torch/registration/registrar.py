@@ -12,7 +12,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
-from ..features.learned_field import LearnedCurvilinearSaliency
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
@@ -474,11 +473,11 @@ class Registrar:
 
     def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted, or None."""
-        settings, field = self.bank.settings, self.matcher.field
+        settings = self.bank.settings
         masks = [item.mask_crop(settings.image_size, settings.margin) for item in items]
-        if isinstance(field, LearnedCurvilinearSaliency):
-            crops = query.crops.split(1)  # rounding is that of a photograph alone
-            masks = [field.mask(crop) if mask is None else mask for mask, crop in zip(masks, crops, strict=True)]
+        if query.mask is not None:
+            pairs = zip(masks, query.mask.split(1), strict=True)
+            masks = [predicted if given is None else given for given, predicted in pairs]
         known = next((mask for mask in masks if mask is not None), None)
         if known is None:
             return None

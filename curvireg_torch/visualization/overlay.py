@@ -88,7 +88,7 @@ def side_pictures(
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
-    field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))
+    field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))[0]
     at = result.allocentric_rotation[None], torch.tensor([result.distance])
     shaded = registrar.describer.shaded(*at)[0]  # grey, or grey and RGB
     return {

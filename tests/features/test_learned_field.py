@@ -5,6 +5,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+import torch.nn.functional as F
 from safetensors.torch import save_file
 
 import curvireg_torch as cr
@@ -12,7 +13,7 @@ from curvireg_torch import filters
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency, doubled_angle, halved_angle
 from curvireg_torch.features.backbone import Backbone, describe
-from curvireg_torch.features.learned_field import save_weights
+from curvireg_torch.features.learned_field import FieldNetwork, save_weights
 
 from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, equal_up_to_sign, photos
@@ -58,11 +59,18 @@ def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):
     assert off.max() < precision * size
 
 
-def test_learned_field_loads_other_weights_and_rejects_bad_ones(field, tmp_path):
-    save_weights(field.network, tmp_path / "weights.safetensors")
-    loaded = LearnedCurvilinearSaliency(weights=tmp_path / "weights.safetensors")
-    x = torch.rand(1, 3, 128, 128)
-    assert torch.equal(loaded(x), field(x))
+def test_learned_field_loads_other_weights_and_rejects_bad_ones(tmp_path):
+    torch.manual_seed(0)
+    network, x = FieldNetwork(), torch.rand(4, 3, 128, 128)
+    with torch.no_grad():
+        network(x)  # statistics that batch normalisation divides by
+        network.eval()
+        save_weights(network, tmp_path / "weights.safetensors")
+        loaded = LearnedCurvilinearSaliency(weights=tmp_path / "weights.safetensors")
+        out = F.interpolate(network(x), scale_factor=2.0, mode="bilinear")
+    assert not any(isinstance(layer, torch.nn.BatchNorm2d) for layer in loaded.modules())
+    torch.testing.assert_close(loaded.mask(x), out[:, 2:].sigmoid(), atol=2e-3, rtol=0)  # stored as halves
+    torch.testing.assert_close(doubled_angle(loaded(x)), out[:, :2], atol=2e-3, rtol=0)
     missing, corrupt, other = (tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other"))
     corrupt.write_bytes(b"not weights")
     save_file({"a": torch.zeros(2)}, other)
