@@ -60,7 +60,7 @@ def hog(
         votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins)
         rows, columns = (_cell_weights(n, grid, votes) for n in field.shape[-2:])
         with ops.full_precision(votes):
-            cells = rows @ (votes @ columns.T)  # (B, bins, grid, grid) mean votes
+            cells = (rows @ votes) @ columns.T  # (B, bins, grid, grid) mean votes
         if bin_weights is not None:
             cells = cells * bin_weights.to(cells.dtype).view(1, -1, 1, 1)
         return (_normalised_blocks(cells, block, clip),)
@@ -187,5 +187,5 @@ def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> T
     candidates, count = candidates & (response > 0), max(1, int(fraction * H * W))
     if ops.is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
         return candidates  # most views have fewer, and topk is slow
-    limit = torch.where(candidates, response, 0.0).flatten(1).topk(count, dim=1).values[:, -1]
+    limit = torch.where(candidates, response, 0.0).flatten(1).topk(count, dim=1, sorted=False).values.amin(dim=1)
     return candidates & (response >= limit.view(B, 1, 1, 1))

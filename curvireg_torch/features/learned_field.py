@@ -110,8 +110,9 @@ def _fold_batch_norm(network: nn.Module) -> None:
         if isinstance(child, nn.Sequential):
             layers: list[nn.Module] = []
             for layer in child:
-                if isinstance(layer, nn.BatchNorm2d):
-                    layers[-1] = fuse_conv_bn_eval(layers[-1], layer)
+                before = layers[-1] if layers else None
+                if isinstance(layer, nn.BatchNorm2d) and isinstance(before, nn.Conv2d):
+                    layers[-1] = fuse_conv_bn_eval(before, layer)
                 else:
                     layers.append(layer)
             setattr(network, name, nn.Sequential(*layers))

@@ -271,7 +271,7 @@ class ViewMatcher(nn.Module):
         """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
         that of the most similar view of its ranking."""
         assert self._appearance is not None
-        raw = self._appearance.compare(query, self._appearance.describe(pictures))[0].cpu().double()
+        raw = self._appearance.compare(query, self._appearance.describe(pictures, together=True))[0].cpu().double()
         views = ranking.terms[Appearance.name][0].cpu().double()
         views = views[views.isfinite()].expand(len(raw), -1)
         scores = self._appearance.term.log_score(torch.cat([views, raw[:, None]], dim=1))

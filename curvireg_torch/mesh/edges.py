@@ -73,6 +73,19 @@ class MeshEdges:
         return all_same, first
 
 
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Whether each edge has two faces, which run along it in opposite directions, apart from faces without area."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    cell = max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)
+    _, number = _unique(np.round((vertices - vertices[0]) / cell).astype(np.int64))
+    corners = number[faces]
+    ends = np.roll(corners, -1, axis=1)
+    has_area = (corners != ends).all(axis=1)
+    a, b = corners[has_area].ravel(), ends[has_area].ravel()
+    along, back = np.sort(a * len(vertices) + b), np.sort(b * len(vertices) + a)
+    return bool((along == back).all() and (np.diff(along) > 0).all())
+
+
 def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most about
     ``max_faces``."""

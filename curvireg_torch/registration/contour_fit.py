@@ -32,8 +32,10 @@ QUARTER_SIZE_RADII = (6.0, 4.0)
 FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
 """Search radius for edges in px, one a round: from all starts and then from the best at half size, and at full size."""
 
-SMALL_CROP_DENSITY = 0.5
-"""Contour points in smaller crops, as a fraction of those at full size."""
+COARSE_DENSITY = 0.25
+DENSITY = {1: 1.0, 2: 0.5, 4: COARSE_DENSITY}
+"""Contour points in crops whose sides are smaller by a factor, as a fraction of those at full size; the coarse ones
+also choose among starts at half size."""
 
 KEPT_STARTS = 3
 """Starts of a pose that continue after the first round, those with the most support."""
@@ -41,9 +43,9 @@ KEPT_STARTS = 3
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
-START_ANGLE, START_ROLL = 8.0, 6.0
+START_ANGLE, START_ROLL, FAR_ANGLE = 8.0, 6.0, 16.0
 """Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
-half the spacing of a bank's views."""
+half the spacing of a bank's views; the last one for a pose that is fitted again."""
 
 SUPPORTED, GAINED = 0.5, 0.2
 """Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated scenes."""
@@ -98,8 +100,7 @@ class ContourProblem:
         shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
         shrink[:2, 2] = 0.5 / factor - 0.5
         K = shrink @ crops.transforms[index] @ K
-        density = 1.0 if factor == 1 else SMALL_CROP_DENSITY
-        return cls(contours, crops.edges(factor), index, K, CROP_SIZE // factor, crops.mask, density)
+        return cls(contours, crops.edges(factor), index, K, CROP_SIZE // factor, crops.mask, DENSITY[factor])
 
     @property
     def centre(self) -> Tensor:
@@ -116,11 +117,15 @@ class ContourProblem:
     def descend(self, state: ContourState, radii: Sequence[float]) -> ContourState:
         """Poses after one round for each search radius in px; contours are found again where they moved."""
         for radius in radii:
-            T = state.T
-            for _ in range(STEPS_PER_ROUND):
-                T = self.step(state.points, T, radius)
-            state = self.with_current_contours(replace(state, T=T))
+            state = self.with_current_contours(self.moved(state, radius))
         return state
+
+    def moved(self, state: ContourState, radius: float) -> ContourState:
+        """Poses after one round, with their contours as they were."""
+        T = state.T
+        for _ in range(STEPS_PER_ROUND):
+            T = self.step(state.points, T, radius)
+        return replace(state, T=T)
 
     def with_current_contours(self, state: ContourState) -> ContourState:
         # Decided for each pose separately: up to rounding, a result must not depend on the rest of the batch.
@@ -146,16 +151,18 @@ class ContourProblem:
         if self.mask is not None:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
         equations = [other.equations() for other in others]
-        step = torch.zeros(len(T), 6, 1, dtype=torch.float64)
+        log, residual = strength.log(), distance
         for _ in range(SELECTIONS_PER_STEP):
-            residual = distance - J @ step.to(J.dtype)
-            index = (strength * torch.exp(-2.0 * (residual / radius) ** 2)).argmax(dim=-1, keepdim=True)
-            tukey = (1.0 - (residual.gather(-1, index) / radius) ** 2).clamp(min=0.0) ** 2
+            # The largest strength times exp(-2 (residual / radius)^2)
+            index = torch.addcmul(log, residual, residual, value=-2.0 / radius**2).argmax(dim=-1, keepdim=True)
+            tukey = (1.0 - (residual.gather(-1, index) / radius).square()).clamp(min=0.0).square()
             edges = Measurements(J, distance.gather(-1, index), strength.gather(-1, index) * tukey)
-            own = (each.double() for each in edges.equations())
-            A, b = (sum(parts) for parts in zip(own, *equations, strict=True))
-            step = self.solution(A, b)[..., None]
-        return apply_twist(T, step[..., 0] * self.step_fraction(step[..., 0], T)[:, None], self.centre)
+            A, b = (each.double() for each in edges.equations())
+            for more_A, more_b in equations:
+                A, b = A + more_A, b + more_b
+            step = self.solution(A, b)
+            residual = distance - J @ step[..., None].to(J.dtype)
+        return apply_twist(T, step * self.step_fraction(step, T)[:, None], self.centre)
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
         """(N, 6) damped solutions of normal equations (N, 6, 6) and (N, 6, 1)."""
@@ -263,9 +270,9 @@ def fit_contours(
 
     where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
     near the predicted position; the search radius shrinks from round to round, and the contours are found again where
-    they have moved. The fit begins at half size from each start and from six poses rotated away from it; the three with
-    the most edge support after the first round go on. The best of them and the next best that differs from it end at
-    full size. If no fit improves the edge support, the start is kept.
+    they have moved. The fit begins at half size from each start and from six poses rotated away from it, with few
+    points; the three with the most edge support after the first round go on. The best of them and the next best that
+    differs from it end at full size. If no fit improves the edge support, the start is kept.
 
     Prints and clutter have edges too. With an ``object_mask`` they are weighted (``ObjectMask``) in the least squares
     and in the choice among the fits, not in the reported support.
@@ -344,18 +351,18 @@ def fit_to_edges(
         wide = _turned(T0, half.centre, wide_angles)
         every = torch.arange(N).repeat_interleave(wide.shape[1])
         quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
-    around = torch.cat([_turned(T0, half.centre, (START_ANGLE,), roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1)
+    angles = (START_ANGLE, FAR_ANGLE) if again else (START_ANGLE,)
+    around = torch.cat([_turned(T0, half.centre, angles, roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1)
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    fits = half[every].state(around.flatten(0, 1))
-    begun = fits[M * torch.arange(N)]
+    begun, coarse = half.state(T0), replace(half[every], density=COARSE_DENSITY)
     before, weighted_before = half.supports(begun)
-    fits = half[every].descend(fits, FIRST_RADII[:1])
-    kept = half[every].supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
-    fits = fits[(kept + M * torch.arange(N)[:, None]).flatten()]
+    fits = coarse.moved(coarse.state(around.flatten(0, 1)), FIRST_RADII[0])
+    kept = coarse.supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+    T = fits.T[(kept + M * torch.arange(N)[:, None]).flatten()]
     M = kept.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    fits = half[every].descend(fits, FIRST_RADII[1:])
+    fits = half[every].descend(half[every].state(T), FIRST_RADII[1:])
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
     first = fits[torch.arange(N) * M + best]
@@ -369,8 +376,10 @@ def fit_to_edges(
     owner = torch.cat([index, others, index[source]])
     unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
     fixed = torch.cat([T0[index], unfinished])
-    fitted = full[index[source]]
-    state = ContourState.cat([full[owner[: len(fixed)]].state(fixed), fitted.descend(fitted.state(T), FULL_SIZE_RADII)])
+    state = full[owner[: len(fixed)]].state(fixed)
+    if len(T):
+        fitted = full[index[source]]
+        state = ContourState.cat([state, fitted.descend(fitted.state(T), FULL_SIZE_RADII)])
     support, weighted = full[owner].supports(state)
     before[index] = support[: len(index)]
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)

@@ -30,8 +30,8 @@ class Measurements:
 
     def equations(self) -> tuple[Tensor, Tensor]:
         """Normal equations J^T W J (N, 6, 6) and J^T W d (N, 6, 1)."""
-        WJ = self.weight * self.J
-        return WJ.mT @ self.J, WJ.mT @ self.distance
+        WJ = (self.weight * self.J).mT
+        return torch.bmm(WJ, self.J), torch.bmm(WJ, self.distance)
 
     def scaled(self, factor: float) -> "Measurements":
         """The same with weights times ``factor``."""
@@ -103,17 +103,19 @@ def step_fraction(step: Tensor, T: Tensor, centre: Tensor) -> Tensor:
 
 def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
     """(N, 6) solutions of (A + damping diag A) x = b, for (N, 6, 6) and (N, 6, 1); 0 without measurements."""
-    diagonal = damping * A.diagonal(dim1=-2, dim2=-1)
-    least = 1e-12 * diagonal.amax(dim=-1, keepdim=True) + 1e-12
-    solution: Tensor = torch.linalg.solve(A + torch.diag_embed(diagonal + least), b)[..., 0]
+    damped = A.clone()
+    diagonal = damped.diagonal(dim1=-2, dim2=-1)
+    diagonal += damping * diagonal + (1e-12 * damping * diagonal.amax(dim=-1, keepdim=True) + 1e-12)
+    solution: Tensor = torch.linalg.solve_ex(damped, b).result[..., 0]  # without the check, which takes as long
     return solution
 
 
 def project(points: Tensor, normals: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels (N, P, 2) of model points, and the derivative (N, P, 6) of their shift along unit vectors ``normals``
     (N, P, 2) by rotation about and translation of the centre."""
-    arms = (points - centre) @ T[:, :3, :3].mT
-    cam = arms + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    R = T[:, :3, :3]
+    arms = (points - centre) @ R.mT
+    cam = arms + (R @ centre + T[:, :3, 3])[:, None]
     z = cam[..., 2:].clamp(min=1e-9)
     uv = cam @ K[:, :2].mT / z
     by_cam = (normals @ K[:, :2] - (normals * uv).sum(dim=-1, keepdim=True) * K[:, None, 2]) / z
@@ -123,14 +125,16 @@ def project(points: Tensor, normals: Tensor, T: Tensor, K: Tensor, centre: Tenso
 
 def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
     """The pixels of :func:`project` without their derivative."""
-    cam = (points - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    R = T[:, :3, :3]
+    cam = (points - centre) @ R.mT + (R @ centre + T[:, :3, 3])[:, None]
     return cam @ K[:, :2].mT / cam[..., 2:].clamp(min=1e-9)
 
 
 def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
     """(N, 4, 4) poses, rotated by ``step[:, :3]`` rad about the centre, which is then translated by ``step[:, 3:]``."""
-    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
-    position = T[:, :3, :3] @ centre + T[:, :3, 3] + step[:, 3:]
+    before = T[:, :3, :3]
+    R = rotation_from_axis_angle(step[:, :3]) @ before
+    position = before @ centre + T[:, :3, 3] + step[:, 3:]
     return transform(R, position - R @ centre)
 
 

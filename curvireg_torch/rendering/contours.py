@@ -23,8 +23,8 @@ CREASE_SCALE = 1.0 / 64.0
 # Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front
 CREASE_BEND = 0.36
 # Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at most
-# a fifth of a pixel of that crop
-LEVELS = ((128, 2500), (256, 8000))
+# 0.3 px of that crop
+LEVELS = ((64, 800), (128, 2500), (256, 8000))
 NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 
 
@@ -55,9 +55,11 @@ class _Level:
         self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
 
-    def seen(self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """(N, V, 3) float32 vertices in the cameras' frames, and (N, E) float32 lengths of the edges in px; 0 for those
-        outside the crop and behind the camera."""
+    def seen(
+        self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int, of: np.ndarray, edge: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(N, V, 3) float32 vertices in the cameras' frames, and (M,) float32 lengths in px of edges ``edge`` (M,) of
+        the poses ``of`` (M,); 0 for those outside the crop and behind the camera."""
         vertices = R @ self._vertices.T + position[..., None]
         x, y, z = vertices.transpose(1, 0, 2)
         behind = z <= NEAR_PLANE * self.radius
@@ -65,9 +67,8 @@ class _Level:
         fx, fy, cx, cy = (K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         u, v = fx * x / z + cx, fy * y / z + cy
         beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
-        a, b = self.edges.edges.T
-        beyond = beyond.astype(np.uint8)
-        (ua, ub), (va, vb), (at_a, at_b) = ((x.take(a, axis=1), x.take(b, axis=1)) for x in (u, v, beyond))
+        a, b = of * u.shape[1] + self.edges.edges[edge].T
+        (ua, ub), (va, vb), (at_a, at_b) = ((x.take(a), x.take(b)) for x in (u, v, beyond))
         outside = (at_a & at_b) | ((at_a | at_b) & 16)
         length: np.ndarray = np.sqrt((ub - ua) ** 2 + (vb - va) ** 2) * (outside == 0)
         return vertices.transpose(0, 2, 1), length
@@ -117,13 +118,16 @@ class MeshContours:
         eye = -(position[:, None] @ T[:, :3, :3])[:, 0]
         on_contour, side = edges.sides(eye)
         R, position, K, eye = (float32(each) for each in (T[:, :3, :3], position, K, eye))
-        vertices, length = level.seen(R, position, K, size)
+        of, edge = np.nonzero(on_contour | edges.is_crease)
+        vertices, length = level.seen(R, position, K, size, of, edge)
+        is_occluding = on_contour[of, edge]
         rows, parts = np.arange(len(T))[:, None], []
-        for weights, count, most, occluding in (
-            (length * on_contour, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
-            (length * (edges.is_crease & ~on_contour), CREASE_CANDIDATES, MAX_CREASES, False),
+        for chosen, count, most, occluding in (
+            (is_occluding, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
+            (~is_occluding, CREASE_CANDIDATES, MAX_CREASES, False),
         ):
-            index, fraction, valid = _spread(weights, round(density * count))
+            number, fraction, valid = _spread(of[chosen], length[chosen], len(T), round(density * count))
+            index = np.append(edge[chosen], 0)[number]
             ends = edges.edges[index]  # (N, M, 2)
             a, along = vertices[rows, ends[..., 0]], vertices[rows, ends[..., 1]]
             along -= a
@@ -169,19 +173,16 @@ def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _spread(weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``count`` places along edges of lengths (N, E), evenly: the edge, the fraction of its length, and whether there
-    is one."""
-    index = np.zeros((len(weights), count), np.int64)
-    fraction = np.zeros((len(weights), count), np.float32)
-    total = weights.cumsum(axis=1)
-    for row, (weight, end) in enumerate(zip(weights, total, strict=True)):
-        if len(end) and end[-1] > 0:
-            target = (np.arange(count) + 0.5) * (end[-1] / count)
-            index[row] = np.minimum(np.searchsorted(end, target), len(end) - 1)
-            fraction[row] = 1.0 - (end[index[row]] - target) / np.maximum(weight[index[row]], 1e-30)
-    there = np.broadcast_to((total[:, -1:] > 0) if total.shape[1] else np.zeros((len(weights), 1), bool), index.shape)
-    return index, fraction.clip(0.0, 1.0), there.copy()
+def _spread(of: np.ndarray, length: np.ndarray, poses: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``of`` (M,) are the edges'
+    poses, ascending. Returns (N, count): the number of the edge, the fraction of its length, whether there is one."""
+    end = np.concatenate([[0.0], length.cumsum(dtype=np.float64)])
+    borders = np.searchsorted(of, np.arange(poses + 1))
+    start, total = end[borders[:-1], None], np.diff(end[borders])[:, None]
+    target = start + (np.arange(count) + 0.5) / count * total
+    number = np.clip(np.searchsorted(end, target) - 1, borders[:-1, None], np.maximum(borders[1:, None] - 1, 0))
+    fraction = (target - end[number]) / np.maximum(np.diff(end, append=np.inf)[number], 1e-30)
+    return number, fraction.clip(0.0, 1.0).astype(np.float32), np.broadcast_to(total > 0, number.shape).copy()
 
 
 def _evenly(valid: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """Depth on the CPU, by ray casting with embree and by OpenCV's z-buffer: no GPU, no driver, no display."""
 
+import itertools
 import math
 from functools import cached_property
 from typing import Any
@@ -12,6 +13,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from torch import Tensor
 
+from ..mesh.edges import is_closed
 from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
 from .depth import NEAREST, check_render_arguments
@@ -21,6 +23,8 @@ _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it sav
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
 # Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws
 BESIDE = 1e-3
+MAX_CULLED_FACES = 10_000  # Checking larger meshes takes longer than it saves
+DIFFERENT_PIXELS = 1e-3  # Fraction of the object's pixels that may change where back faces are left out
 FARTHEST = 1000.0  # Depth, in object radii, beyond which single precision does not separate object and background
 
 
@@ -145,8 +149,8 @@ def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: f
 class RasterRenderer(EmbreeRenderer):
     """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower or wrong. The time
     of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer faces than
-    the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and knows no
-    parallel projection."""
+    the image has pixels. Back faces of closed surfaces are left out, which halves the time. It does not clip faces that
+    cross the near plane, is not precise far away, and knows no parallel projection."""
 
     name = "auto"
 
@@ -157,6 +161,24 @@ class RasterRenderer(EmbreeRenderer):
         self._faces = np.array(mesh.faces, np.int32)[:, None]
         self._settings = cv2.TriangleRasterizeSettings()
         self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+        self.draws_back_faces = True
+        if len(self._faces) <= MAX_CULLED_FACES and is_closed(mesh):
+            before = self._from_corners()
+            self._settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
+            different = (self._from_corners() != before).sum()
+            self.draws_back_faces = bool(different > DIFFERENT_PIXELS * (before > 0).sum())  # a part is inside out
+            if self.draws_back_faces:
+                self._settings.setCullingMode(cv2.RASTERIZE_CULLING_NONE)
+
+    def _from_corners(self) -> np.ndarray:
+        """(8, 64, 64) depth from the corners of a cube around the object."""
+        K, t = np.array([[110.0, 0.0, 31.5], [0.0, 110.0, 31.5], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, 4.0])
+        pictures = []
+        for corner in itertools.product((-1.0, 1.0), repeat=3):
+            z = np.array(corner) / math.sqrt(3.0)
+            x = np.cross([0.0, 0.0, 1.0], z) * math.sqrt(1.5)
+            pictures.append(self._draw(np.stack([x, np.cross(z, x), z]), t, K, (64, 64), 2.9, 5.1))
+        return np.stack(pictures)
 
     def render(
         self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False

@@ -7,7 +7,7 @@ import torch
 
 from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sample_views
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.terms import Correlation, Repeatability
 from tests._support.scenes import scene
@@ -107,3 +107,14 @@ def test_distinct_views_applies_symmetries_to_the_model():
     assert distinct_views(torch.arange(4), views, count=4, symmetries=symmetries).tolist() == [0, 2]
     assert distinct_views(torch.tensor([3, 2, 1, 0]), views, count=4, symmetries=symmetries).tolist() == [3, 2]
     assert distinct_views(torch.arange(4), views, count=4).tolist() == [0, 1, 2, 3]
+
+
+def test_views_exactly_as_far_apart_as_the_angle_count_as_one():
+    views = sample_views(azimuth_step=10, elevations=[0, 35])
+    order = torch.arange(len(views)).roll(5)
+    chosen = distinct_views(order, views.rotations, count=99, angle=20.0)
+    apart = rotation_error(views.rotations[chosen][:, None], views.rotations[chosen]).fill_diagonal_(180.0)
+    assert len(chosen) > 12
+    assert apart.min() > 20.01
+    assert chosen[0] == order[0]
+    assert len(distinct_views(order, views.rotations, count=99, angle=9.99)) == len(views)

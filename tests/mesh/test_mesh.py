@@ -7,7 +7,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError
-from curvireg_torch.mesh.edges import MeshEdges, simplified
+from curvireg_torch.mesh.edges import MeshEdges, is_closed, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
 
 
@@ -54,6 +54,23 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     assert sorted(vertices.round(3).tolist()) == sorted((np.asarray(box.vertices) - [0.5, 0, 0]).tolist())
     welded = trimesh.Trimesh(vertices, faces, process=False)
     assert (len(faces), welded.is_watertight, welded.volume) == (12, True, pytest.approx(6.0, rel=1e-5))
+
+
+def test_a_surface_is_closed_where_each_edge_has_two_faces_of_one_orientation() -> None:
+    box = trimesh.creation.box()
+    corners, faces = np.asarray(box.vertices), np.asarray(box.faces)
+
+    def closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
+        return is_closed(trimesh.Trimesh(vertices, faces, process=False))
+
+    assert closed(corners, faces)
+    assert closed(1e-4 * corners + 50.0, faces[:, ::-1])
+    assert closed(corners[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))  # not welded
+    assert closed(corners, np.concatenate([faces, [[0, 0, 1]]]))  # without area
+    assert not closed(corners, faces[1:])
+    assert not closed(corners, np.concatenate([faces, faces[:1]]))
+    assert not closed(corners, np.concatenate([faces[:1, ::-1], faces[1:]]))
+    assert not closed(np.concatenate([corners, corners]), np.concatenate([faces, faces + len(corners)]))
 
 
 def test_edges_of_one_vertex_are_neighbours():

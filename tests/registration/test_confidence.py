@@ -116,7 +116,7 @@ def test_confidence_is_higher_for_the_object_than_for_clutter():
     clutter = [procedural_background(SIZE, torch.Generator().manual_seed(s)) for s in range(6)]
     absent = registrar(clutter, torch.tensor([[60.0, 40, 180, 140]]).repeat(6, 1), CAMERA)
     assert min(r.confidence for r in there) > max(r.confidence for r in absent)
-    assert sorted(r.confidence for r in absent)[2] < 0.5
+    assert sorted(r.confidence for r in absent)[2] < 0.6
     assert not any(r.reliable for r in absent)
     assert sum(r.confidence >= confidence.RELIABLE for r in there) >= 4
 

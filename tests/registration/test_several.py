@@ -84,7 +84,7 @@ def test_half_turns_in_doubt_are_decided_together():
     images, boxes, cameras = rig_of(IN_DOUBT, noise=0.36)
     alone = learned_registrar()(images, torch.stack(boxes), CAMERA)
     errors = [float(rotation_error(r.rotation, (c @ WORLD)[:3, :3])) for r, c in zip(alone, cameras, strict=True)]
-    assert min(errors) > 150
+    assert sorted(errors)[1] > 150, "two of three"
     check_pose(registered(images, boxes, cameras), degrees=3.0, shift=0.2)
 
 

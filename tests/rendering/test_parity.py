@@ -2,6 +2,7 @@
 
 import itertools
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -13,10 +14,34 @@ from curvireg_torch.synthetic import example_mesh
 
 from .conftest import BACKENDS, camera, interior, pixel_grid, require, smooth
 
+
+def inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def half(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[: len(mesh.faces) // 2], process=False)
+
+
+def crossed_prism() -> trimesh.Trimesh:
+    """A closed surface over a polygon that crosses itself: half of it is inside out."""
+    polygon = [[-1.0, -0.8], [1.0, 0.7], [1.0, -0.6], [-1.0, 0.9]]
+    vertices = [[x, y, z] for z in (-0.5, 0.5) for x, y in polygon]
+    sides = [[i, (i + 1) % 4, (i + 1) % 4 + 4, i, (i + 1) % 4 + 4, i + 4] for i in range(4)]
+    faces = [[2, 1, 0], [3, 2, 0], [4, 5, 6], [4, 6, 7], *np.reshape(sides, (-1, 3)).tolist()]
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
 MESHES = {
     "parts": example_mesh,
     "fine": lambda: trimesh.creation.icosphere(subdivisions=4, radius=40.0).apply_translation([300.0, -20.0, 5.0]),
     "knot": lambda: trimesh.creation.torus(1.0, 0.3, major_sections=60, minor_sections=30),
+    "open": lambda: half(trimesh.creation.icosphere(subdivisions=4)),
+    "inside out": lambda: inside_out(trimesh.creation.icosphere(subdivisions=4)),
+    "partly inside out": lambda: trimesh.util.concatenate(
+        trimesh.creation.torus(1.0, 0.3), inside_out(trimesh.creation.icosphere(subdivisions=2, radius=0.6))
+    ),
+    "crossed": crossed_prism,
 }
 
 
@@ -34,6 +59,11 @@ def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) ->
     assert even.sum() > 5000
     assert float((a - b)[even].abs().max()) <= 1e-5 * radius
     assert int(((a > 0) != (b > 0)).sum()) <= 10  # rounding at contours, in six views
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_back_faces_of_closed_surfaces_are_not_drawn(name: str) -> None:
+    assert make_renderer(MESHES[name](), "auto").draws_back_faces == (name not in ("parts", "fine", "knot"))
 
 
 def test_depth_of_a_sphere(backend: str, orthographic: bool) -> None:

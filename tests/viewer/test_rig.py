@@ -136,12 +136,13 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
     workspace, session = found
     _, first, last = session.shots
     before, session.shot = first.box, first
-    first.set_box((10.0, 10.0, 230.0, 170.0))
+    drawn = [before[0] - 3.0, before[1] - 2.0, before[2] + 3.0, before[3] + 2.0]
+    first.set_box(tuple(drawn))
     last.set_box(None)
     assert session.inputs() != first.result.inputs
     search(workspace)
     rows = session.document()["views"]
-    assert rows[0]["box"] == [10.0, 10.0, 230.0, 170.0]
+    assert rows[0]["box"] == drawn
     assert rows[1]["box"] != list(last.box_before)
     first.set_box(before)
     session.set_limits(azimuth=(0.0, 90.0))
