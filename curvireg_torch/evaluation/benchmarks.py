@@ -190,6 +190,13 @@ class Benchmark(ABC):
         count = n if limit is None else min(limit, n)
         return [i * n // count for i in range(count)]
 
+    def copies(self, samples: Sequence[Row]) -> list[list[Row]]:
+        """For each of some samples, all samples of the same object or class in its photograph, itself first."""
+        groups, key = defaultdict[Any, list[Row]](list), self.groups[1]
+        for sample in self.samples:
+            groups[sample["image_path"], sample[key]].append(sample)
+        return [[one, *(s for s in groups[one["image_path"], one[key]] if s is not one)] for one in samples]
+
     def settings(self) -> Row:
         """What results depend on besides pipeline and protocol."""
         split = getattr(self.dataset, "split", None)  # folders of the user have none
@@ -457,14 +464,27 @@ class BOPBenchmark(Benchmark):
         write_csv(path, lines)
 
 
-def detection_recall(samples: Sequence[Row], rows: Sequence[Row]) -> Row:
-    """``recall_1``, ``recall_5``, ``recall_20``: fractions of the ``n`` annotated boxes that the best proposals find.
+def copy_shown(copies: Sequence[Row], row: Row) -> Row:
+    """Of the ``copies`` of an object in a photograph, that which the box of a result overlaps most; the first one if it
+    overlaps none. Where no box is given, each of them is a right answer."""
+    if "rotation" not in row:
+        return copies[0]
+    boxes = torch.stack([copy["box"].double() for copy in copies])
+    overlap = box_iou(boxes, torch.tensor([row["inputs"]["box"]], dtype=torch.float64))[:, 0].nan_to_num(0.0)
+    return copies[int(overlap.argmax())]
+
+
+def detection_recall(copies: Sequence[Sequence[Row]], rows: Sequence[Row]) -> Row:
+    """``recall_1``, ``recall_5``, ``recall_20``: fractions of ``n`` objects one of whose annotated ``copies`` is among
+    the best proposals.
 
     Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
     that failed has no proposals, unless the object was not found among them. Recalls are None if no box is annotated.
     """
-    pairs = [(sample["box"], row) for sample, row in zip(samples, rows, strict=True)]
-    ranks = [_rank(box, row) for box, row in pairs if bool(box.isfinite().all())]
+    ranks = []
+    for group, row in zip(copies, rows, strict=True):
+        if boxes := [copy["box"] for copy in group if bool(copy["box"].isfinite().all())]:
+            ranks.append(min(_rank(box, row) for box in boxes))
     recalls = {f"recall_{k}": sum(rank <= k for rank in ranks) / len(ranks) if ranks else None for k in (1, 5, 20)}
     return {"n": len(ranks), **recalls}
 

@@ -18,7 +18,7 @@ from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
 from ..version import __version__
 from ..visualization.sheet import SheetEntry, write_sheet
-from .benchmarks import Benchmark, detection_recall
+from .benchmarks import Benchmark, copy_shown, detection_recall
 from .runner import POSE_SOURCES, run_entries, thumbnail_of
 from .store import ResultStore, Row, to_json
 
@@ -112,13 +112,17 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
         else:
             scored.append(i)
             rows.append(row)
-    samples = [benchmark.samples[i] for i in scored]
+    samples, detection = [benchmark.samples[i] for i in scored], {}
+    if located:
+        copies = benchmark.copies(samples)
+        detection = {"detection": detection_recall(copies, rows)}
+        samples = [copy_shown(group, row) for group, row in zip(copies, rows, strict=True)]
     errors = benchmark.errors(samples, rows)
     seconds = {name: sum(row["seconds"][name] for row in rows) for name in ("bank", "register")}
     settings = {**settings, "root": Path(settings["root"]).name}  # a summary is shared: no paths
     summary = {
         **benchmark.summary(samples, rows, errors),
-        **({"detection": detection_recall(samples, rows)} if located else {}),
+        **detection,
         "failed": sum(row["status"] == "failed" for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],

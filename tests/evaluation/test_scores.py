@@ -9,7 +9,7 @@ import torch
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
-from curvireg_torch.evaluation.benchmarks import detection_recall
+from curvireg_torch.evaluation.benchmarks import copy_shown, detection_recall
 from curvireg_torch.evaluation.datasets import report
 from curvireg_torch.evaluation.store import ResultStore, to_json
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
@@ -31,7 +31,8 @@ def rotated(sample, axis, degrees):
 def scores_of(benchmark, out, rows):
     """Write results with these rows, and score them."""
     store = ResultStore(out)
-    known = {"score": 0.5, "confidence": 0.5, "reliable": False, "mesh": "CAD/01.off", "inputs": {"picture": PICTURE}}
+    inputs = {"picture": PICTURE, "box": [-9.0, -9.0, -8.0, -8.0]}
+    known = {"score": 0.5, "confidence": 0.5, "reliable": False, "mesh": "CAD/01.off", "inputs": inputs}
     for entry, row in zip(benchmark.entries, rows, strict=False):
         head = {"key": entry.key, "digests": {"request": ""}, "status": "ok", "message": "", "seconds": SECONDS}
         store.append({**head, **(known if "rotation" in row else {}), **row})
@@ -187,6 +188,21 @@ def test_detection_is_scored_in_single_photographs(bop, tmp_path):
         assert ("detection" in summary) == (views == 1)
 
 
+def test_without_a_box_any_copy_of_the_object_is_right(bop, tmp_path):
+    benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None))
+    first, other, second, _ = benchmark.samples
+    second["box"], second["rotation"] = torch.tensor([50.0, 30.0, 70.0, 50.0]), first["rotation"][[1, 2, 0]]
+    assert benchmark.copies([second, other]) == [[second, first], [other]]
+    pose = {"rotation": second["rotation"].tolist(), "translation": second["translation"].tolist()}
+    found = located(AWAY, (49.0, 29.0, 71.0, 51.0))
+    rows = [{**pose, **found, "inputs": {"picture": PICTURE, "box": [49.0, 29.0, 71.0, 51.0]}}, FAILED]
+    summary = scores_of(benchmark, tmp_path, [*rows, {**rows[0]}, FAILED])
+    assert (summary["acc_15_deg"], summary["mssd_ar"], summary["mspd_ar"]) == (0.5, 0.5, 0.5)
+    assert summary["detection"] == {"n": 3, "recall_1": 0.0, "recall_5": 2 / 3, "recall_20": 2 / 3}
+    assert copy_shown([first, second], FAILED) is first
+    assert copy_shown([first, second], {**rows[0], "inputs": {"box": [75.0, 0.0, 79.0, 4.0]}}) is first
+
+
 BOX = (10.0, 10.0, 30.0, 30.0)
 AWAY = (150, 50, 160, 60)
 
@@ -203,13 +219,15 @@ def located(*boxes):
 def test_detection_recall_counts_the_first_right_proposal_and_clips_boxes():
     half, less = (10, 10, 30, 20), (10, 10, 30, 19.9)
     rows = [located(BOX), located(AWAY, half), located(*[AWAY] * 5, BOX), located(less), located(*[AWAY] * 20, BOX)]
-    recall = detection_recall([sample(*BOX)] * 5, rows)
+    recall = detection_recall([[sample(*BOX)]] * 5, rows)
     assert recall == {"n": 5, "recall_1": 0.2, "recall_5": 0.4, "recall_20": 0.6}
     unknown = sample(*[math.nan] * 4)
-    recall = detection_recall([sample(*BOX), unknown, sample(*BOX)], [located(BOX), located(AWAY), FAILED])
+    recall = detection_recall(
+        [[sample(*BOX)], [unknown], [unknown, sample(*BOX)]], [located(BOX), located(AWAY), FAILED]
+    )
     assert (recall["n"], recall["recall_1"]) == (2, 0.5)
     assert detection_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
     left = ((-20.5, 10.0, 19.5, 50.0), (-0.5, 10.0, 19.5, 50.0))
     low = ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5))
     for annotated, proposed in (left, left[::-1], low):
-        assert detection_recall([sample(*annotated)], [located(proposed)])["recall_1"] == 1.0
+        assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
