@@ -8,17 +8,17 @@ import trimesh
 from torch import Tensor, nn
 
 from ..features import HOG, field_points
-from ..geometry.cameras import projected_boxes, transform
+from ..geometry.cameras import boxes_around, projected, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
-from ..mesh.edges import is_closed, simplified
+from ..mesh.edges import simplified
 from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import LEVELS, MeshContours
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
-VIEW_FACES = LEVELS[-1][1]  # to which larger meshes are simplified: their contours are those of full size
+VIEW_FACES = LEVELS[-1][1]  # to which larger meshes are simplified for views: their contours are those of full size
 EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
 # Distances to step back so that a perspective view approximates parallel projection to a few per mille
 PARALLEL_DISTANCE = 20.0
@@ -38,21 +38,15 @@ def hog_layer(settings: BankSettings) -> HOG:
 
 @cached_in_mesh
 def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """What contours and pictures of a mesh of more than ``VIEW_FACES`` faces are made from, with no more than these."""
-    return decimated(mesh, VIEW_FACES)
-
-
-def decimated(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
-    """The mesh with about ``max_faces`` faces at most, see :func:`simplified`."""
+    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more than these."""
     centre = mesh_centre(mesh).numpy()
-    vertices, faces = simplified(mesh, centre, max_faces)
+    vertices, faces = simplified(mesh, centre, VIEW_FACES)
     return trimesh.Trimesh(vertices + centre, faces, process=False)
 
 
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
-    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces, a closed one as contours in a picture of that
-    size are; ``renderer`` is one of the whole mesh, ``picture_renderer`` of one of ``VIEW_FACES``."""
+    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
@@ -64,16 +58,12 @@ class ViewDescriber:
     ) -> None:
         self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
-        self.renderer = self.picture_renderer = self.view_renderer = make_renderer(mesh, renderer)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self._simple = view_mesh(mesh)
-            self.picture_renderer = self.view_renderer = make_renderer(self._simple, renderer)
-        few = next((faces for size, faces in LEVELS if settings.image_size <= size), VIEW_FACES)
-        # What decimation leaves of loose polygons and thin sheets serves as contours, but not as views.
-        if isinstance(renderer, str) and len(self._simple.faces) > few and is_closed(self._simple):
-            self.view_renderer = make_renderer(decimated(self._simple, few), renderer)
+            self.view_renderer = make_renderer(self._simple, renderer)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -99,7 +89,8 @@ class ViewDescriber:
         t = -(R @ self.centre)
         t[:, 2] += distances.double().cpu()
         T = transform(R, t)
-        boxes = projected_boxes(self.hull, T, torch.eye(3, dtype=torch.float64), orthographic=self._orthographic)
+        K = torch.eye(3, dtype=torch.float64)
+        boxes = boxes_around(projected(self.hull, T, K, orthographic=self._orthographic))
         return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
 
     def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:

@@ -166,7 +166,7 @@ def _small_pictures(
     registrar: Registrar, result: Registration, item: ImageItem, side: int
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
-    window, renderer = close_up(item.size, item.box.tolist()), registrar.describer.picture_renderer
+    window, renderer = close_up(item.size, item.box.tolist()), registrar.describer.view_renderer
     scale = side / max(window[2] - window[0], window[3] - window[1])
     close_ups = [draw_window(renderer, h.projection, item.image, window, scale) for h in result.hypotheses]
     sides = side_pictures(registrar, result, item.image, item.box)

@@ -35,18 +35,8 @@ def test_views_of_a_fine_mesh_equal_those_of_a_simplified_one():
     assert len(fine.faces) > 2 * VIEW_FACES
     expected, found = (each(views.rotations, views.distance * exact.radius) for each in (exact, quick))
     assert float((expected["silhouettes"] ^ found["silhouettes"]).float().mean()) < 1e-3
-    assert float(torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min()) > 0.985
+    assert float(torch.cosine_similarity(expected["descriptors"], found["descriptors"]).min()) > 0.995
     torch.testing.assert_close(found["boxes"], expected["boxes"])
-
-
-def test_views_of_closed_surfaces_have_as_few_faces_as_their_size_allows():
-    closed = trimesh.creation.icosphere(5)
-    opened = trimesh.Trimesh(closed.vertices, closed.faces[:15000], process=False)
-    for mesh, size, faces in ((closed, 64, 800), (closed, 128, 2500), (closed, 129, 8000), (opened, 128, 8000)):
-        describe = ViewDescriber(mesh, BankSettings(image_size=size))
-        assert 0.98 * faces < len(describe.view_renderer._mesh.faces) <= faces
-        assert 7900 < len(describe.picture_renderer._mesh.faces) <= 8000
-        assert describe.renderer._mesh is mesh
 
 
 def test_quarter_turns_groups_views_of_equal_direction_and_distance():
