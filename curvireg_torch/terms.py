@@ -274,7 +274,7 @@ class Repeatability(Term):
             for few in points.any(dim=0).nonzero()[:, 0].split(CELLS_AT_A_TIME):
                 matched.addmm_(points[:, few] / area[:, few], near[few].float())
             rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
-            return rep.view(B, K, -1).amax(dim=1)
+            return rep.view(B, K, near.shape[1]).amax(dim=1)
 
         return compare
 

@@ -90,7 +90,7 @@ def distinct_views(
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
-    R, S = rotations.cpu().numpy(), symmetries[:, :3, :3].to(rotations).cpu().numpy()  # many small steps
+    R, S = (x.detach().cpu().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations)))  # many small steps
     flat, least = R.reshape(-1, 9).T, 1.0 + 2.0 * math.cos(math.radians(angle)) - ROUNDING_OF_TRACE
     selected: list[int] = []
     available = np.ones(len(R), bool)
