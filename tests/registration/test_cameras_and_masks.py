@@ -104,6 +104,17 @@ def test_mask_decides_which_edges_are_the_outline():
     assert register.object_mask(query, [image_item(image, box, CAMERA)]) is None
 
 
+def test_a_given_mask_replaces_the_predicted_one_of_the_box():
+    image, box, _ = scene(0)
+    register = learned_registrar()
+    query = register.matcher.query([image], box[None])
+    none, given = (image_item(image, box, CAMERA, mask=mask) for mask in (None, torch.ones(SIZE, dtype=torch.bool)))
+    predicted = register.object_mask(query, [none])
+    torch.testing.assert_close(predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0)
+    assert not torch.allclose(predicted, register.matcher.field.mask(query.regions[:, -1]), atol=1e-2)
+    assert float(register.object_mask(query, [given]).min()) == 1.0
+
+
 def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
     mask = torch.zeros(40, 60, dtype=torch.bool)
     mask[10:30, 20:50] = True

@@ -11,7 +11,7 @@ from torch import Tensor
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.mesh.mesh import mesh_centre
-from curvireg_torch.registration import ContourFit, fit_contours
+from curvireg_torch.registration import ContourFit, contour_fit, fit_contours
 from curvireg_torch.registration.contour_fit import (
     ContourProblem,
     ContourState,
@@ -337,3 +337,13 @@ def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
     again = fit_to_edges(*problem, mixed, FIRST.repeat(2), again=True)
     assert again.transform[0].equal(mixed[0])
     assert float(rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3])) < 1
+
+
+def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(monkeypatch):
+    angles, turned = [], contour_fit._turned
+    monkeypatch.setattr(contour_fit, "_turned", lambda T, c, a, **k: angles.append(tuple(a)) or turned(T, c, a, **k))
+    crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
+    for again in (False, True):
+        problem = MeshContours(cube()), crops, K[None], CUBE_POSE[None], FIRST
+        fit_to_edges(*problem, quick=CUBE_POSE[None], again=again)
+    assert angles == [(8.0,), (8.0, 16.0)]

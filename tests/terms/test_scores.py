@@ -75,6 +75,20 @@ def test_repeatability_score_has_the_closed_form():
         terms.Repeatability(mode="other")
 
 
+def test_repeatability_is_the_fraction_of_points_with_one_of_the_view_near_them():
+    """In cells of 2 px, the last ones of which are cut."""
+    S = 131
+    views, queries = torch.zeros(3, S, S, dtype=torch.bool), torch.zeros(1, 2, S, S, dtype=torch.bool)
+    queries[0, 0, [20, 60, 130], [20, 60, 130]] = True  # the second crop has no points
+    views[0, [20, 60, 130], [20, 60, 130]] = True
+    views[1, [20, 60], [20, 90]] = True
+    facts = {"settings": SimpleNamespace(image_size=S), "descriptors": views, "points_at": lambda _, i: views[i]}
+    known = type("Views", (), {"__len__": lambda _: len(views), **facts})()
+    compare = terms.Repeatability(eps=2.0 / S).build(known)
+    torch.testing.assert_close(compare(SimpleNamespace(points=queries)), torch.tensor([[1.0, 1 / 3, 0.0]]))
+    assert compare(SimpleNamespace(points=queries[:0])).shape == (0, 3)
+
+
 def box_score(shapes, boxes, **options):
     return terms.BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
 
