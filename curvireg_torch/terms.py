@@ -64,7 +64,11 @@ def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | 
     holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
     crops = to_grey(crops) if grey else crops
-    out, mask = field.field_and_mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else (field(crops), None)
+    mask: Tensor | None
+    if type(field) is LearnedCurvilinearSaliency:
+        out, mask = field.field_and_mask(crops)
+    else:
+        out, mask = field(crops), field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0), mask
 
 

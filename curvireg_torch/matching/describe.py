@@ -58,12 +58,12 @@ class ViewDescriber:
     ) -> None:
         self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
-        self.renderer = self.view_renderer = make_renderer(mesh, renderer)
+        self.renderer = self.view_renderer = make_renderer(mesh, renderer, many_views=True)
         self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self._simple = view_mesh(mesh)
-            self.view_renderer = make_renderer(self._simple, renderer)
+            self.view_renderer = make_renderer(self._simple, renderer, many_views=True)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:

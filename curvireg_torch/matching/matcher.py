@@ -28,7 +28,7 @@ from .bank import ViewBank
 from .describe import ViewDescriber, hog_layer
 
 MAX_CACHED_VIEWS = 2048  # Views whose appearance is cached, 35 kB each at 128 px
-ROUNDING_OF_TRACE = 1e-5  # Views of a grid are exactly as far apart as its steps
+ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
 
@@ -90,8 +90,10 @@ def distinct_views(
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
-    R, S = (x.detach().cpu().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations)))  # many small steps
-    flat, least = R.reshape(-1, 9).T, 1.0 + 2.0 * math.cos(math.radians(angle)) - ROUNDING_OF_TRACE
+    R, S = (
+        x.detach().cpu().float().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations))
+    )  # many small steps
+    flat, least = R.reshape(-1, 9).T, 1.0 + 2.0 * math.cos(math.radians(min(angle, 180.0))) - ROUNDING_OF_TRACE
     selected: list[int] = []
     available = np.ones(len(R), bool)
     for view in order.tolist():
@@ -100,7 +102,6 @@ def distinct_views(
         if available[view]:
             selected.append(view)
             available &= ((R[view] @ S).reshape(-1, 9) @ flat).max(axis=0) < least
-            available[view] = False
     return torch.tensor(selected, dtype=torch.long, device=order.device)
 
 

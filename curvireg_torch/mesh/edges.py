@@ -73,17 +73,22 @@ class MeshEdges:
         return all_same, first
 
 
-def is_closed(mesh: trimesh.Trimesh) -> bool:
-    """Whether each edge has two faces, which run along it in opposite directions, apart from faces without area."""
+def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
+    """Whether each edge has two faces, which run along it in opposite directions, apart from faces without area, and
+    every connected surface has its outer side outside."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    cell = max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)
-    _, number = _unique(np.round((vertices - vertices[0]) / cell).astype(np.int64))
+    _, number = _unique(np.round(vertices / max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)).astype(np.int64))
     corners = number[faces]
     ends = np.roll(corners, -1, axis=1)
     has_area = (corners != ends).all(axis=1)
-    a, b = corners[has_area].ravel(), ends[has_area].ravel()
+    corners, ends = corners[has_area], ends[has_area]
+    a, b = corners.ravel(), ends.ravel()
     along, back = np.sort(a * len(vertices) + b), np.sort(b * len(vertices) + a)
-    return bool((along == back).all() and (np.diff(along) > 0).all())
+    if not len(along) or (along != back).any() or not (np.diff(along) > 0).all():
+        return False
+    body = trimesh.graph.connected_component_labels(np.column_stack([a, b]), node_count=len(vertices))[corners[:, 0]]
+    volume = np.bincount(body, np.linalg.det(vertices[faces[has_area]] - vertices.mean(axis=0)))
+    return bool((volume[np.unique(body)] > 0).all())
 
 
 def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:

@@ -34,8 +34,8 @@ FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 
 
 COARSE_DENSITY = 0.25
 DENSITY = {1: 1.0, 2: 0.5, 4: COARSE_DENSITY}
-"""Contour points in crops whose sides are smaller by a factor, as a fraction of those at full size; the coarse ones
-also choose among starts at half size."""
+"""Contour points in crops whose sides are smaller by a factor, as a fraction of those at full size. ``COARSE_DENSITY``
+also holds at half size where starts are compared."""
 
 KEPT_STARTS = 3
 """Starts of a pose that continue after the first round, those with the most support."""
@@ -45,7 +45,7 @@ SAME_POSE_SHIFT = 0.5
 
 START_ANGLE, START_ROLL, FAR_ANGLE = 8.0, 6.0, 16.0
 """Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
-half the spacing of a bank's views; the last one for a pose that is fitted again."""
+half the spacing of a bank's views. ``FAR_ANGLE``: more starts of a pose that is fitted again."""
 
 SUPPORTED, GAINED = 0.5, 0.2
 """Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated scenes."""

@@ -176,7 +176,7 @@ def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
 def _spread(of: np.ndarray, length: np.ndarray, poses: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``of`` (M,) are the edges'
     poses, ascending. Returns (N, count): the number of the edge, the fraction of its length, whether there is one."""
-    end = np.concatenate([[0.0], length.cumsum(dtype=np.float64)])
+    end = np.concatenate([[0.0], np.nan_to_num(length).cumsum(dtype=np.float64)])
     borders = np.searchsorted(of, np.arange(poses + 1))
     start, total = end[borders[:-1], None], np.diff(end[borders])[:, None]
     target = start + (np.arange(count) + 0.5) / count * total

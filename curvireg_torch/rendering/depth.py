@@ -30,13 +30,17 @@ class DepthRenderer(Protocol):
         ...
 
 
-def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") -> DepthRenderer:
+def make_renderer(
+    mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, many_views: bool = False
+) -> DepthRenderer:
     """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be shared by threads:
 
     - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or needed.
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
       its first use cannot use it: start processes by "spawn".
+
+    For ``many_views``, "auto" leaves out the back faces of closed surfaces, see :class:`.RasterRenderer`.
 
     Raises :class:`RenderingError` where the backend does not work.
     """
@@ -49,7 +53,7 @@ def make_renderer(mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto") 
         return PyrenderRenderer(mesh)
     from .embree import EmbreeRenderer, RasterRenderer
 
-    return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh)
+    return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh, many_views=many_views)
 
 
 def render_depth(

@@ -69,6 +69,9 @@ def test_learned_field_loads_other_weights_and_rejects_bad_ones(tmp_path):
         loaded = LearnedCurvilinearSaliency(weights=tmp_path / "weights.safetensors")
         out = F.interpolate(network(x), scale_factor=2.0, mode="bilinear")
     assert not any(isinstance(layer, torch.nn.BatchNorm2d) for layer in loaded.modules())
+    assert all(p.requires_grad for p in loaded.parameters())
+    with pytest.raises(InvalidInputError, match="folded"):
+        save_weights(loaded.network, tmp_path / "folded.safetensors")
     torch.testing.assert_close(loaded.mask(x), out[:, 2:].sigmoid(), atol=2e-3, rtol=0)  # stored as halves
     torch.testing.assert_close(doubled_angle(loaded(x)), out[:, :2], atol=2e-3, rtol=0)
     missing, corrupt, other = (tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other"))

@@ -118,3 +118,5 @@ def test_views_exactly_as_far_apart_as_the_angle_count_as_one():
     assert apart.min() > 20.01
     assert chosen[0] == order[0]
     assert len(distinct_views(order, views.rotations, count=99, angle=9.99)) == len(views)
+    assert len(distinct_views(order, views.rotations, count=99, angle=360.0)) == 1
+    assert len(distinct_views(order, views.rotations.bfloat16(), count=9, angle=20.0)) == 9

@@ -7,7 +7,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError
-from curvireg_torch.mesh.edges import MeshEdges, is_closed, simplified
+from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
 
 
@@ -56,15 +56,20 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     assert (len(faces), welded.is_watertight, welded.volume) == (12, True, pytest.approx(6.0, rel=1e-5))
 
 
-def test_a_surface_is_closed_where_each_edge_has_two_faces_of_one_orientation() -> None:
+def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation() -> None:
     box = trimesh.creation.box()
     corners, faces = np.asarray(box.vertices), np.asarray(box.faces)
 
     def closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
-        return is_closed(trimesh.Trimesh(vertices, faces, process=False))
+        return encloses_volumes(trimesh.Trimesh(vertices, faces, process=False))
 
     assert closed(corners, faces)
-    assert closed(1e-4 * corners + 50.0, faces[:, ::-1])
+    assert closed(1e-4 * corners + 50.0, faces)
+    two = np.concatenate([faces, faces + len(corners)]), np.concatenate([faces, faces[:, ::-1] + len(corners)])
+    assert closed(np.concatenate([corners, corners + 3.0]), two[0])
+    assert not closed(np.concatenate([2.0 * corners, corners + 3.0]), two[1]), "one inside out"
+    assert not closed(corners, faces[:, ::-1])
+    assert not closed(corners, faces[:0])
     assert closed(corners[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))  # not welded
     assert closed(corners, np.concatenate([faces, [[0, 0, 1]]]))  # without area
     assert not closed(corners, faces[1:])

@@ -11,6 +11,7 @@ from scipy.ndimage import distance_transform_edt
 
 from curvireg_torch import ViewMatcher, terms
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import ImageGradient
 from tests._support.scenes import scene
 
@@ -147,3 +148,14 @@ def test_box_jitter_recovers_a_shifted_view(bank):
     reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
     assert lost < reference - 0.05
     assert recovered > reference - 0.01
+
+
+def test_a_field_that_changes_the_learned_one_is_used():
+    class Doubled(LearnedCurvilinearSaliency):
+        def forward(self, image: torch.Tensor) -> torch.Tensor:
+            return 2.0 * super().forward(image)
+
+    crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    (once, mask), (twice, same) = (terms.photograph_field(f(), crops) for f in (LearnedCurvilinearSaliency, Doubled))
+    assert torch.equal(twice, 2.0 * once)
+    assert torch.equal(mask, same)
