@@ -124,7 +124,7 @@ class LearnedCurvilinearSaliency(nn.Module):
     The output of a :class:`FieldNetwork` trained on generated scenes only (see ``docs/learned.md``): contours of the
     object and its parts without texture and background. It replaces :class:`MultiScaleFocusCurves` for crops around one
     object; it is not a general edge detector. Its ``network`` has no batch normalisation, which is part of the
-    convolutions: to train on, use a :class:`FieldNetwork`.
+    convolutions: to train on, use a ``FieldNetwork``.
 
     Args:
         weights: safetensors file of another training; None is the packaged file.

@@ -40,7 +40,7 @@ def make_renderer(
     - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
       its first use cannot use it: start processes by "spawn".
 
-    For ``many_views``, "auto" leaves out the back faces of closed surfaces, see :class:`.RasterRenderer`.
+    For ``many_views``, "auto" leaves out the back faces of closed surfaces, which halves the time.
 
     Raises :class:`RenderingError` where the backend does not work.
     """
