@@ -64,7 +64,7 @@ def test_open_picture_tells_formats_by_each_of_their_starts():
 @pytest.mark.parametrize("content", [POSTSCRIPT, DOS_POSTSCRIPT + POSTSCRIPT])
 def test_postscript_never_reaches_ghostscript(monkeypatch, start, content):
     started = []
-    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *a, **k: started.append(a))
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *given, **_: started.append(given))
     monkeypatch.setattr(EpsImagePlugin, "has_ghostscript", lambda: True)
     monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
     with pytest.raises(ImageError):
@@ -84,7 +84,7 @@ def test_open_picture_bounds_bytes_pixels_and_scans(monkeypatch):
     monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 64)
     open_picture(square).close()
     monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 63)
-    with pytest.raises(ImageError, match="more than .* pixels; scale it down"):
+    with pytest.raises(ImageError, match=r"more than .* pixels; scale it down"):
         open_picture(square)
     monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", len(square))
     monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 64)
