@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, ImageError, MissingFileError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
 from ..utils.pictures import check_pixels, damaged_picture, open_picture
@@ -26,7 +27,12 @@ if TYPE_CHECKING:
 _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
+_WIDTH, _HEIGHT = 0xA002, 0xA003  # EXIF sizes in px of the picture that the camera took
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+
+EXIF_DEVIATION = 0.05
+"""Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections and stabilisers cut
+the border off, and some cameras mean the width by it, not the diagonal. An estimate, not measured."""
 
 
 @dataclass(frozen=True)
@@ -38,23 +44,47 @@ class Photo:
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
         notes: changes to the pixels, in words.
+        taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None if it is not known.
     """
 
     image: Tensor
     orientation: int
     focal_35mm: float | None
     notes: tuple[str, ...]
+    taken_size: tuple[int, int] | None = None
+
+    @property
+    def is_cropped(self) -> bool:
+        """Whether the proportions of the pixels differ from those of the picture that the camera took."""
+        H, W = self.image.shape[-2:]
+        longer, shorter = max(H, W), min(H, W)
+        if self.taken_size is None:
+            return False
+        taken = max(self.taken_size) / min(self.taken_size)
+        return abs(shorter * taken - longer) > 1.0 + taken
 
     def guessed_camera_matrix(self) -> Tensor | None:
         """Return the (3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
-        The focal length is relative to the diagonal, the principal point the centre: the picture must not be cropped.
+        The focal length is relative to the diagonal of the picture that the camera took. A picture of its proportions
+        is taken for a resized one, with the principal point in its centre. One of other proportions is taken for a
+        part of it at full size, which is as large; None if it is larger.
         """
         if self.focal_35mm is None:
             return None
         H, W = self.image.shape[-2:]
-        focal = self.focal_35mm * math.hypot(H, W) / _DIAGONAL_35MM
+        taken = (H, W)
+        if self.is_cropped and self.taken_size is not None:
+            taken = self.taken_size
+            if max(H, W) > max(taken) or min(H, W) > min(taken):
+                return None
+        focal = self.focal_35mm * math.hypot(*taken) / _DIAGONAL_35MM
         return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
+
+    def camera(self) -> Camera | None:
+        """Return the camera of :meth:`guessed_camera_matrix`, or None."""
+        K = self.guessed_camera_matrix()
+        return None if K is None else Camera(K, focal_deviation=EXIF_DEVIATION, source="exif")
 
     def facts(self) -> dict[str, Any]:
         """Return all but the pixels, as plain JSON."""
@@ -83,12 +113,30 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
         >>> photo.image.shape, int(photo.image[0, 0, 0]), photo.notes
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
-    rgb, orientation, focal, notes = _decode(Path(path))
-    orientation = 1 if as_stored else orientation
+    return _photo(*_decode(Path(path)), as_stored=as_stored)
+
+
+def photo_of_picture(image: "Image") -> Photo:
+    """A picture that Pillow has opened, as :func:`read_photo` reads its file; of one made in memory, its pixels.
+
+    Raises:
+        ImageError: a mode that is not read, a damaged file, or one beyond :mod:`curvireg_torch.errors`.
+    """
+    try:
+        check_pixels(image)
+        return _photo(*_decoded(image))
+    except ImageError:
+        raise
+    except Exception as error:  # Pillow raises errors of any kind for damaged files
+        raise damaged_picture(error) from error
+
+
+def _photo(rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_stored: bool = False) -> Photo:
+    orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
     pixels = torch.from_numpy(np.array(_oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
-    return Photo(pixels, orientation, focal, notes)
+    return Photo(pixels, orientation, exif.focal_35mm, notes, exif.taken_size)
 
 
 def read_image(path: str | os.PathLike[str]) -> Tensor:
@@ -99,8 +147,16 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
-def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
-    """(H, W, 3) RGB pixels as stored, EXIF orientation and focal length, and notes."""
+class _Exif(NamedTuple):
+    """What is used of a file's metadata, see :class:`Photo`."""
+
+    orientation: int
+    focal_35mm: float | None
+    taken_size: tuple[int, int] | None
+
+
+def _decode(path: Path) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+    """(H, W, 3) RGB pixels as stored, metadata, and notes."""
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the photograph", subject=path)
     if path.stat().st_size > MAX_IMAGE_BYTES:
@@ -109,15 +165,20 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
         with open_picture(path.read_bytes()) as image:
             _seek_full_image(image)
             check_pixels(image)
-            notes, (orientation, focal) = _notes(image), _exif(image)
-            rgb = _rgb_pixels(image)
-            if image.format == "TIFF":  # Pillow has applied the orientation: take it back
-                rgb = _oriented(rgb, {6: 8, 8: 6}.get(orientation, orientation))
-            return rgb, orientation, focal, notes
+            return _decoded(image)
     except ImageError as error:
         raise error.with_subject(path) from None
     except Exception as error:  # Pillow raises errors of any kind for damaged files
         raise damaged_picture(error).with_subject(path) from error
+
+
+def _decoded(image: "Image") -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+    notes = _notes(image)
+    exif = _exif(image)
+    rgb = _rgb_pixels(image)
+    if image.format == "TIFF":  # Pillow has applied the orientation: take it back
+        rgb = _oriented(rgb, {6: 8, 8: 6}.get(exif.orientation, exif.orientation))
+    return rgb, exif, notes
 
 
 def _seek_full_image(image: "Image") -> None:
@@ -131,15 +192,23 @@ def _seek_full_image(image: "Image") -> None:
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _exif(image: "Image") -> tuple[int, float | None]:
-    """Orientation and focal length in mm of a 36 x 24 mm camera; what is damaged gives 1 and None."""
+def _exif(image: "Image") -> _Exif:
+    """The metadata of a picture; what is damaged gives orientation 1, and None."""
     orientation, focal = 1, 0.0
+    width = height = 0
     with suppress(Exception):
         exif = image.getexif()
         orientation = exif.get(_ORIENTATION, 1)
-        focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM, 0))
+        directory = exif.get_ifd(_EXIF_DIRECTORY)
+        focal = float(directory.get(_FOCAL_35MM, 0))
+        width = int(directory.get(_WIDTH, 0))
+        height = int(directory.get(_HEIGHT, 0))
     valid = isinstance(orientation, int) and orientation in range(1, 9)
-    return orientation if valid else 1, focal if 0 < focal < math.inf else None
+    return _Exif(
+        orientation if valid else 1,
+        focal if 0 < focal < math.inf else None,
+        (height, width) if width > 0 and height > 0 else None,
+    )
 
 
 def _rgb_pixels(image: "Image") -> NDArray[np.uint8]:

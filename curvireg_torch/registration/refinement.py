@@ -12,7 +12,7 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .edges import EdgeCrops
-from .inputs import MIN_BOX_SIDE, ImageItem, check_crop, image_items
+from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .poses import (
     Poses,
     distinct_poses,
@@ -53,7 +53,8 @@ def refine(
 
     Args:
         registrar: :class:`Registrar` of the mesh.
-        images, camera_matrices: see :class:`Registrar`; the camera is needed.
+        images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that have its focal
+            length.
         poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
         start_confidences: of the starts of each photograph, if they are known, as those of earlier results are.
 
@@ -64,8 +65,7 @@ def refine(
     Raises:
         InvalidInputError: not as many cameras or starts as photographs, or a start that is not rigid and finite.
     """
-    if camera_matrices is None:
-        raise InvalidInputError("refine: needs the camera matrix of each photograph")
+    check_cameras(images, camera_matrices, "refine")
     items, starts = image_items(images, None, camera_matrices), []
     for one in poses:
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()
@@ -132,7 +132,7 @@ def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses
     query = registrar.matcher.query([item.image], boxes.float())
     found = registrar.register(replace(item, box=boxes[0].float()), query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
-    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact(with_camera=True)))
+    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)
 
 

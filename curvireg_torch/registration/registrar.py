@@ -34,10 +34,24 @@ from .confidence import (
 from .contour_fit import measure_contours
 from .detection import Detector, detect
 from .edges import EdgeCrops
+from .focal import (
+    FINISHED,
+    FITTED,
+    TRIED_VIEWS,
+    USUAL_DEVIATION,
+    focal_covariance,
+    off_axis_angle,
+    possible_cameras,
+    starts_of_fields,
+    usual_camera,
+    with_focal_length,
+)
 from .inputs import ImageItem, check_crop, image_items
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
+    FINISHED_FITS,
     SCORE_WEIGHTS,
+    SCREENING_WEIGHT,
     Poses,
     best_views,
     common_score,
@@ -66,9 +80,9 @@ MIN_REFINED = 3
 """Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on rivals. Of 15
 photographs of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
 
-SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
-"""Number of the best distinct views of an exact mesh that get a short contour fit, and weight of the edge support that
-they reach, beside log S, in the choice of those that become hypotheses."""
+SCREENED_VIEWS = 10
+"""Number of the best distinct views of an exact mesh that get a short contour fit, which decides with their rank which
+become hypotheses."""
 
 KEPT_LANDMARKS = 0.5  # Fraction of the landmarks that agree with a start, which must agree with its fit as well
 
@@ -96,6 +110,7 @@ class _Work:
     symmetries: Tensor | None
     crops: EdgeCrops | None
     landmarks: LandmarkMatches | None
+    starts: Poses | None = None
 
 
 class Registrar:
@@ -114,9 +129,9 @@ class Registrar:
         views, settings: custom viewpoints and bank settings, for a mesh.
         field: custom photograph filter, see :class:`ViewMatcher`.
         renderer: for views of the mesh and a bank that is built; a custom renderer knows one mesh.
-        mesh_is: "exact" for the mesh of this very object, "similar" for that of another one of its kind. It decides how
-            far fitted contours are trusted, and the probabilities of the hypotheses. Default: exact for photographs
-            with a camera matrix, similar for others.
+        mesh_is: "exact" for the mesh of this very object (None: the same), "similar" for that of another one of its
+            kind. It decides how far fitted contours are trusted, and the probabilities of the hypotheses; a focal
+            length is estimated with an exact mesh alone.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once. Default: those of the shape of an exact mesh without colours, see
             :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
@@ -132,8 +147,8 @@ class Registrar:
         >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
         ...                       image_size=64, progress=False)
         >>> result = Registrar(bank)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
-        >>> result.rotation.shape, result.translation
-        (torch.Size([3, 3]), None)
+        >>> result.rotation.shape, result.translation.shape, result.camera.source
+        (torch.Size([3, 3]), torch.Size([3]), 'estimated')
     """
 
     def __init__(
@@ -204,11 +219,12 @@ class Registrar:
         """Register a batch.
 
         Args:
-            images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
-                [0, 1] or uint8.
+            images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays, Pillow pictures or paths, C = 1
+                or 3 (RGB), floating in [0, 1] or uint8. Pictures and files are turned as their EXIF data say.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
-            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
-                relative to a camera that looks at the box.
+            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these. None: the camera of
+                the EXIF data; without, its focal length is estimated with the pose, see :mod:`.focal`, or with a
+                similar mesh, rotations are relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
             masks: B masks (H, W) of the objects, white in bool, uint8 or floating in [0, 1], paths, or None for some
                 photographs with boxes. Contours are fitted to them; without boxes they give these.
@@ -219,8 +235,7 @@ class Registrar:
             convincingly; it raises its error on access to a pose.
 
         Raises:
-            InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without
-                cameras.
+            InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
         if boxes is None and masks is None:
             results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
@@ -259,9 +274,10 @@ class Registrar:
         """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
         return self.others[model - 1] if model else self
 
-    def is_exact(self, *, with_camera: bool) -> bool:
+    @property
+    def is_exact(self) -> bool:
         """Whether the mesh counts as that of this very object."""
-        return self.mesh_is == "exact" if self.mesh_is else with_camera
+        return self.mesh_is != "similar"
 
     def symmetries_of(self, *, exact: bool) -> Tensor | None:
         """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are none."""
@@ -273,7 +289,7 @@ class Registrar:
     @property
     def uses_landmarks(self) -> bool:
         """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
-        return self.is_exact(with_camera=True) and self.pipeline.contours
+        return self.is_exact and self.pipeline.contours
 
     def landmark_matches(self, item: ImageItem, box: Tensor | None = None) -> LandmarkMatches | None:
         """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without colours or a camera
@@ -353,8 +369,8 @@ class Registrar:
     def register_item(self, item: ImageItem) -> Registration:
         """Register a photograph with a box, and again if its pose asks for another box."""
         result = self._register_box(item)
-        # Without a camera matrix, poses are derived from their boxes.
-        if self.pipeline.box_jitter and self.pipeline.contours and item.camera_matrix is not None:
+        # Without a camera, poses are derived from their boxes.
+        if self.pipeline.box_jitter and self.pipeline.contours and result.camera is not None:
             box = projected_box(self.describer, result.projection)
             if item.shows_other_part(box):
                 with suppress(CurviregError):
@@ -377,7 +393,9 @@ class Registrar:
             query: the same, cropped and described by the matcher.
         """
         work = self._rank(item, query)
-        starts, outside, by_landmarks = self._starts(work)
+        if work.exact and item.camera_matrix is None:
+            work = self._with_possible_cameras(work)
+        starts, outside, repeated = self._starts(work)
         poses = starts
         if self.pipeline.search:
             self.report_progress("search")
@@ -390,16 +408,19 @@ class Registrar:
             unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
             if len(unknown):
                 poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
-            poses = self._fitted(work, work.crops, poses, quick=poses.quick)
+            finish = FINISHED_FITS if work.starts is None else FINISHED
+            poses = self._fitted(work, work.crops, poses, quick=poses.quick, finish=finish)
         features = self._features(work, poses)
         if work.crops is not None and work.exact:
+            if work.item.focal_deviation:
+                poses, features = self._with_focal_length(work, work.crops, poses, features, outside)
             poses, features = self._fitted_again(work, work.crops, poses, features, outside)
             poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
-        # Unlike a view, a pose of landmarks starts near the one that it merged with: it is no rival.
-        other = (distinct | ~by_landmarks).nonzero()[:, 0]
+        # Unlike another view, these started near the pose that they merged with: they are no rivals.
+        other = (distinct | ~repeated).nonzero()[:, 0]
         starts, poses, features = starts[other], poses[other], features[other]
         distinct, outside = distinct[other], outside[other]
         keep = self._kept(work, poses, distinct, outside)
@@ -411,13 +432,15 @@ class Registrar:
                 restored = with_edge_support(self.describer, work.crops, restored)
             poses = poses.replaced(back, restored)
             features = features.index_copy(0, back, self._features(work, restored))
+        if work.crops is not None and work.item.focal_deviation:
+            work, poses = self._with_focal_deviation(work, work.crops, poses, features, outside)
         return self._result(work, poses, features, distinct, outside)
 
     def _rank(self, item: ImageItem, query: QueryFeatures) -> _Work:
         self.report_progress("ranking")
-        limits = None if item.prior is None else Limits(item, self.bank)
+        exact = self.is_exact
+        limits = None if item.prior is None else self.limits_of(item)
         ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
-        exact = self.is_exact(with_camera=item.camera_matrix is not None)
         symmetries = self.symmetries_of(exact=exact)
         crops = None
         if self.pipeline.contours:
@@ -427,13 +450,72 @@ class Registrar:
         descriptor = self.describer.descriptor(query.field)
         return _Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
 
+    def _with_possible_cameras(self, work: _Work) -> _Work:
+        """A photograph whose camera is unknown, with starts of several cameras, of which it has the best."""
+        item = replace(work.item, focal_deviation=USUAL_DEVIATION, camera_source="estimated")
+        starts: Poses | None = None
+        K = usual_camera(item.size)
+        if work.crops is not None:
+            view, rank = best_views(work.ranking, self.bank, count=TRIED_VIEWS, symmetries=work.symmetries)
+            of_cameras = []
+            for camera in possible_cameras(item.size):
+                poses = self._of_views(replace(work, item=replace(item, camera_matrix=camera)), view, rank)
+                of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
+            starts = starts_of_fields(self.describer, work.crops, of_cameras, self._least_starts)
+            K = starts.cameras[0]
+        item = replace(item, camera_matrix=K)
+        limits = None if item.prior is None else Limits(item, self.bank)
+        landmarks = self.landmark_matches(item, item.box) if self.uses_landmarks else None
+        return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
+
+    def limits_of(self, item: ImageItem) -> Limits:
+        """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens them.
+
+        :meta private:
+        """
+        assert item.prior is not None
+        if item.camera_matrix is not None:
+            return Limits(item, self.bank)
+        if not self.is_exact:
+            if item.prior.distance is not None:
+                raise InvalidInputError("distance: with a similar mesh, needs the camera of the photograph")
+            return Limits(item, self.bank)
+        usual = replace(item, camera_matrix=usual_camera(item.size))
+        return Limits(usual, self.bank, off_centre=off_axis_angle(usual))
+
     def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
-        most, and which landmarks agree on, in place of the views near it.
+        most, and which repeats another one: the same view with another camera, or a pose that landmarks agree on, in
+        place of the views near it.
 
         That outside is the best view there; it is never reported, and tells whether the limits are wrong.
         """
-        count = max(MIN_REFINED, self.pipeline.hypotheses)
+        poses = self._promising(work) if work.starts is None else work.starts
+        repeated = _are_repeated(poses.view)
+        if work.crops is not None and work.exact:
+            found, _ = self.landmark_poses(work.landmarks)
+            found = found if work.limits is None else found[work.limits.keeps(found)]
+            if len(found):
+                far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)
+                poses = Poses.cat([poses[far], found[torch.tensor([0])]])
+                repeated = F.pad(repeated[far], (0, 1), value=True)
+        outside = torch.zeros_like(repeated)
+        if work.limits is None:
+            return poses, outside, repeated
+        assert work.ranking.outside is not None
+        view = work.ranking.outside.cpu()
+        if int(view) < 0:
+            return poses, outside, repeated
+        other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
+        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(repeated, (0, 1))
+
+    @property
+    def _least_starts(self) -> int:
+        return max(MIN_REFINED, self.pipeline.hypotheses)
+
+    def _promising(self, work: _Work) -> Poses:
+        """Poses of the most promising distinct views."""
+        count = self._least_starts
         screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
         view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
         poses = self._of_views(work, view, rank)
@@ -441,23 +523,7 @@ class Registrar:
             poses = work.limits.moved_inside(poses)
         if work.crops is not None and len(poses) > count:
             poses = self._screened(work.crops, poses, count)
-        by_landmarks = torch.zeros(len(poses), dtype=torch.bool)
-        if work.crops is not None and work.exact:
-            found, _ = self.landmark_poses(work.landmarks)
-            found = found if work.limits is None else found[work.limits.keeps(found)]
-            if len(found):
-                poses = poses[~are_near(poses.rotation, found.rotation[0], work.symmetries)]
-                poses = Poses.cat([poses, found[torch.tensor([0])]])
-                by_landmarks = torch.arange(len(poses)) == len(poses) - 1
-        outside = torch.zeros_like(by_landmarks)
-        if work.limits is None:
-            return poses, outside, by_landmarks
-        assert work.ranking.outside is not None
-        view = work.ranking.outside.cpu()
-        if int(view) < 0:
-            return poses, outside, by_landmarks
-        other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
-        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(by_landmarks, (0, 1))
+        return poses
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
@@ -487,14 +553,15 @@ class Registrar:
         """(H, 5) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
-        landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
+        landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
         return pose_features(poses, similarity, appearance, landmarks)
 
     def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
         poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
-            before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
+            before = work.landmarks.agreeing(starts.T, starts.cameras)
+            after = work.landmarks.agreeing(poses.T, poses.cameras)
             left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
             if len(left):
                 kept = starts[left]
@@ -514,6 +581,31 @@ class Registrar:
         if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
             return poses, features
         return self._replaced(work, poses, features, best, fitted, new)
+
+    def _with_focal_length(
+        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    ) -> tuple[Poses, Tensor]:
+        """Fit the focal lengths of the best poses with them, and keep what does not lower their scores."""
+        scores = pose_scores(features, exact=True)
+        count = FITTED if work.starts is not None else 1
+        for h in scores.masked_fill(outside, -torch.inf).topk(min(count, int((~outside).sum()))).indices.tolist():
+            index = torch.tensor([h])
+            fitted = with_focal_length(self.describer, crops, poses[index], work.item)
+            new = self._features(work, fitted)
+            if bool(pose_scores(new, exact=True) >= scores[index]):
+                poses, features = self._replaced(work, poses, features, index, fitted, new)
+        return poses, features
+
+    def _with_focal_deviation(
+        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    ) -> tuple[_Work, Poses]:
+        """The photograph with the camera of the best pose and what is known of its focal length, and the poses with the
+        covariance that follows; the others have none."""
+        best = _best_inside(features, outside)
+        covariance, deviation = focal_covariance(self.describer, crops, poses[best], work.item)
+        unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
+        item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)
+        return replace(work, item=item), replace(poses, covariance=unknown)
 
     def _with_texture(
         self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
@@ -575,7 +667,14 @@ class Registrar:
             prior=work.item.prior,
             prior_contradiction=contradiction,
             warnings=work.item.warnings + self.mesh_warnings,
+            camera=work.item.camera,
         )
+
+
+def _are_repeated(views: Tensor) -> Tensor:
+    """(H,) bool: whether a view (H,) is among those before it."""
+    equal = views == views[:, None]
+    return equal.tril(diagonal=-1).any(dim=1)
 
 
 def _best_inside(features: Tensor, outside: Tensor) -> Tensor:

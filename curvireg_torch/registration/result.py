@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior, object_frame
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
@@ -35,14 +36,14 @@ STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from
 SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
-    "translation": "in the mesh file's unit; null without a camera",
+    "translation": "in the mesh file's unit; null with a similar mesh and no camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
     "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose is a guess",
     "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
-    "t_true = t + e; errors of the camera matrix are not in it",
+    "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
 }
 
 
@@ -185,6 +186,8 @@ class Registration:
             outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None otherwise.
         warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
         model: number of the mesh, of several.
+        camera: of the photograph without its distortion; its ``source`` tells whether it was given, and
+            ``focal_deviation`` how well its focal length is known. None without a camera, and of several photographs.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
             ``T_world_from_model``, along the world's axes.
     """
@@ -199,6 +202,7 @@ class Registration:
     prior_contradiction: str | None = None
     warnings: tuple[str, ...] = ()
     model: int = 0
+    camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
 
     ok = True
@@ -302,6 +306,8 @@ class Registration:
             and {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
             "covariance": _plain(self.covariance),
             "corrected_box": _plain(self.corrected_box),
+            "camera": self.camera and self.camera.describe(),
+            "camera_source": self.camera and self.camera.source,
             "top": [],
         }
         for one in self.hypotheses:
@@ -359,7 +365,7 @@ def result_document(result: Registration, registrar: "Registrar", seconds: Mappi
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
     registrar = registrar.of_model(result.model)
     bank = registrar.bank
-    symmetries = registrar.symmetries_of(exact=registrar.is_exact(with_camera=result.translation is not None))
+    symmetries = registrar.symmetries_of(exact=registrar.is_exact)
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
