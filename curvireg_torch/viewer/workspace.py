@@ -19,6 +19,7 @@ from ..data import load_camera
 from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
+from ..utils.pictures import PICTURE_NAMES
 from .session import STATIC, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
@@ -145,7 +146,7 @@ class Workspace:
             await self.run("file", self._leave_sample, stop=True)
         if suffix not in kinds:
             self.messages["file"] = (
-                f"{path.name}: neither a photograph (JPEG, PNG, TIFF, WebP, BMP, PGM or PPM) nor a mesh "
+                f"{path.name}: neither a photograph ({PICTURE_NAMES}) nor a mesh "
                 f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers) nor a "
                 f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
             )
