@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,9 @@ from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
 from ...geometry.calibration import Camera
 from .documents import EXPECTED, read_document
 from .formats import FORMATS, Format
-from .record import Record, Used, flattened, plain, unread_distortion
+from .record import Record, Used, distortion_keys, distortion_keys_inside, flattened, plain
 
-__all__ = ["load_camera"]
+__all__ = ["Calibrations", "load_camera"]
 
 _STEREO = re.compile(
     r"(left|right)?(cameramatrix|mtx|m|k|d|dist|distcoeffs|distortioncoefficients)(left|right|\d|l|r)?"
@@ -47,21 +48,40 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
         >>> camera.matrix.tolist(), camera.distortion, camera.size
         ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480, 640))
     """
-    file, name = Path(path), ""
-    if not file.is_file() and ":" in str(path):
-        front, _, name = str(path).rpartition(":")
-        file = Path(front)
-    if not file.is_file():
-        raise MissingFileError("no such file; check the path of the calibration, or use --camera exif", subject=path)
-    try:
-        if file.stat().st_size > MAX_CAMERA_BYTES:
-            raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
-        return _camera_of(read_document(file), name)
-    except RecursionError:
-        raise InvalidInputError("nested too deeply; write it again", subject=path) from None
-    except InvalidInputError as error:
-        message = f"{error}; without a calibration, use --camera exif"
-        raise InvalidInputError(message, subject=path) from error
+    return Calibrations().load(path)
+
+
+class Calibrations:
+    """Calibration files, each of which is read once, however many of its cameras are asked for."""
+
+    def __init__(self) -> None:
+        self._files: dict[Path, _Cameras] = {}
+
+    def load(self, path: str | os.PathLike[str]) -> Camera:
+        """:func:`load_camera`."""
+        file = Path(path)
+        name = ""
+        if not os.path.isfile(file) and ":" in str(path):  # unlike Path.is_file, whatever the name is
+            front, _, name = str(path).rpartition(":")
+            file = Path(front)
+        if not os.path.isfile(file):
+            message = "no such file; check the path of the calibration, or use --camera exif"
+            raise MissingFileError(message, subject=path)
+        try:
+            if file not in self._files:
+                self._files[file] = _Cameras(_document(file))
+            return self._files[file].camera(name)
+        except RecursionError:
+            raise InvalidInputError("nested too deeply; write it again", subject=path) from None
+        except InvalidInputError as error:
+            message = f"{error}; without a calibration, use --camera exif"
+            raise InvalidInputError(message, subject=path) from error
+
+
+def _document(file: Path) -> Any:
+    if file.stat().st_size > MAX_CAMERA_BYTES:
+        raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
+    return _with_stereo_pair(read_document(file))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,40 +93,68 @@ class _Found:
     around: tuple[Mapping[str, Any], ...]
     format: Format
 
-    def is_called(self, name: str) -> bool:
-        """Whether a part of the path is this name; numbers may have zeros in front."""
-        plain_name = name.lstrip("0") if name.isdecimal() else name
-        parts = [part.lstrip("0") if part.isdecimal() else part for part in self.path]
-        return plain_name in parts or name == "/".join(self.path) or (not name and not self.path)
+    @property
+    def names(self) -> set[str]:
+        """The whole path, and its parts; numbers without zeros in front."""
+        return {_without_zeros(part) for part in (*self.path, "/".join(self.path))}
 
 
-def _camera_of(document: Any, name: str) -> Camera:
-    """The camera of a document, or the one of several that is named."""
-    document = _with_stereo_pair(document)
-    found = list(_cameras(document, (), ()))
-    if not found:
-        raise InvalidInputError(f"no camera matrix; expected {EXPECTED}")
-    chosen, parse = _chosen(found, name)
-    others = [other for other in found if other is not chosen]
-    around = [values for values in chosen.around if not any(values in other.around for other in others)]
-    used: Used = set()
-    camera: Camera = parse(Record(chosen.values, used, around))
-    ignored = {id(other.values) for other in others}
-    if unread := list(dict.fromkeys(unread_distortion(document, used, ignored))):
-        keys = ", ".join(repr(key) for key in unread[:4])
-        raise InvalidInputError(
-            f"{keys}: looks like distortion, but is not read; write the coefficients as distortion_coefficients: "
-            "[k1, k2, p1, p2, k3], or remove the key"
-        )
-    return camera
+def _without_zeros(name: str) -> str:
+    return str(int(name)) if name.isdecimal() and len(name) < 20 else name
 
 
-def _cameras(value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], ...]) -> Iterator[_Found]:
+class _Cameras:
+    """The cameras of a document."""
+
+    def __init__(self, document: Any) -> None:
+        self.found = list(_found(document, (), ()))
+        if not self.found:
+            raise InvalidInputError(f"no camera matrix; expected {EXPECTED}")
+        self.identities = {id(camera.values) for camera in self.found}
+        self.outside = list(distortion_keys(document, self.identities))
+        self.by_name: dict[str, list[_Found]] = {}
+        for camera in self.found:
+            for name in camera.names:
+                self.by_name.setdefault(name, []).append(camera)
+        self.inside = Counter(id(values) for camera in self.found for values in camera.around)
+
+    def camera(self, name: str) -> Camera:
+        """The camera with a name; without one, the only camera. Its distortion is all read, or the file refused."""
+        chosen, parse = self._chosen(name)
+        around = [values for values in chosen.around if self.inside[id(values)] == 1]
+        used: Used = set()
+        camera: Camera = parse(Record(chosen.values, used, around))
+        inside = distortion_keys_inside(chosen.values, self.identities)
+        unread = [key for place, key in (*inside, *self.outside) if (place, key) not in used]
+        if unread:
+            keys = ", ".join(repr(key) for key in list(dict.fromkeys(unread))[:4])
+            raise InvalidInputError(
+                f"{keys}: looks like distortion, but is not read; write the coefficients as distortion_coefficients: "
+                "[k1, k2, p1, p2, k3], or remove the key"
+            )
+        return camera
+
+    def _chosen(self, name: str) -> tuple[_Found, Any]:
+        """The camera with a name, and the function that reads it."""
+        if len(self.found) == 1 and name in self.found[0].format.others:
+            return self.found[0], self.found[0].format.others[name]
+        named = self.by_name.get(_without_zeros(name), []) if name else self.found
+        if named and all(camera.values == named[0].values for camera in named):
+            return named[0], named[0].format.parse
+        last = [camera.path[-1] if camera.path else "" for camera in self.found]
+        unique = len(set(last)) == len(last)
+        names = last if unique else ["/".join(camera.path) for camera in self.found]
+        listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+        advice = f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
+        raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
+
+
+def _found(value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], ...]) -> Iterator[_Found]:
     """The cameras in a document, each before those inside it."""
     if isinstance(value, list):
         for index, item in enumerate(value):
             names = [item[key] for key in _ITEM_NAMES if key in item] if isinstance(item, dict) else []
-            yield from _cameras(item, (*path, str([*names, index][0])), around)
+            yield from _found(item, (*path, str([*names, index][0])), around)
     if not isinstance(value, dict):
         return
     record = Record(value, set())
@@ -114,23 +162,7 @@ def _cameras(value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any],
     if kind is not None:
         yield _Found(path, value, around, kind)
     for key, inside in value.items():
-        yield from _cameras(inside, (*path, key), (value, *around))
-
-
-def _chosen(found: list[_Found], name: str) -> tuple[_Found, Any]:
-    """The camera with a name, and the function that reads it."""
-    if len(found) == 1 and name in found[0].format.others:
-        return found[0], found[0].format.others[name]
-    named = [camera for camera in found if camera.is_called(name)] if name else found
-    equal = all(camera.values == named[0].values for camera in named)
-    if named and (len(named) == 1 or equal):
-        return named[0], named[0].format.parse
-    last = [camera.path[-1] if camera.path else "" for camera in found]
-    unique = len(set(last)) == len(last)
-    names = last if unique else ["/".join(camera.path) for camera in found]
-    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    advice = f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
-    raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
+        yield from _found(inside, (*path, key), (value, *around))
 
 
 def _with_stereo_pair(document: Any) -> Any:

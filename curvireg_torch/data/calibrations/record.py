@@ -1,7 +1,7 @@
 """The keys and values of one camera in a calibration file, and which of them were read."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import Any
 
 from ...errors import InvalidInputError
@@ -87,26 +87,27 @@ def flattened(value: Any) -> list[Any]:
     return [] if value is None else [value]
 
 
-def unread_distortion(value: Any, used: Used, others: set[int]) -> Iterator[str]:
-    """The keys that look like distortion, have a number that is not zero, and were not read.
+def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, str]]:
+    """The keys that look like distortion and have a number that is not zero, each with the identity of its dict.
 
     Args:
-        value: the document, or a part of it.
-        used: the keys that were read.
-        others: identities of the dicts of other cameras, which may hold what they like.
+        value: a document, or a part of it.
+        others: identities of dicts that do not count.
     """
     if isinstance(value, list):
         for item in value:
             if isinstance(item, dict | list):
-                yield from unread_distortion(item, used, others)
-    if not isinstance(value, dict) or id(value) in others:
-        return
-    for key, inside in value.items():
-        name = plain(key)
-        if _DISTORTION_KEY.match(name) and (id(value), key) not in used and _has_number(inside):
-            yield key
-        else:
-            yield from unread_distortion(inside, used, others)
+                yield from distortion_keys(item, others)
+    if isinstance(value, dict) and id(value) not in others:
+        yield from distortion_keys_inside(value, others)
+
+
+def distortion_keys_inside(values: Mapping[str, Any], others: Container[int]) -> Iterator[tuple[int, str]]:
+    """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
+    for key, value in values.items():
+        if _DISTORTION_KEY.match(plain(key)) and _has_number(value):
+            yield id(values), key
+        yield from distortion_keys(value, others)
 
 
 def _has_number(value: Any) -> bool:
