@@ -343,9 +343,10 @@ class Appearance(Term):
     with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines.
 
-    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank only the best
-    distinct views of the other terms are compared, ``top`` of them, at least ``min_angle`` degrees apart; every other
-    view gets the score of the nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. Of a larger bank a fixed packing is
+    compared, with views at least ``min_angle`` degrees apart: of its cells, the ``top`` that hold the best views of the
+    other terms. Every other view gets the score of the nearest compared view, and NaN as raw score.
+    ``weights`` is the digest of the network's.
     """
 
     name: ClassVar[str] = "appearance"

@@ -41,7 +41,10 @@ class ViewBank:
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
         appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank. Meshes with colours
             have grey features followed by coloured ones.
+        described_views_file: where those of a large bank are kept, as views are described; None keeps them in memory.
     """
+
+    described_views_file: Path | None = None
 
     def __init__(
         self, mesh: trimesh.Trimesh, views: ViewSphere, pipeline: Pipeline, tensors: Mapping[str, Tensor]
@@ -167,7 +170,10 @@ class ViewBank:
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
-        return ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
+        bank = ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
+        on_cpu = bank.device.type == "cpu"  # another device rounds differently: a file has the features of a CPU
+        bank.described_views_file = self.described_views_file if on_cpu else None
+        return bank
 
     @property
     def tensors(self) -> dict[str, Tensor]:

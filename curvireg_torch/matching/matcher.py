@@ -25,9 +25,9 @@ from ..terms import (
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
 from .bank import ViewBank
+from .cells import DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
-MAX_CACHED_VIEWS = 2048  # Views whose appearance is cached, 35 kB each at 128 px
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
@@ -145,7 +145,7 @@ class ViewMatcher(nn.Module):
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
         self.bank, self._renderer = bank, renderer
-        self._known_appearance: dict[int, Tensor] = {}
+        self._described_views = DescribedViews(bank.described_views_file)
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
@@ -234,9 +234,8 @@ class ViewMatcher(nn.Module):
             score = term.log_score(raw)
         elif len(log):
             R = self.bank.rotations
-            order = log.argsort(dim=1, descending=True, stable=True)
-            selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
-            selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
+            representatives, cells = self._packing
+            selected = [representatives[best_cells(row, cells, count=term.top)] for row in log]
             compared = torch.cat(selected).unique()
             similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
             for b, index in enumerate(selected):
@@ -245,28 +244,34 @@ class ViewMatcher(nn.Module):
                 score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return log + term.weight * score, {term.name: raw}
 
+    @cached_property
+    def _packing(self) -> tuple[Tensor, Tensor]:
+        """(C,) views that are at least the appearance term's ``min_angle`` apart, and (N,) the nearest of these to each
+        view. They are the same for every photograph, so that few views of a mesh are ever described."""
+        assert self._appearance is not None
+        R = self.bank.rotations
+        every = torch.arange(len(R), device=R.device)
+        representatives = distinct_views(every, R, count=len(R), angle=self._appearance.term.min_angle)
+        return representatives, cells_of_views(R, representatives)
+
     def _features_of_views(self, views: Tensor) -> Tensor:
-        """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
+        """(U, D) features of (U,) ascending views: from the bank, described before, or described now."""
         if (features := self.bank.appearance) is not None:
             return features if len(views) == len(features) else features[views.to(self.bank.device)]
-        appearance, cache = self._appearance, self._known_appearance
+        return self._described_views.features(views.tolist(), self._describe_views)
+
+    def _describe_views(self, views: list[int]) -> Tensor:
+        """(U, D) appearance features of views, rendered and described."""
+        appearance = self._appearance
         assert appearance is not None
-        found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
-        missing = [view for view in views.tolist() if view not in found]
 
         def describe(chunk: list[int]) -> Tensor:
             R, distances = self.bank.rotations[chunk], self.bank.distances[chunk]
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
-        parts = map_on_threads(describe, chunks, device=self.bank.device)
-        new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
-        if len(cache) + len(new) > MAX_CACHED_VIEWS:
-            cache.clear()
-        cache.update(new)
-        found.update(new)
-        return torch.stack([found[view] for view in views.tolist()])
+        chunks = [views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)]
+        return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
         """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
