@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,15 +15,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError, MissingFileError
+from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, ImageError, MissingFileError
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
+from ..utils.pictures import check_pixels, damaged_picture, open_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP", "PPM")
-_SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
 _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
@@ -69,7 +67,7 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, BMP, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
+        path: JPEG, PNG, TIFF, WebP, BMP, PBM, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
         as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
@@ -107,17 +105,10 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
         raise MissingFileError("no such file; check the path of the photograph", subject=path)
     if path.stat().st_size > MAX_IMAGE_BYTES:
         raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
-    from PIL import Image, UnidentifiedImageError
-
     try:
-        data = path.read_bytes()
-        scans = len(_SCAN_OF_JPEG.findall(data)) if data.startswith(b"\xff\xd8") else 0
-        if scans > MAX_IMAGE_SCANS:  # of a progressive JPEG, which Pillow would decode for hours
-            raise ImageError(f"a JPEG of {scans} scans, more than {MAX_IMAGE_SCANS}; save it again")
-        with Image.open(BytesIO(data), formats=_FORMATS) as image:
+        with open_picture(path.read_bytes()) as image:
             _seek_full_image(image)
-            if image.width * image.height > MAX_IMAGE_PIXELS:
-                raise Image.DecompressionBombError
+            check_pixels(image)
             notes, (orientation, focal) = _notes(image), _exif(image)
             rgb = _rgb_pixels(image)
             if image.format == "TIFF":  # Pillow has applied the orientation: take it back
@@ -125,14 +116,8 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str
             return rgb, orientation, focal, notes
     except ImageError as error:
         raise error.with_subject(path) from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise ImageError(f"more than {MAX_IMAGE_PIXELS:,} pixels; scale it down", subject=path) from None
-    except UnidentifiedImageError:
-        message = "not an image that is read (JPEG, PNG, TIFF, WebP, BMP, PGM, PPM); convert it to JPEG or PNG"
-        raise ImageError(message, subject=path) from None
     except Exception as error:  # Pillow raises errors of any kind for damaged files
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise ImageError(f"damaged or truncated ({reason}); fetch or save the file again", subject=path) from error
+        raise damaged_picture(error).with_subject(path) from error
 
 
 def _seek_full_image(image: "Image") -> None:

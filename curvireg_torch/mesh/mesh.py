@@ -245,5 +245,6 @@ def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
 
 def principal_rotation(mesh: trimesh.Trimesh) -> Tensor:
     """(3, 3) float64 rotation of :func:`normalization_transform`."""
-    R: Tensor = normalization_transform(mesh)[:3, :3]
-    return R / torch.linalg.vector_norm(R[0])
+    R = normalization_transform(mesh)[:3, :3]
+    rotation: Tensor = R / torch.linalg.vector_norm(R[0])
+    return rotation

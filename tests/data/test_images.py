@@ -160,7 +160,7 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path, monkeypatch):
     path.write_bytes(data[:-2] + 64 * last + data[-2:])
     with pytest.raises(ImageError, match="scans, more than 64"):
         read_photo(path)
-    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)
+    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)  # before the file is read
     with pytest.raises(ImageError, match="larger than 100 bytes"):
         read_photo(path)
 
