@@ -22,7 +22,7 @@ from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
-from .bank import FORMAT_VERSION, ViewBank, colour_arrays
+from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
 #: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
 CACHE_LIMIT = 2_000_000_000
@@ -94,7 +94,7 @@ def cached_bank(
     """
     mesh, folder, pipeline = as_mesh(mesh), folder or cache_folder(), pipeline or Pipeline()
     if views is None:
-        views = pipeline.views.sphere(mesh_up(mesh))
+        views = views_of(mesh, pipeline.views)
     else:
         pipeline = pipeline.with_pose_prior("given")
 

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from ..features import field_points
+from ..geometry import ViewSphere
+from ..mesh import mesh_radius
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
@@ -24,7 +26,7 @@ from ..terms import (
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
-from .bank import ViewBank
+from .bank import VIEWS_AT_A_TIME, ViewBank, packed
 from .cells import DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
@@ -41,8 +43,8 @@ class Ranking:
         scores: (B, N) in [0, 1], the product of the terms' scores, each to the power of its weight.
         order: (B, N) view indices, best first; ties in the order of the bank.
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
-            [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
-            similarity of the boxes' aspect ratios in [0, 1], best view 1.
+            [-1, 1] if they are whitened, or the paper's product; "repeatability": fraction of the photograph's points
+            found in the view; "box": similarity of the boxes' aspect ratios in [0, 1], best view 1.
         allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,) the best of the others
             more than 30 degrees from the best view, or -1.
     """
@@ -223,6 +225,21 @@ class ViewMatcher(nn.Module):
         return terms, torch.stack([term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]).sum(
             dim=0
         )
+
+    @torch.no_grad()
+    def compare_views(self, query: QueryFeatures, views: ViewSphere) -> Tensor:
+        """(N,) log scores of further views of the mesh for one described photograph, 0 for the best of them, by all
+        terms but appearance; mu and Sigma of whitened descriptors are those of the bank."""
+        radius = mesh_radius(self.bank.mesh)
+        parts = zip(views.rotations.split(VIEWS_AT_A_TIME), views.distance.split(VIEWS_AT_A_TIME), strict=True)
+        described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
+        tensors = {name: torch.cat([part[name] for part in described]) for name in described[0]}
+        few = ViewBank(self.bank.mesh, views, self.bank.pipeline, tensors)
+        if any(getattr(term, "whitening", "none") != "none" for term, _ in self._terms):
+            few.whitening = self.bank.whitening
+        scores = [term.weight * term.log_score(term.build(few)(query)) for term, _ in self._terms]
+        log = torch.stack(scores).sum(dim=0)[0]
+        return log - log.max()
 
     def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""
