@@ -107,6 +107,8 @@ MAX_MESH_PARTS = 10_000  #: Nodes with a mesh in a glTF scene
 MAX_POLYGON_WORK = 20_000_000
 #: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25
+MAX_LIST_COLUMNS = 1000  #: Columns of a list of photographs; each row has a text for each
+MAX_RIG_VIEWS = 10_000  #: Photographs of a rig
 MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
 MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
 #: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice

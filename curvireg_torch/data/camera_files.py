@@ -55,21 +55,46 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
         >>> camera.matrix.tolist(), camera.distortion, camera.size
         ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480, 640))
     """
-    file, name = Path(path), ""
-    if not file.is_file() and ":" in str(path):
-        front, _, name = str(path).rpartition(":")
-        file = Path(front)
-    if not file.is_file():
-        raise MissingFileError("no such file; check the path of the calibration, or use --camera exif", subject=path)
-    try:
-        if file.stat().st_size > MAX_CAMERA_BYTES:
-            raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
-        return _chosen(_content(file), name)
-    except RecursionError:
-        raise InvalidInputError("nested too deeply; write it again", subject=path) from None
-    except InvalidInputError as error:
-        message = f"{error}; without a calibration, use --camera exif"
-        raise InvalidInputError(message, subject=path) from error
+    return Calibrations().load(path)
+
+
+class Calibrations:
+    """Calibration files, each of which is read once, however many of its cameras are asked for."""
+
+    def __init__(self) -> None:
+        self._cameras: dict[Path, dict[str, Any]] = {}
+
+    def load(self, path: str | os.PathLike[str]) -> Camera:
+        """:func:`load_camera`."""
+        file = Path(path)
+        name = ""
+        if not os.path.isfile(file) and ":" in str(path):  # unlike Path.is_file, whatever the name is
+            front, _, name = str(path).rpartition(":")
+            file = Path(front)
+        if not os.path.isfile(file):
+            message = "no such file; check the path of the calibration, or use --camera exif"
+            raise MissingFileError(message, subject=path)
+        try:
+            if file not in self._cameras:
+                self._cameras[file] = _cameras(file)
+            return _camera(_chosen(self._cameras[file], name))
+        except RecursionError:
+            raise InvalidInputError("nested too deeply; write it again", subject=path) from None
+        except InvalidInputError as error:
+            message = f"{error}; without a calibration, use --camera exif"
+            raise InvalidInputError(message, subject=path) from error
+
+
+def _cameras(file: Path) -> dict[str, Any]:
+    """The values of each camera in a file, by name; of a file with one camera alone, the name is empty."""
+    if file.stat().st_size > MAX_CAMERA_BYTES:
+        raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
+    content = _content(file)
+    parts = {"": content, **{key: value for key, value in content.items() if isinstance(value, dict)}}
+    cameras = {key: value for key, value in parts.items() if _get(value, (*_MATRIX, "fx")) is not None}
+    if not cameras:
+        raise InvalidInputError(f"no camera matrix; expected {_FORMATS}")
+    return cameras
 
 
 def _content(file: Path) -> dict[str, Any]:
@@ -87,19 +112,16 @@ def _content(file: Path) -> dict[str, Any]:
     return _colmap(text) if re.search(r"^\d+ [A-Z_]+ ", text, re.MULTILINE) else _yaml(text)
 
 
-def _chosen(content: dict[str, Any], name: str) -> Camera:
-    """The camera of a file's content, or one of several."""
-    found = {"": content, **{key: value for key, value in content.items() if isinstance(value, dict)}}
-    found = {key: value for key, value in found.items() if _get(value, (*_MATRIX, "fx")) is not None}
-    if not found:
-        raise InvalidInputError(f"no camera matrix; expected {_FORMATS}")
-    if not name and len(found) == 1:
-        (name,) = found
-    if name not in found:
-        names = ", ".join(list(found)[:8]) + (", ..." if len(found) > 8 else "")
+def _chosen(cameras: dict[str, Any], name: str) -> dict[str, Any]:
+    """The values of a camera; without a name, those of the only one."""
+    if not name and len(cameras) == 1:
+        (name,) = cameras
+    if name not in cameras:
+        names = ", ".join(list(cameras)[:8]) + (", ..." if len(cameras) > 8 else "")
         advice = f"choose one as FILE:NAME from {names}" if names else "leave the name out"
         raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
-    return _camera(found[name])
+    values: dict[str, Any] = cameras[name]
+    return values
 
 
 def _camera(values: dict[str, Any]) -> Camera:
@@ -211,7 +233,7 @@ def _yaml(text: str) -> dict[str, Any]:
         else:
             key, colon, content = line.partition(":")
             if not colon or content[:1].strip():
-                raise InvalidInputError(f"expected 'key: value', got {line!r:.60}; expected {_FORMATS}")
+                raise InvalidInputError(f"a line that is not 'key: value'; expected {_FORMATS}")
             content = re.sub(r"^\s*!\S*", "", content).strip()
             parents[-1][1][key.strip("\"' ")] = _scalar(content) if content else nested
         parents.append((indent, nested))
@@ -224,7 +246,7 @@ def _scalar(text: str) -> Any:
     if not text.startswith("["):
         return _number(text)
     if not text.endswith("]"):
-        raise InvalidInputError(f"a list without its ']': {text!r:.60}")
+        raise InvalidInputError("a list without its ']'")
     return [_number(word.strip("[] ")) for word in text.split(",") if word.strip("[] ")]
 
 

@@ -69,7 +69,8 @@ def evaluate(
     """
     pipeline = pipeline or PRESETS[DEFAULT]
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
-    pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
+    if pipeline.views.pose != "paper":  # the paper's grid stays, whatever is known
+        pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
         check_positive(limit, "limit")
     if (out / "results.csv").exists():

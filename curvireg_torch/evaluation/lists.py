@@ -9,12 +9,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from ..data import Video, load_camera
+from ..data import Video
+from ..data.camera_files import Calibrations
 from ..data.frames import FrameReader, VideoFrame
-from ..errors import InvalidInputError, MissingFileError
+from ..errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
-from ..utils.files import read_csv, write_csv
+from ..utils.files import FindFile, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .outputs import output_folder
@@ -37,7 +38,13 @@ REPORTS = ("results.csv", "index.html")  # written from all results at the end
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 
 
-def _entry(cells: Sequence[str], columns: Mapping[str, str], folder: Path, options: RegisterOptions) -> Entry:
+def _entry(
+    cells: Sequence[str],
+    columns: Mapping[str, str],
+    folder: Path,
+    options: RegisterOptions,
+    calibrations: Calibrations,
+) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     cells, count = _without_empty_end(cells, len(columns)), len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
@@ -50,7 +57,7 @@ def _entry(cells: Sequence[str], columns: Mapping[str, str], folder: Path, optio
         meshes = (folder / values["mesh"],) if values.get("mesh") else options.meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = numbers_of(values, BOX), camera_of(values, folder) or options.guess
+        box, camera = numbers_of(values, BOX), camera_of(values, folder.joinpath, calibrations) or options.guess
         mask = folder / values["mask"] if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**(options.limits or {}), **own})
@@ -60,14 +67,14 @@ def _entry(cells: Sequence[str], columns: Mapping[str, str], folder: Path, optio
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
-def camera_of(values: Mapping[str, str], folder: Path) -> Camera | None:
-    """The camera of a row: of numbers, or a calibration in ``folder``."""
+def camera_of(values: Mapping[str, str], find: FindFile, calibrations: Calibrations) -> Camera | None:
+    """The camera of a row: of numbers, or of a calibration that ``find`` finds by its name."""
     numbers = numbers_of(values, CAMERA)
     if not values.get("camera"):
         return None if numbers is None else Camera(camera_matrix(*numbers))
     if numbers is not None:
         raise InvalidInputError("camera: give it or fx, fy, cx, cy")
-    return load_camera(folder / values["camera"])
+    return calibrations.load(find(values["camera"]))
 
 
 def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, ...] | None:
@@ -151,6 +158,8 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
             f"{path}: no column {', '.join(missing)} in its header {','.join(header)[:80]!r}; "
             f"separate columns by commas and call them {','.join(_REQUIRED)}"
         )
+    if len(names) > MAX_LIST_COLUMNS:
+        raise InvalidInputError(f"{path}: more than {MAX_LIST_COLUMNS:,} columns; leave some out")
     if twice := sorted({column for column in names if names.count(column) > 1}):
         raise InvalidInputError(f"{path}: two columns {', '.join(twice) or 'without a name'}; keep one of each")
     for column in set(names) - set(_KNOWN):
@@ -161,7 +170,8 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     if not rows:
         raise InvalidInputError(f"{path}: no photographs; give one row for each")
     columns = dict(zip(names, header, strict=True))
-    return [_entry(cells, columns, path.parent, options) for cells in rows]
+    calibrations = Calibrations()
+    return [_entry(cells, columns, path.parent, options, calibrations) for cells in rows]
 
 
 def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:

@@ -9,6 +9,7 @@ import torch
 
 from curvireg_torch import load_camera
 from curvireg_torch.errors import MAX_CAMERA_BYTES, InvalidInputError
+from tests._support.doubling import check_linear
 
 K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
 D = np.array([[-0.31, 0.12, 0.001, -0.002, 0.03]])
@@ -167,3 +168,47 @@ def test_malicious_files_are_refused(tmp_path):
             load_camera(tmp_path / name)
         assert str(error.value).startswith(f"{tmp_path / name}: ")
         assert "--camera exif" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "part", "end"),
+    [
+        ("K: ", "[", ""),
+        ("K: ", "[1, ", ""),
+        ("K: [", "[1], ", ""),
+        ("K: [", "1, ", ""),
+        ("K: [", "1, ", "]"),
+        ("K: ", '"', ""),
+        ("K: ", "\t", "x"),
+        ("K: ", " #", ""),
+        ("", "a:\n", ""),
+        ("K:\n", "- 1\n", ""),
+        ("", "---\n", ""),
+        ("", "\n%", ""),
+        ("", "1", " PINHOLE "),
+        ("1 PINHOLE ", "1 ", ""),
+        ("K: !", "!", ""),
+        ("<a>", "<b/>", "</a>"),
+    ],
+)
+def test_calibrations_are_read_in_linear_time(tmp_path, head, part, end):
+    def make(count):
+        (tmp_path / "cam").write_text(head + part * count + end)
+
+    check_linear(lambda _: load_camera(tmp_path / "cam"), make, 20_000)
+
+
+def test_messages_do_not_quote_lines_of_a_file_that_is_no_calibration(tmp_path):
+    for content in (
+        "TOKEN-hunter2\n",
+        "[hunter2",
+        "K: [hunter2",
+        "x:\n  hunter2\n",
+        "{hunter2",
+        "<hunter2",
+        "- hunter2",
+    ):
+        (tmp_path / "env").write_text(content)
+        with pytest.raises(InvalidInputError) as error:
+            load_camera(tmp_path / "env")
+        assert "hunter2" not in str(error.value)
