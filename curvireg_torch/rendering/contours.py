@@ -62,7 +62,7 @@ class _Level:
     def vertices_in_cameras(self, R: np.ndarray, position: np.ndarray) -> np.ndarray:
         """(N, V, 3) float32 vertices in the cameras' frames, of poses with rotations (N, 3, 3) and positions (N, 3) of
         the centre."""
-        vertices = R @ self._vertices.T + position[..., None]
+        vertices: np.ndarray = R @ self._vertices.T + position[..., None]
         return vertices.transpose(0, 2, 1)
 
     def lengths_in_crop(
@@ -176,7 +176,8 @@ class _Views:
         with np.errstate(invalid="ignore"):
             bend = np.abs(ahead - 2.0 * z + back) / step * self.K[:, :1, 0] / z
             largest_jump = np.maximum(np.abs(ahead - z), np.abs(back - z))
-        return is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP * radius)
+        is_fold: np.ndarray = is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP * radius)
+        return is_fold
 
 
 @dataclass(frozen=True)
