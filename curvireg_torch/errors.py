@@ -109,6 +109,8 @@ MAX_TEXTURE_PIXELS = 1 << 28  #: Pixels of all textures of a mesh together: 16 o
 MAX_POLYGON_WORK = 20_000_000
 #: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25
+MAX_LIST_COLUMNS = 1000  #: Columns of a list of photographs; each row has a text for each
+MAX_RIG_VIEWS = 10_000  #: Photographs of a rig
 MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
 MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
 #: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice

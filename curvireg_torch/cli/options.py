@@ -85,6 +85,14 @@ def register_options(
     return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
 
 
+def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
+    """The files that a command's options name, and ``more``."""
+    named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
+    camera = getattr(arguments, "camera", None)
+    calibrations = [camera, camera.rpartition(":")[0]] if isinstance(camera, str) else []
+    return [*more, *(path for path in named if isinstance(path, Path)), *map(Path, filter(None, calibrations))]
+
+
 def check_viewer(command: str) -> None:
     """Refuse a command that opens a page where NiceGUI is missing."""
     try:

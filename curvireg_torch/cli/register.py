@@ -13,8 +13,15 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InvalidInputError, LostObjectError
 from ..evaluation.opening import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..utils.choices import check_given, is_one_photograph
-from ..utils.files import check_writable
-from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
+from .options import (
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    input_files,
+    numbers_among,
+    register_options,
+)
 
 if TYPE_CHECKING:
     from ..evaluation.lists import Counts
@@ -149,8 +156,7 @@ def run(arguments: argparse.Namespace) -> int:
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if run_processes(arguments.jobs, arguments.argv):
         return 0
-    with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) if arguments.out is None else arguments.out
+    with one_torch_thread(), _output(arguments) as out:
         counts = _register_several(options, arguments, out)
         if counts is None:  # another process writes the tables
             return 0
@@ -171,6 +177,28 @@ def run(arguments: argparse.Namespace) -> int:
     return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
 
 
+@contextmanager
+def _output(arguments: argparse.Namespace) -> Iterator[Path]:
+    """The folder of the results, or one for the time being."""
+    if arguments.out is not None:
+        yield arguments.out
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+@contextmanager
+def _one_result(arguments: argparse.Namespace, *inputs: Path) -> Iterator[None]:
+    """Context in which the files of one result may be written."""
+    if arguments.out is None:
+        yield
+        return
+    from ..evaluation.outputs import output_folder
+
+    with output_folder(arguments.out, "register", inputs=input_files(arguments, *inputs)):
+        yield
+
+
 def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
     from ..data import read_photo
@@ -181,19 +209,19 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     out, path = arguments.out, options.photos[0]
     photo, entry = read_photo(path), options.entry(path)
     check_entry(entry, photo)
-    if out is not None:
-        check_writable(out, "--out")
-    if options.progress and not (options.box or options.mask or options.start):
-        print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with opened_registrar(options) as (registrar, seconds):
-        try:
-            found = register_entry(entry, photo, registrar, bank_seconds=seconds)
-        except LostObjectError as error:
-            if out is not None:
-                write_lost(out, str(error))
-            raise
-    if out is not None:
-        found.save(out)
+    with _one_result(arguments, *entry.files):
+        if options.progress and not (options.box or options.mask or options.start):
+            print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+        with opened_registrar(options) as (registrar, seconds):
+            try:
+                found = register_entry(entry, photo, registrar, bank_seconds=seconds)
+            except LostObjectError as error:
+                if out is not None:
+                    write_lost(out, str(error))
+                raise
+        if out is not None:
+            found.write(out)
+        _write_pose(arguments, found.document)
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks, inputs = list(photo.notes), found.document["inputs"]
@@ -215,13 +243,13 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..registration.result import view_in_words
 
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
-    if out is not None:
-        check_writable(out, "--out")
-    with opened_registrar(options) as (registrar, seconds):
-        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
-    document["mesh"] = str(options.meshes[result.model])
-    if out is not None:
-        write_views(out, document, registrar, result, photographs)
+    with _one_result(arguments, *options.meshes, *(view.photo for view in rig)):
+        with opened_registrar(options) as (registrar, seconds):
+            result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
+        document["mesh"] = str(options.meshes[result.model])
+        if out is not None:
+            write_views(out, document, registrar, result, photographs)
+        _write_pose(arguments, document)
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["views"]:
@@ -230,13 +258,18 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     return result.reliable
 
 
-def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Print the result, and write it in the format of another tool."""
+def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Write the pose in the format of another tool, if one is asked for."""
     from ..evaluation.result_files import write_pose_stamped
-    from ..evaluation.store import to_json
 
     if arguments.format:
         write_pose_stamped(arguments.out / "pose.yaml", document)
+
+
+def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Print the result."""
+    from ..evaluation.store import to_json
+
     if arguments.json:
         print(to_json(document), end="")
     else:
@@ -250,13 +283,13 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
     from ..pipeline import field_digest
 
     if arguments.list is None:
-        check_writable(out, "--out")
-        photos = list_photographs(options, every=arguments.every, frames=out / "frames")
+        photos = list_photographs(options, every=arguments.every)
+        source = [str(path.resolve()) for path in options.photos]
         if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
             print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     else:
         photos = read_list(arguments.list, options)
-        check_writable(out, "--out")
+        source = [str(arguments.list.resolve())]
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
     names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
@@ -265,7 +298,8 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
         "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    return register_list(photos, out, partial(open_registrar, options), settings=settings, progress=options.progress)
+    how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}
+    return register_list(photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how)
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:

@@ -141,8 +141,8 @@ class RegisterOptions:
     )
     preset: str | None = _option(
         None,
-        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search "
-        f"and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
+        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
+        f"contour fit. paper: the published method, to the letter (default: that of a bank, else {DEFAULT})",
         choices=PRESET_NAMES,
     )
     pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)
@@ -274,7 +274,7 @@ def open_registrar(
         elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
             pipeline = replace(pipeline, views=banks[0].pipeline.views)
     if not options.refine:
-        pipeline = replace(pipeline, contours=False)
+        pipeline = replace(pipeline, contours=False, search=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
     settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}

@@ -11,7 +11,6 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ..geometry import rotation_error
-from ..matching.describe import depth_filter
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
@@ -95,7 +94,7 @@ def side_pictures(
         "photograph": to_uint8(crop[0]),
         "photograph field": _field_picture(field[0]),
         "pose": to_uint8(shaded[-3:] if len(shaded) > 1 else shaded),
-        "view field": _field_picture(depth_filter(settings)(registrar.describer.depth(*at)[0])[0]),
+        "view field": _field_picture(registrar.describer.fields(*at)[0]),
     }
 
 

@@ -48,7 +48,7 @@ def test_the_header_of_a_binary_file_says_nothing(tmp_path: Path, load: Load, he
 @pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
 def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
     (tmp_path / "a.stl").write_bytes(binary()[:-cut])
-    with pytest.raises(MeshError, match="says 12 faces and holds .*cut while it was written"):
+    with pytest.raises(MeshError, match=r"says 12 faces and holds .*cut while it was written"):
         cr.load_mesh(tmp_path / "a.stl")
     (tmp_path / "a.stl").write_bytes(binary(claimed=0))
     with pytest.raises(MeshError, match="says 0 faces and holds 12"):
