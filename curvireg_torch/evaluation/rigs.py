@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..data.bop import bop_box, entry_at
-from ..data.camera_files import Calibrations
+from ..data.calibrations import Calibrations
 from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera
 from ..geometry.cameras import transform

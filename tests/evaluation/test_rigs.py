@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from curvireg_torch.data import camera_files
+from curvireg_torch.data import calibrations
 from curvireg_torch.errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
 from curvireg_torch.evaluation import rigs
 from curvireg_torch.evaluation.lists import read_list
@@ -53,13 +53,13 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path):
 
 
 def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, monkeypatch):
-    read, content = [], camera_files._content
+    read, content = [], calibrations.read_document
 
     def counted(file):
         read.append(file.name)
         return content(file)
 
-    monkeypatch.setattr(camera_files, "_content", counted)
+    monkeypatch.setattr(calibrations, "read_document", counted)
     camera = {"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]}
     (tmp_path / "a.json").write_text(json.dumps({f"c{k}": camera for k in range(5)}))
     (tmp_path / "b.json").write_text(json.dumps(camera))
