@@ -15,7 +15,7 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
-from ..mesh import has_colours, mesh_symmetries
+from ..mesh import has_colours, mesh_symmetries, mesh_warnings
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
@@ -313,6 +313,11 @@ class Registrar:
             return ()
         return ("the mesh is flat and has no colours: front and back look alike",)
 
+    @property
+    def mesh_notes(self) -> tuple[str, ...]:
+        """What the mesh lacks, in words: see :func:`curvireg_torch.mesh.mesh_warnings`."""
+        return tuple(warning.text for warning in mesh_warnings(self.bank.mesh))
+
     @cached_property
     def describer(self) -> ViewDescriber:
         """Renderer, contours and descriptor of the mesh, on a grid twice as fine as the bank's."""
@@ -584,6 +589,7 @@ class Registrar:
             prior=work.item.prior,
             prior_contradiction=contradiction,
             warnings=work.item.warnings + self.mesh_warnings,
+            notes=self.mesh_notes,
         )
 
 
