@@ -1,6 +1,7 @@
 """Write the README's table of results from ``scripts/results/evaluation_*.json``.
 
     python scripts/results_table.py --record DIR/summary.json NAME    store a summary of ``curvireg evaluate`` as NAME
+    python scripts/results_table.py --compare DIR/summary.json ...    print them beside the stored ones
     python scripts/results_table.py                                   write the table into the README
 
 A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted changes), so record
@@ -9,6 +10,7 @@ it right after measuring.
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +36,12 @@ LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name")
+    parser.add_argument("--compare", nargs="+", type=Path, metavar="SUMMARY", help="print summaries beside stored ones")
     arguments = parser.parse_args()
     if arguments.record:
         print(record(Path(arguments.record[0]), arguments.record[1]))
+    elif arguments.compare:
+        print(comparison(arguments.compare, RESULTS))
     else:
         update_page(REPOSITORY / "README.md", "results", table(RESULTS))
 
@@ -47,6 +52,32 @@ def record(summary: Path, name: str) -> Path:
     content = json.loads(summary.read_text(encoding="utf-8"))
     write_json(path, {"name": name, "date": today(), "commit": commit(), "summary": content})
     return path
+
+
+COMPARED = {
+    "pascal3d": ("acc_pi_6", "acc_pi_18", "med_err_deg"),
+    "bop": ("acc_15_deg", "acc_30_deg", "med_err_deg", "mspd_ar"),
+}
+"""Of each kind of data set: the scores that a comparison shows."""
+
+
+def comparison(summaries: Sequence[Path], results: Path) -> str:
+    """Markdown of ``DIR/NAME/summary.json`` files beside the stored results of the same names."""
+    rows = [["set", "N", "score", "stored", "now"]]
+    for path in summaries:
+        name = path.parent.name
+        measured = json.loads(path.read_text(encoding="utf-8"))
+        stored_path = results / f"evaluation_{name}.json"
+        stored = json.loads(stored_path.read_text(encoding="utf-8"))["summary"] if stored_path.exists() else {}
+        for key in COMPARED[measured["settings"]["dataset"]]:
+            values = [score(summary.get(key), key) for summary in (stored, measured)]
+            rows.append([name, str(measured["n"]), key, *values])
+    return "\n".join(table_lines(rows))
+
+
+def score(value: float | None, key: str) -> str:
+    """A score as the tables print it."""
+    return degrees(value) if key.endswith("_err_deg") else percent(value)
 
 
 def table(results: Path) -> str:

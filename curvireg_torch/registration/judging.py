@@ -4,9 +4,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
+import trimesh
 from torch import Tensor
 
 from ..matching import Ranking
+from ..mesh import has_colours, mesh_radius
 from ..terms import QueryFeatures
 from .confidence import (
     are_near,
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
+
+FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,7 @@ def judged(
         prior=item.prior,
         prior_contradiction=_contradiction(registrar, work, poses[best], gain),
         warnings=item.warnings + registrar.mesh_warnings + outside_warnings(fraction),
+        notes=registrar.mesh_notes,
     )
 
 
@@ -123,6 +128,15 @@ def _contradiction(registrar: "Registrar", work: Work, best: Poses, gain: float 
     filling = Poses.in_box(registrar.describer, work.item.box, K, *placement)
     better = gain is not None and gain > OUTSIDE_MARGIN
     return work.limits.contradiction(best, filling, better_outside=better)
+
+
+def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
+    """What makes every pose of a flat mesh questionable, in words."""
+    vertices = torch.from_numpy(mesh.vertices.copy()).double()
+    thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+    if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
+        return ()
+    return ("the mesh is flat and has no colours: front and back look alike",)
 
 
 def better_of(

@@ -1,0 +1,90 @@
+"""The scripts that store results and write the README's table."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from scripts import _shared, results_table
+
+
+def bop_summary(*, acc_15_deg: float = 0.5, med_err_deg: float | None = 3.25) -> dict[str, object]:
+    """A summary of ``curvireg evaluate bop`` with the keys that the tables read."""
+    scores = {
+        "acc_15_deg": acc_15_deg,
+        "acc_30_deg": 0.75,
+        "med_err_deg": med_err_deg,
+        "add_recall_0.1d": 0.25,
+        "mssd_ar": 0.4,
+        "mspd_ar": 0.6,
+    }
+    return {
+        "n": 8,
+        **scores,
+        "subsets": {"unoccluded": {"n": 4, "acc_30_deg": 1.0}},
+        "seconds": {"register_each": 0.25},
+        "limit": None,
+        "skipped": {"no box": 2},
+        "failed": 1,
+        "protocol": "box=annotated",
+        "settings": {"dataset": "bop", "split": "test", "preset": "learned"},
+    }
+
+
+def write_summary(folder: Path, **scores: float | None) -> Path:
+    folder.mkdir(parents=True)
+    path = folder / "summary.json"
+    path.write_text(json.dumps(bop_summary(**scores)))
+    return path
+
+
+@pytest.fixture
+def results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "results"
+    monkeypatch.setattr(results_table, "RESULTS", folder)
+    return folder
+
+
+def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Path) -> None:
+    path = results_table.record(write_summary(tmp_path / "run"), "cups")
+    stored = json.loads(path.read_text())
+    assert path == results / "evaluation_cups.json"
+    assert (stored["name"], stored["summary"]["n"]) == ("cups", 8)
+    assert {"date", "commit"} <= stored.keys()
+    table = results_table.table(results)
+    assert "| cups | 8 | 50.0 % | 75.0 % | 3.2° | 25.0 % | 40.0 % | 60.0 % | 4 | 100.0 % | 0.2 |" in table
+    assert "1 failed, 2 skipped" in table
+
+
+def test_sets_of_several_lightings_count_views(tmp_path: Path, results: Path) -> None:
+    results_table.record(write_summary(tmp_path / "run"), "hope")
+    assert "| hope | 8 |" in results_table.table(results)  # 8 is no multiple of 5
+    assert results_table.counted("hope", 10) == "10 (2 views x 5 lightings)"
+
+
+def test_comparison_shows_stored_and_new_scores(tmp_path: Path, results: Path) -> None:
+    results_table.record(write_summary(tmp_path / "old" / "cups"), "cups")
+    new = write_summary(tmp_path / "new" / "cups", acc_15_deg=0.625, med_err_deg=None)
+    text = results_table.comparison([new], results)
+    assert "| cups | 8 | acc_15_deg | 50.0 % | 62.5 % |" in text
+    assert "| cups | 8 | med_err_deg | 3.2° | - |" in text
+
+
+def test_comparison_of_a_set_that_was_never_stored(tmp_path: Path, results: Path) -> None:
+    text = results_table.comparison([write_summary(tmp_path / "new" / "cups")], results)
+    assert "| cups | 8 | acc_15_deg | - | 50.0 % |" in text
+
+
+def test_page_is_replaced_between_its_markers_only(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- rows:begin -->\nold\n<!-- rows:end -->\nafter\n", encoding="utf-8")
+    _shared.update_page(page, "rows", "new\n")
+    assert page.read_text(encoding="utf-8") == "before\n<!-- rows:begin -->\nnew\n<!-- rows:end -->\nafter\n"
+
+
+def test_page_without_markers_is_an_error(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("text", encoding="utf-8")
+    with pytest.raises(ValueError, match="substring"):
+        _shared.update_page(page, "rows", "new\n")
+    assert page.read_text(encoding="utf-8") == "text"

@@ -1,0 +1,111 @@
+"""Which pictures are decoded: by their first bytes, before Pillow chooses a decoder."""
+
+import io
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from PIL import EpsImagePlugin, Image
+
+from curvireg_torch.errors import MAX_IMAGE_PIXELS, ImageError
+from curvireg_torch.utils import pictures
+from curvireg_torch.utils.pictures import PICTURE_NAMES, PICTURE_STARTS, check_pixels, open_picture, picture_format
+
+SECURITY = Path(__file__).parents[2] / "SECURITY.md"
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n%%EOF\n"
+DOS_POSTSCRIPT = b"\xc5\xd0\xd3\xc6" + (32).to_bytes(4, "little") + len(POSTSCRIPT).to_bytes(4, "little") + bytes(20)
+
+
+def _saved(name: str, mode: str = "RGB", **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.new(mode, (8, 8)).save(file, name, **options)
+    return file.getvalue()
+
+
+def test_open_picture_opens_the_formats_of_security_md_and_no_other_that_pillow_writes():
+    Image.init()
+    opened = set()
+    for name in Image.SAVE:
+        for mode in ("RGB", "L", "P"):
+            try:
+                data = _saved(name, mode)
+            except Exception:  # formats of other modes, or written by programs that are absent
+                continue
+            try:
+                open_picture(data).close()
+                opened.add(name)
+            except ImageError:
+                continue
+    assert opened - {"MPO", "JPEG2000"} == set(PICTURE_STARTS)  # MPO: a JPEG with others behind it
+    listed = re.search(r"those of (.*?);", SECURITY.read_text())
+    assert listed is not None
+    assert listed[1].replace(" or ", ", ") == PICTURE_NAMES
+
+
+def test_open_picture_tells_formats_by_each_of_their_starts():
+    starts = {
+        "TIFF": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"),
+        "PPM": (b"P1\n", b"P2 ", b"P3\t", b"P4\r", b"P5\n", b"P6\n"),
+        "WEBP": (b"RIFF\n\0\n\0WEBP",),
+    }
+    for name, kinds in starts.items():
+        for start in kinds:
+            assert picture_format(start + b"rest") == name
+            for other in (b" " + start, start[:-1]):
+                with pytest.raises(ImageError, match="not an image that is read"):
+                    picture_format(other)
+    for other in (b"", b"P0CMYK 1 1 255\n", b"P7\n", b"Pf\n", b"PyP\n", b"RIFFAVI WAVE", b"GIF89a", b"<svg/>"):
+        with pytest.raises(ImageError, match=re.escape(PICTURE_NAMES)):
+            picture_format(other)
+
+
+@pytest.mark.parametrize("start", [b"", b"\n", b" ", b"BM", b"\xff\xd8\xff", b"P6\n"])
+@pytest.mark.parametrize("content", [POSTSCRIPT, DOS_POSTSCRIPT + POSTSCRIPT])
+def test_postscript_never_reaches_ghostscript(monkeypatch, start, content):
+    started = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *given, **_: started.append(given))
+    monkeypatch.setattr(EpsImagePlugin, "has_ghostscript", lambda: True)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/usr/bin/{name}")
+    with pytest.raises(ImageError):
+        open_picture(start + content).load()
+    assert not started
+
+
+def test_open_picture_bounds_bytes_pixels_and_scans(monkeypatch):
+    progressive = _saved("JPEG", progressive=True)
+    scan = progressive[progressive.rindex(b"\xff\xda") : -2]
+    whole = progressive[:-2]
+    scans = progressive.count(b"\xff\xda")
+    open_picture(whole + (pictures.MAX_IMAGE_SCANS - scans) * scan).close()
+    with pytest.raises(ImageError, match="a JPEG of 65 scans, more than 64"):
+        open_picture(whole + (pictures.MAX_IMAGE_SCANS - scans + 1) * scan)
+    square = _saved("PNG")
+    monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 64)
+    open_picture(square).close()
+    monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 63)
+    with pytest.raises(ImageError, match=r"more than .* pixels; scale it down"):
+        open_picture(square)
+    monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", len(square))
+    monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 64)
+    open_picture(square).close()
+    with pytest.raises(ImageError, match=r"larger than [\d,]+ bytes; save it smaller"):
+        open_picture(square + b"\0")
+
+
+def test_messages_of_damaged_pictures_are_one_line_and_say_what_to_do(monkeypatch):
+    message = "damaged or truncated, or of a kind that is not read; convert it to JPEG or PNG"
+    for data in (b"BM" + b"secret" * 9, b"\xff\xd8\xff" + b"secret" * 9, b"II*\0" + b"secret" * 9):
+        with pytest.raises(ImageError) as caught:
+            open_picture(data)
+        assert "secret" not in str(caught.value)
+        assert "\n" not in str(caught.value)
+    for error in (OSError(), OSError("\nmore")):
+        assert str(pictures.damaged_picture(error)) == message
+    bomb = pictures.damaged_picture(Image.DecompressionBombError("2 x 2"))
+    assert str(bomb) == f"more than {MAX_IMAGE_PIXELS:,} pixels; scale it down"
+    image = Image.new("L", (8, 8))
+    check_pixels(image)
+    monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 63)
+    with pytest.raises(ImageError, match="pixels; scale it down"):
+        check_pixels(image)
