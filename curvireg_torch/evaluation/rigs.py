@@ -1,23 +1,26 @@
 """Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
 
+import math
+import os
 import re
 import time
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
 
-from ..data import load_camera
 from ..data.bop import bop_box, entry_at
-from ..errors import CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera, camera_matrix
+from ..data.calibrations import Calibrations
+from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
+from ..geometry import Camera
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.result import result_document
 from ..utils.checks import check_pose
-from ..utils.files import check_table_size, finite_numbers, read_csv, read_json
+from ..utils.files import FindFile, check_table_size, finite_numbers, read_csv, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
 from .photograph import register_views
 from .result_files import View
@@ -26,30 +29,38 @@ ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "
 COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
 
 
-def read_rig(path: Path, mesh: Path | None = None) -> list[View]:
+def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = None) -> list[View]:
     """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a scene of a BOP set.
 
     docs/results.md describes the columns of the CSV. Of a BOP scene, boxes are those of the object that the name of
-    ``mesh`` numbers, if each photograph shows it once at most.
+    ``mesh`` numbers, if each photograph shows it once at most. ``find`` finds the photographs and calibrations that the
+    rig names, by default from its own folder on.
     """
+    folder = path if path.is_dir() else path.parent
+    find = find or folder.joinpath
     if path.is_dir():
-        for name, read in (("images.txt", _colmap), ("scene_camera.json", lambda folder: _bop(folder, mesh))):
-            if (path / name).is_file():
-                return _checked(path, read(path))
+        if (path / "images.txt").is_file():
+            return _checked(path, _colmap(path, find))
+        if (path / "scene_camera.json").is_file():
+            return _checked(path, _bop(path, mesh, find))
         raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
-    return _checked(path, _colmap(path.parent) if path.name == "images.txt" else _table(path, read_csv(path)))
+    if path.name == "images.txt":
+        return _checked(path, _colmap(folder, find))
+    return _checked(path, _table(read_csv(path), find))
 
 
 def _checked(path: Path, rows: Iterator[View]) -> list[View]:
     """The rows, whose errors name the file."""
     try:
-        views = list(rows)
+        views = list(islice(rows, MAX_RIG_VIEWS + 1))
     except CurviregError as error:
         raise error.with_subject(f"{path}: {error.subject}") from error
     if not views:
         raise InvalidInputError("no photographs", subject=path)
+    if len(views) > MAX_RIG_VIEWS:
+        raise InvalidInputError(f"more than {MAX_RIG_VIEWS:,} photographs; leave some out", subject=path)
     return views
 
 
@@ -73,53 +84,81 @@ def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any
         raise InvalidInputError(str(error), subject=name) from error
 
 
-def _table(path: Path, cells: Sequence[Sequence[str]]) -> Iterator[View]:
+def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
     header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
+    if twice := sorted({name for name in names if name and names.count(name) > 1}):
+        raise InvalidInputError(f"two columns {', '.join(twice)}; keep one of each", subject="header")
+    calibrations = Calibrations()
     for number, values in enumerate(rows, start=1):
         row = dict(zip(names, map(str.strip, values), strict=False))
         name = f"row {number}: {row.get('photo', '')}"
         if not row.get("photo"):
             raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
+        if beyond := [cell for cell in values[len(names) :] if cell.strip()]:
+            raise InvalidInputError(
+                f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas", subject=name
+            )
         try:
-            box, camera = numbers_of(row, BOX), camera_of(row, path.parent)
-            rotation = numbers_of(row, ROTATION) or numbers_of(row, QUATERNION)
+            box, camera = numbers_of(row, BOX), camera_of(row, find, calibrations)
+            matrix = numbers_of(row, ROTATION)
+            quaternion = numbers_of(row, QUATERNION)
+            if matrix and quaternion:
+                raise InvalidInputError("r11 to r33 and qw to qz; give one of them")
+            rotation = matrix or quaternion
             translation = numbers_of(row, TRANSLATION)
         except CurviregError as error:
             raise error.with_subject(": ".join(filter(None, (name, error.subject)))) from error
-        yield _view(name, path.parent / row["photo"], box, camera, rotation, translation)
+        yield _view(name, find(row["photo"]), box, camera, rotation, translation)
 
 
-def _colmap(folder: Path) -> Iterator[View]:
-    """Photographs of ``images.txt``, in which every second line lists points, that lie in the folder, in ``images`` in
-    it, or beside it."""
+def _colmap(folder: Path, find: FindFile) -> Iterator[View]:
+    """Photographs of ``images.txt`` that lie in the folder, in ``images`` in it, or beside it."""
     check_table_size(folder / "images.txt")
     try:
         lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"not text ({error})", subject="images.txt") from error
-    lines = [line for line in lines if not line.startswith("#")]
-    for line in lines[::2]:
-        if not line.strip():
-            continue
-        match = re.fullmatch(r"\s*\d+((?:\s+\S+){7})\s+(\d+)\s+(\S.*?)\s*", line)
+    calibrations = Calibrations()
+    for line in _without_points([line for line in lines if not line.startswith("#")]):
+        words = line.split(maxsplit=9)
         try:
-            pose = list(map(float, match[1].split())) if match else None
+            pose = list(map(float, words[1:8]))
         except ValueError:
-            pose = None
-        if match is None or pose is None:
+            pose = []
+        if len(words) < 10 or not pose or not (words[0].isdecimal() and words[8].isdecimal()):
             message = f"expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:60]!r}"
             raise InvalidInputError(message, subject="images.txt")
-        places = [
-            folder / match[3],
-            *(place / "images" / match[3] for place in (folder, *folder.resolve().parents[:3])),
-        ]
-        photo = next((place for place in places if place.is_file()), places[0])
-        camera = load_camera(f"{folder / 'cameras.txt'}:{match[2]}")
-        yield _view(f"image {match[3]}", photo, None, camera, pose[:4], pose[4:])
+        name = words[9].rstrip()
+        places = [find(name)]
+        places += [find(str(place / "images" / name)) for place in (folder, *folder.resolve().parents[:3])]
+        photo = next(filter(os.path.isfile, places), places[0])
+        camera = calibrations.load(f"{folder / 'cameras.txt'}:{words[8]}")
+        yield _view(f"image {name}", photo, None, camera, pose[:4], pose[4:])
 
 
-def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
+def _without_points(lines: Sequence[str]) -> Iterator[str]:
+    """The lines of ``images.txt`` that name images: COLMAP writes a line of points X Y POINT3D_ID ..., often empty,
+    behind each; other programs leave it out."""
+    may_be_points = False
+    for line in lines:
+        if not line.strip() or (may_be_points and _are_points(line)):
+            may_be_points = False
+        else:
+            may_be_points = True
+            yield line
+
+
+def _are_points(line: str) -> bool:
+    words = line.split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:  # a name
+        return False
+    return len(numbers) % 3 == 0 and all(number == int(number) for number in numbers[2::3] if math.isfinite(number))
+
+
+def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
         read_json(folder / name, dict, "datasets/bop/README.md") if (folder / name).is_file() else {}
@@ -127,19 +166,23 @@ def _bop(folder: Path, mesh: Path | None) -> Iterator[View]:
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
     for key, camera in cameras.items():
-        pictures = [
-            folder / kind / f"{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")
-        ]
-        photo = next((path for path in pictures if path.is_file()), pictures[0])
+        names = [f"{kind}/{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")]
+        pictures = list(map(find, names))
+        photo = next(filter(os.path.isfile, pictures), pictures[0])
         values = camera if isinstance(camera, dict) else {}
         K = finite_numbers(values.get("cam_K"), 9)
         if K is None:
             raise InvalidInputError("no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}")
-        objects = truths.get(key) if isinstance(truths.get(key), list) else []
+        objects = truths.get(key, [])
+        if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
+            raise InvalidInputError("expected a list of objects in scene_gt.json", subject=f"image {key}")
         mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
-        camera_of_image = Camera(camera_matrix(K[0], K[4], K[2], K[5]))
+        try:
+            camera_of_image = Camera(torch.tensor(K, dtype=torch.float64).view(3, 3))
+        except InvalidInputError as error:  # skew, for instance
+            raise error.with_subject(f"image {key}: cam_K in scene_camera.json") from error
         yield _view(f"image {key}", photo, box, camera_of_image, *pose)
 
 

@@ -26,6 +26,7 @@ from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
 from .result import Detection, FailedRegistration, Registration, corners
 from .tracker import boxes_at
+from .unknown_camera import limits_of
 
 if TYPE_CHECKING:
     from .registrar import Registrar
@@ -93,7 +94,7 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     if item.prior is not None:
         distance, allowed = item.prior.distance, _allowed_views(registrar, item)
         distance = None if item.camera_matrix is None else distance  # sizes do not limit an unknown camera
-        kept = registrar.limits_of(item).keeps(poses)
+        kept = limits_of(registrar, item).keeps(poses)
         poses, count = poses[kept], count[kept]
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
@@ -128,7 +129,7 @@ def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
         points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
-    return registrar.limits_of(item).allowed(off_centre=off_centre)
+    return limits_of(registrar, item).allowed(off_centre=off_centre)
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ class Candidate:
         query = registrar.matcher.query([item.image], box[None].float())
         allowed = None
         if item.prior is not None:
-            allowed = registrar.limits_of(replace(item, box=box.float())).allowed()[None]
+            allowed = limits_of(registrar, replace(item, box=box.float())).allowed()[None]
         similarity = float(registrar.matcher.similarity(query, allowed))
         score = detection_probability(response, similarity, rival=rival)
         return cls(box, response, rival, query, score)

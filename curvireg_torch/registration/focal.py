@@ -15,7 +15,6 @@ from torch import Tensor
 from ..geometry.cameras import camera_matrix, rotation_towards, transform
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
-from ..rendering.contours import ContourPoints
 from .contour_fit import FULL_SIZE_RADII, STEPS_PER_ROUND, ContourFit, ContourProblem, ContourState, measured_fit
 from .edges import EdgeCrops
 from .inputs import ImageItem
@@ -73,9 +72,7 @@ def _camera(size: tuple[int, int], focal: float) -> Tensor:
     return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
 
-def starts_of_fields(
-    describer: ViewDescriber, crops: EdgeCrops, starts: Sequence[Poses], count: int
-) -> Poses:
+def starts_of_fields(describer: ViewDescriber, crops: EdgeCrops, starts: Sequence[Poses], count: int) -> Poses:
     """Of ``starts``, the same views with each of several cameras, those that are fitted, with their quick fits and the
     most evidence first: the best view with each camera, and at least ``count`` views with their best camera."""
     poses, support = with_quick_fit(describer, crops, Poses.cat(starts))
@@ -205,9 +202,7 @@ class FocalInformation:
         return self.scale / self.amount.clamp(min=1e-12)
 
 
-def focal_information(
-    problem: ContourProblem, state: ContourState, radius: float
-) -> tuple[FocalInformation, Tensor]:
+def focal_information(problem: ContourProblem, state: ContourState, radius: float) -> tuple[FocalInformation, Tensor]:
     """What edges within ``radius`` px tell of log f beyond what motions of the object could imitate, with errors as in
     :func:`pose_covariance`; and (N, 6), how the best pose moves with log f."""
     measured = problem.measured_edges(state, radius)
@@ -240,9 +235,7 @@ def with_focal_length(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, 
     return replace(poses, cameras=cameras).with_fit(measured, describer.centre)
 
 
-def focal_covariance(
-    describer: ViewDescriber, crops: EdgeCrops, pose: Poses, item: ImageItem
-) -> tuple[Tensor, float]:
+def focal_covariance(describer: ViewDescriber, crops: EdgeCrops, pose: Poses, item: ImageItem) -> tuple[Tensor, float]:
     """(1, 6, 6) covariance of one fitted pose with the error of its focal length, and the standard deviation of that,
     as a fraction."""
     full = ContourProblem.of(describer.contours, crops, pose.cameras, pose.crop_index)

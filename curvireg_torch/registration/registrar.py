@@ -3,8 +3,9 @@
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from copy import copy
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -14,65 +15,46 @@ from torch import Tensor, nn
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
-from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
-from ..mesh import has_colours, mesh_symmetries
+from ..matching import ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..mesh import has_colours, mesh_symmetries, mesh_warnings
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
 from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.threads import map_on_threads
-from .confidence import (
-    MIN_LANDMARKS,
-    are_near,
-    concentration,
-    confidence_features,
-    hypothesis_probabilities,
-    is_calibrated,
-    registration_confidence,
-)
+from .confidence import MIN_LANDMARKS, are_near
 from .contour_fit import measure_contours
 from .detection import Detector, detect
 from .edges import EdgeCrops
-from .focal import (
-    FINISHED,
-    FITTED,
-    TRIED_VIEWS,
-    USUAL_DEVIATION,
-    focal_covariance,
-    off_axis_angle,
-    possible_cameras,
-    starts_of_fields,
-    usual_camera,
-    with_focal_length,
-)
+from .focal import FINISHED
 from .inputs import ImageItem, check_crop, image_items
+from .judging import Work, better_of, flat_mesh_warnings, judged
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
     FINISHED_FITS,
-    SCORE_WEIGHTS,
     SCREENING_WEIGHT,
     Poses,
     best_views,
+    close_rivals,
     common_score,
     compare_with_photograph,
     distinct_poses,
     fit_poses,
     fit_texture_of,
-    hypothesis_of,
     landmark_evidence,
-    named_features,
     pose_features,
     pose_scores,
     projected_box,
     with_edge_support,
     with_quick_fit,
 )
-from .priors import Limits
 from .refinement import nearest_view, refine
 from .result import FailedRegistration, Registration
 from .search import search
 from .several import register_views
+from .siblings import Siblings, telling_symmetries
+from .unknown_camera import limits_of, with_fitted_focal_lengths, with_focal_deviation, with_possible_cameras
 
 __all__ = ["Registrar"]
 
@@ -86,31 +68,9 @@ become hypotheses."""
 
 KEPT_LANDMARKS = 0.5  # Fraction of the landmarks that agree with a start, which must agree with its fit as well
 
-OUTSIDE_MARGIN = 1.0
-"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
-
-FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
-
 Results = list[Registration | FailedRegistration]
 
 _SHAPE_LOCK = threading.Lock()
-
-
-@dataclass(frozen=True)
-class _Work:
-    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
-    fits, and ``landmarks`` in the box, if there are any."""
-
-    item: ImageItem
-    query: QueryFeatures
-    ranking: Ranking
-    descriptor: Tensor
-    limits: Limits | None
-    exact: bool
-    symmetries: Tensor | None
-    crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
-    starts: Poses | None = None
 
 
 class Registrar:
@@ -244,7 +204,7 @@ class Registrar:
             results = self.map_items(items, lambda item, _: self.register_item(item))
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
-            results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
+            results = [better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
@@ -265,7 +225,7 @@ class Registrar:
             result = FailedRegistration(error)
         for model, other in enumerate(self.others, 1):
             with suppress(CurviregError):  # that of the first mesh is raised if all fail
-                result = _better(result, other.register_views(*given), model)
+                result = better_of(result, other.register_views(*given), model)
         if isinstance(result, FailedRegistration):
             raise result.error
         return result
@@ -273,6 +233,18 @@ class Registrar:
     def of_model(self, model: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
         return self.others[model - 1] if model else self
+
+    def with_hypotheses(self, count: int) -> "Registrar":
+        """The same registrar with at least ``count`` hypotheses, of which a joint result needs more than it reports.
+
+        :meta private:
+        """
+        if self.pipeline.hypotheses >= count:
+            return self
+        _ = self.describer  # shared
+        other = copy(self)
+        other.pipeline = replace(self.pipeline, hypotheses=count)
+        return other
 
     @property
     def is_exact(self) -> bool:
@@ -321,13 +293,23 @@ class Registrar:
         return Landmarks(self.describer)
 
     @cached_property
+    def _telling_symmetries(self) -> Tensor:
+        """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity alone if they are
+        given, and trusted."""
+        symmetries = self.symmetries_of(exact=True)
+        if self.symmetries is not None or symmetries is None:
+            return torch.eye(4, dtype=torch.float64)[None]
+        return telling_symmetries(self.bank.mesh, symmetries)
+
+    @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:
         """What makes every pose of this mesh questionable, in words."""
-        vertices = torch.from_numpy(self.bank.mesh.vertices.copy()).double()
-        thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
-        if has_colours(self.bank.mesh) or thickness > FLAT_EXTENT * self.describer.radius:
-            return ()
-        return ("the mesh is flat and has no colours: front and back look alike",)
+        return flat_mesh_warnings(self.bank.mesh)
+
+    @property
+    def mesh_notes(self) -> tuple[str, ...]:
+        """What the mesh lacks, in words: see :func:`curvireg_torch.mesh.mesh_warnings`."""
+        return tuple(warning.text for warning in mesh_warnings(self.bank.mesh))
 
     @cached_property
     def describer(self) -> ViewDescriber:
@@ -354,6 +336,7 @@ class Registrar:
         whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
+        _ = self.is_exact and self._telling_symmetries
 
         def run(index: int) -> Any:
             item = items[index]
@@ -394,15 +377,11 @@ class Registrar:
         """
         work = self._rank(item, query)
         if work.exact and item.camera_matrix is None:
-            work = self._with_possible_cameras(work)
+            work = with_possible_cameras(self, work)
+        if self.pipeline.search:
+            return self._searched(work)
         starts, outside, repeated = self._starts(work)
         poses = starts
-        if self.pipeline.search:
-            self.report_progress("search")
-            rotation = search(self.describer, work.descriptor, poses)
-            poses = self._in_box(work, rotation, poses.distance, poses.view, poses.rank)
-            if work.limits is not None:
-                poses = work.limits.moved_inside(poses)
         if work.crops is not None:
             self.report_progress("contours")
             unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
@@ -410,11 +389,13 @@ class Registrar:
                 poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
             finish = FINISHED_FITS if work.starts is None else FINISHED
             poses = self._fitted(work, work.crops, poses, quick=poses.quick, finish=finish)
-        features = self._features(work, poses)
+        features = self.features_of(work, poses)
+        sibling: tuple[Poses, Tensor] | None = None
         if work.crops is not None and work.exact:
             if work.item.focal_deviation:
-                poses, features = self._with_focal_length(work, work.crops, poses, features, outside)
+                poses, features = with_fitted_focal_lengths(self, work, work.crops, poses, features, outside)
             poses, features = self._fitted_again(work, work.crops, poses, features, outside)
+            poses, features, sibling = self._with_siblings(work, work.crops, poses, features, outside)
             poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
@@ -431,15 +412,18 @@ class Registrar:
             if work.crops is not None:
                 restored = with_edge_support(self.describer, work.crops, restored)
             poses = poses.replaced(back, restored)
-            features = features.index_copy(0, back, self._features(work, restored))
+            features = features.index_copy(0, back, self.features_of(work, restored))
         if work.crops is not None and work.item.focal_deviation:
-            work, poses = self._with_focal_deviation(work, work.crops, poses, features, outside)
-        return self._result(work, poses, features, distinct, outside)
+            work, poses = with_focal_deviation(self, work, work.crops, poses, features, outside)
+        if sibling is not None:
+            poses, features = Poses.cat([poses, sibling[0]]), torch.cat([features, sibling[1]])
+            distinct, outside = F.pad(distinct, (0, 1), value=True), F.pad(outside, (0, 1))
+        return judged(self, work, poses, features, distinct, outside)
 
-    def _rank(self, item: ImageItem, query: QueryFeatures) -> _Work:
+    def _rank(self, item: ImageItem, query: QueryFeatures) -> Work:
         self.report_progress("ranking")
         exact = self.is_exact
-        limits = None if item.prior is None else self.limits_of(item)
+        limits = None if item.prior is None else limits_of(self, item)
         ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
         symmetries = self.symmetries_of(exact=exact)
         crops = None
@@ -448,42 +432,9 @@ class Registrar:
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
         landmarks = self.landmark_matches(item, item.box) if self.uses_landmarks else None
         descriptor = self.describer.descriptor(query.field)
-        return _Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
+        return Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
 
-    def _with_possible_cameras(self, work: _Work) -> _Work:
-        """A photograph whose camera is unknown, with starts of several cameras, of which it has the best."""
-        item = replace(work.item, focal_deviation=USUAL_DEVIATION, camera_source="estimated")
-        starts: Poses | None = None
-        K = usual_camera(item.size)
-        if work.crops is not None:
-            view, rank = best_views(work.ranking, self.bank, count=TRIED_VIEWS, symmetries=work.symmetries)
-            of_cameras = []
-            for camera in possible_cameras(item.size):
-                poses = self._of_views(replace(work, item=replace(item, camera_matrix=camera)), view, rank)
-                of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-            starts = starts_of_fields(self.describer, work.crops, of_cameras, self._least_starts)
-            K = starts.cameras[0]
-        item = replace(item, camera_matrix=K)
-        limits = None if item.prior is None else Limits(item, self.bank)
-        landmarks = self.landmark_matches(item, item.box) if self.uses_landmarks else None
-        return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
-
-    def limits_of(self, item: ImageItem) -> Limits:
-        """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens them.
-
-        :meta private:
-        """
-        assert item.prior is not None
-        if item.camera_matrix is not None:
-            return Limits(item, self.bank)
-        if not self.is_exact:
-            if item.prior.distance is not None:
-                raise InvalidInputError("distance: with a similar mesh, needs the camera of the photograph")
-            return Limits(item, self.bank)
-        usual = replace(item, camera_matrix=usual_camera(item.size))
-        return Limits(usual, self.bank, off_centre=off_axis_angle(usual))
-
-    def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
+    def _starts(self, work: Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
         most, and which repeats another one: the same view with another camera, or a pose that landmarks agree on, in
         place of the views near it.
@@ -506,24 +457,37 @@ class Registrar:
         view = work.ranking.outside.cpu()
         if int(view) < 0:
             return poses, outside, repeated
-        other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
+        other = self.poses_of_views(work, view, torch.zeros(1, dtype=torch.float64))
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(repeated, (0, 1))
 
     @property
-    def _least_starts(self) -> int:
+    def least_starts(self) -> int:
         return max(MIN_REFINED, self.pipeline.hypotheses)
 
-    def _promising(self, work: _Work) -> Poses:
+    def _promising(self, work: Work) -> Poses:
         """Poses of the most promising distinct views."""
-        count = self._least_starts
+        count = self.least_starts
         screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
         view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
-        poses = self._of_views(work, view, rank)
+        poses = self.poses_of_views(work, view, rank)
         if work.limits is not None:
             poses = work.limits.moved_inside(poses)
         if work.crops is not None and len(poses) > count:
             poses = self._screened(work.crops, poses, count)
         return poses
+
+    def _searched(self, work: Work) -> Registration:
+        """The result of the paper's search, and further distinct views of the ranking, in its order."""
+        self.report_progress("search")
+        view, rank = best_views(work.ranking, self.bank, count=self.pipeline.hypotheses, symmetries=work.symmetries)
+        rotation, distance = search(self.matcher, work.query, work.ranking)
+        found = self._in_box(work, rotation[None], distance[None], view[:1], rank[:1])
+        poses = self.poses_of_views(work, view, rank).replaced(torch.tensor([0]), found)
+        if work.limits is not None:
+            poses = work.limits.moved_inside(poses)
+        distinct = torch.ones(len(poses), dtype=torch.bool)
+        by_rank = replace(work, exact=False)
+        return judged(self, by_rank, poses, self.features_of(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
@@ -531,10 +495,10 @@ class Registrar:
         score = poses.rank + SCREENING_WEIGHT * support
         return poses[score.argsort(descending=True, stable=True)[:count]]
 
-    def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
+    def poses_of_views(self, work: Work, view: Tensor, rank: Tensor) -> Poses:
         return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)
 
-    def _in_box(self, work: _Work, *poses: Tensor) -> Poses:
+    def _in_box(self, work: Work, *poses: Tensor) -> Poses:
         return Poses.in_box(self.describer, work.item.box, work.item.camera_matrix, *poses)
 
     def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
@@ -549,14 +513,16 @@ class Registrar:
             return None
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
-    def _features(self, work: _Work, poses: Poses) -> Tensor:
+    def features_of(self, work: Work, poses: Poses) -> Tensor:
         """(H, 5) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
-        landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
+        landmarks = (
+            None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
+        )
         return pose_features(poses, similarity, appearance, landmarks)
 
-    def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
+    def _fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
         poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
@@ -570,105 +536,85 @@ class Registrar:
         return poses
 
     def _fitted_again(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
-        """Fit the best pose again from where it is, and keep the result if it has a higher score."""
+        """Fit the best pose again from where it is, then its close rivals: fits that differ in effort cannot be
+        compared. Results with a higher score are kept."""
         best = _best_inside(features, outside)
-        fitted = self._fitted(work, crops, poses[best], again=True)
-        if bool((poses.T[best] == fitted.T).all()):
-            return poses, features
-        new = self._features(work, fitted)
-        if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
-            return poses, features
-        return self._replaced(work, poses, features, best, fitted, new)
+        poses, features = self._refitted(work, crops, poses, features, best)
+        scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
+        rivals = close_rivals(poses, scores, work.symmetries)
+        return self._refitted(work, crops, poses, features, rivals) if len(rivals) else (poses, features)
 
-    def _with_focal_length(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    def _refitted(
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
     ) -> tuple[Poses, Tensor]:
-        """Fit the focal lengths of the best poses with them, and keep what does not lower their scores."""
-        scores = pose_scores(features, exact=True)
-        count = FITTED if work.starts is not None else 1
-        for h in scores.masked_fill(outside, -torch.inf).topk(min(count, int((~outside).sum()))).indices.tolist():
-            index = torch.tensor([h])
-            fitted = with_focal_length(self.describer, crops, poses[index], work.item)
-            new = self._features(work, fitted)
-            if bool(pose_scores(new, exact=True) >= scores[index]):
-                poses, features = self._replaced(work, poses, features, index, fitted, new)
+        """Fit poses again, and keep the results that have a higher score."""
+        fitted = self._fitted(work, crops, poses[index], again=True)
+        moved = (poses.T[index] != fitted.T).flatten(1).any(dim=1)
+        if not bool(moved.any()):
+            return poses, features
+        new = self.features_of(work, fitted)
+        better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
+        for k in better.nonzero()[:, 0].tolist():
+            one = torch.tensor([k])
+            poses, features = self.replaced(work, poses, features, index[one], fitted[one], new[one])
         return poses, features
 
-    def _with_focal_deviation(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-    ) -> tuple[_Work, Poses]:
-        """The photograph with the camera of the best pose and what is known of its focal length, and the poses with the
-        covariance that follows; the others have none."""
+    def _with_siblings(
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    ) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
+        """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
+        strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
+        symmetries = self._telling_symmetries
+        if len(symmetries) == 1:
+            return poses, features, None
         best = _best_inside(features, outside)
-        covariance, deviation = focal_covariance(self.describer, crops, poses[best], work.item)
-        unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
-        item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)
-        return replace(work, item=item), replace(poses, covariance=unknown)
+        measure = partial(self._measured, work, crops)
+        siblings = Siblings.of(poses[best], symmetries, self.describer, measure)
+        kept = siblings.best()
+        if kept:
+            fitted = self._fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
+            new = self.features_of(work, fitted)
+            better = bool(pose_scores(new, exact=True) > pose_scores(features[best], exact=True))
+            if better:
+                poses, features = self.replaced(work, poses, features, best, fitted, new)
+            else:
+                kept = 0
+        rival = siblings.rival(kept, features[best])
+        if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
+            rival = None
+        return poses, features, rival
+
+    def _measured(self, work: Work, crops: EdgeCrops, poses: Poses) -> Tensor:
+        """(H, 5) :data:`POSE_FEATURES` of poses that are not fitted."""
+        return self.features_of(work, with_edge_support(self.describer, crops, poses))
 
     def _with_texture(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose to the mesh's colours as well."""
         best = _best_inside(features, outside)
         fitted = fit_texture_of(self.describer, crops, poses, int(best))
         if fitted is None:
             return poses, features
-        return self._replaced(work, poses, features, best, fitted, self._features(work, fitted))
+        return self.replaced(work, poses, features, best, fitted, self.features_of(work, fitted))
 
-    def _replaced(
-        self, work: _Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
+    def replaced(
+        self, work: Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
     ) -> tuple[Poses, Tensor]:
         """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds the limits."""
         if work.limits is not None and not bool(work.limits.keeps(fitted)):
             return poses, features
         return poses.replaced(index, fitted), features.index_copy(0, index, new)
 
-    def _kept(self, work: _Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
+    def _kept(self, work: Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
         """(H,) bool: poses that do not return to their views."""
         kept = distinct
         if self.pipeline.contours and not work.exact:
             # Where the contours of a similar object do not fit, the view has the smaller error.
             kept = kept & poses.fit.trustworthy
         return kept if work.limits is None else kept & (work.limits.keeps(poses) | outside)
-
-    def _result(self, work: _Work, poses: Poses, features: Tensor, distinct: Tensor, outside: Tensor) -> Registration:
-        """Hypotheses, best first, those that merged last, and their probabilities."""
-        scores = pose_scores(features, exact=work.exact)
-        order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
-        own, rivals = order[~outside[order]], order[outside[order]]
-        best, reported = own[:1], own[: self.pipeline.hypotheses].tolist()
-        with_camera = work.item.camera_matrix is not None
-        R, ranking = self.bank.rotations, work.ranking
-        near = are_near(R, R[ranking.order[0, 0]], work.symmetries)
-        measured = confidence_features(features[own], scores[own], concentration(ranking.scores[0], near))
-        gain = None
-        if len(rivals):  # without the rank, which views outside the limits do not have
-            gain = float((features[rivals, 1:] - features[best, 1:]) @ torch.tensor(SCORE_WEIGHTS[1:]).to(features))
-            if len(own) == 1:  # limits that leave no rival do not make a pose uncertain
-                share = measured["concentration"] or 1.0
-                measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
-        probabilities: tuple[float, ...] = ()
-        if is_calibrated(self.pipeline):
-            confidence = registration_confidence(measured, exact=work.exact)
-            probabilities = hypothesis_probabilities(confidence, scores[own], exact=work.exact)[: len(reported)]
-        contradiction = None
-        if work.limits is not None:
-            one = poses[best]
-            filling = self._in_box(work, one.rotation, one.distance, one.view, one.rank)
-            better = gain is not None and gain > OUTSIDE_MARGIN
-            contradiction = work.limits.contradiction(one, filling, better_outside=better)
-        return Registration(
-            tuple(hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported),
-            probabilities,
-            ranking,
-            measured,
-            prior=work.item.prior,
-            prior_contradiction=contradiction,
-            warnings=work.item.warnings + self.mesh_warnings,
-            camera=work.item.camera,
-        )
 
 
 def _are_repeated(views: Tensor) -> Tensor:
@@ -680,15 +626,3 @@ def _are_repeated(views: Tensor) -> Tensor:
 def _best_inside(features: Tensor, outside: Tensor) -> Tensor:
     """(1,) index of the best pose that is not outside the limits."""
     return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-
-
-def _better(
-    one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
-) -> Registration | FailedRegistration:
-    """The registration with more confidence, or with a higher score where there is none; ``model`` is the rival's."""
-    if not isinstance(rival, Registration):
-        return one
-    if not isinstance(one, Registration):
-        return replace(rival, model=model)
-    ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
-    return replace(rival, model=model) if ahead else one

@@ -11,7 +11,7 @@ import secrets
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -21,6 +21,11 @@ from ..errors import MAX_TABLE_BYTES, InvalidInputError, MissingFileError, Outpu
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+MAX_NAME = 60  # characters of the name of an uploaded file
+FindFile = Callable[[str], Path]
+"""Where a file lies that another file names. ``folder.joinpath`` follows any name, :func:`only_in` none out of a
+folder."""
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -55,6 +60,36 @@ def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_inert, row) for row in rows)
     write_file(path, text.getvalue().encode(errors="backslashreplace"))  # file names may be no UTF-8
+
+
+class CsvFile:
+    """A CSV file that grows: each row is on disk once it is known. It begins, anew, with the first row.
+
+    Cells are written as by :func:`write_csv`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Sequence[str]) -> None:
+        self.path = path
+        self._header: Sequence[str] | None = header
+
+    def add(self, row: Sequence[object]) -> None:
+        """Write one row."""
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        mode = "ab"
+        if self._header is not None:
+            writer.writerow(self._header)
+            mode = "wb"
+        writer.writerow(list(map(_inert, row)))
+        try:
+            with self.path.open(mode) as file:
+                file.write(text.getvalue().encode(errors="backslashreplace"))
+        except OSError as error:
+            raise OutputError(f"cannot be written ({error.strerror}); make room", subject=self.path) from error
+        self._header = None
 
 
 def _inert(cell: object) -> object:
@@ -125,6 +160,29 @@ def read_csv(path: Path) -> list[list[str]]:
         return [cells for cells in table if any(map(str.strip, cells))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path) from error
+
+
+def file_name(text: str) -> str:
+    """The name of an uploaded file, without folders and control characters.
+
+    Example:
+        >>> file_name("../../etc/passwd"), file_name("C:\\\\photos\\\\a.png"), file_name("..")
+        ('passwd', 'a.png', 'file')
+    """
+    last = text.replace("\\", "/").rpartition("/")[2]
+    name = "".join(c for c in last if c.isprintable()).strip(" .")
+    return name[-MAX_NAME:] or "file"
+
+
+def only_in(folder: Path) -> FindFile:
+    """A :data:`FindFile` for lists and rigs from strangers: whatever folder a name has, the file with its
+    :func:`file_name` in ``folder`` is meant.
+
+    Example:
+        >>> only_in(Path("uploads"))("../../etc/passwd").as_posix()
+        'uploads/passwd'
+    """
+    return lambda name: folder / file_name(name)
 
 
 def check_table_size(path: Path) -> None:

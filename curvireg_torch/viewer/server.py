@@ -24,9 +24,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import MAX_MESH_BYTES, InvalidInputError
 from ..evaluation.opening import RegisterOptions
+from ..utils.files import file_name
 from ..utils.threads import one_torch_thread
 from .page import build_page
-from .workspace import Workspace, file_name, show_warning
+from .workspace import Workspace, show_warning
 
 SECURITY_HEADERS = {
     # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.

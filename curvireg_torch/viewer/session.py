@@ -13,7 +13,7 @@ import trimesh
 from torch import Tensor
 
 from ..data import read_photo
-from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError
+from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError, MissingFileError
 from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
 from ..evaluation.photograph import register_entry
 from ..evaluation.result_files import View
@@ -25,6 +25,7 @@ from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
 from ..registration import Registrar, Registration
+from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
 from .shot import Answer, Numbers, Result, Shot, numbers
 
@@ -139,18 +140,28 @@ class Session:
         names. A rig that cannot be used has no rows."""
         self.rig_path, self.rig = path, ()
         try:
-            self.rig = () if path is None else tuple(read_rig(path, self.mesh_path))
-            names = [_key(view.photo) for view in self.rig]
-            if twice := [view.name for view, key in zip(self.rig, names, strict=True) if names.count(key) > 1]:
-                message = f"{' and '.join(twice[:2])} have the same file name; rename the photographs"
-                raise InvalidInputError(message, subject=path)
+            self.rig = () if path is None else self._read_rig(path)
             self._match_rig()
         except CurviregError as error:
             self.rig = ()
             self._match_rig()
             folder = "" if path is None else path if path.is_dir() else path.parent
             subject = str(error.subject).replace(f"{folder}/", "")
-            raise error.with_subject(subject.replace(str(path), self.rig_name)) from error
+            subject = subject.replace(str(path), self.rig_name)
+            if isinstance(error, MissingFileError):
+                raise MissingFileError("no such file; drop it here", subject=subject) from error
+            raise error.with_subject(subject) from error
+
+    def _read_rig(self, path: Path) -> tuple[View, ...]:
+        """The rows of a rig. It comes from anyone who has the address: it names files beside it only."""
+        rig = tuple(read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent)))
+        rows = dict[str, View]()
+        for view in rig:
+            same = rows.setdefault(_key(view.photo), view)
+            if same is not view:
+                message = f"{same.name} and {view.name} have the same file name; rename the photographs"
+                raise InvalidInputError(message, subject=path)
+        return rig
 
     def _match_rig(self) -> None:
         """Give each photograph its row of the rig; the first of several that have one name gets it."""

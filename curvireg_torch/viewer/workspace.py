@@ -25,7 +25,6 @@ from .session import STATIC, Session
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
-MAX_NAME = 60  # characters of the name of an uploaded file
 SAMPLE_CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
 SAMPLE_BOX = (172.0, 18.0, 409.0, 308.0)  # of the cup, in px
 SAMPLE_OPTIONS: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
@@ -140,7 +139,7 @@ class Workspace:
 
     async def _open_upload(self, path: Path) -> None:
         suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
-        kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
+        kinds = (*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
         self.messages.pop("file", None)
         if suffix in kinds and self._before_sample is not None:
             await self.run("file", self._leave_sample, stop=True)
@@ -232,12 +231,6 @@ class Workspace:
         self._version += 1
         self.files[name] = (content, media_type)
         return f"file/{name}?v={self._version}"
-
-
-def file_name(text: str) -> str:
-    """Return the name of an uploaded file without folders and control characters."""
-    name = "".join(c for c in text.replace("\\", "/").rpartition("/")[2] if c.isprintable()).strip(" .")
-    return name[-MAX_NAME:] or "file"
 
 
 def unpack(archive: Path, folder: Path) -> Path:

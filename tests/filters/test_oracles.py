@@ -82,6 +82,9 @@ def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float
     x = _smooth(image[0, 0].numpy(), 1.0)
     gx, gy = _gradient(image[0, 0].numpy(), 1.0)
     cs = gx**2 + gy**2
+    cosine, sine = gx / np.maximum(np.sqrt(cs), 1e-300), gy / np.maximum(np.sqrt(cs), 1e-300)
+    variance = (cosine**4 + sine**4) / 3
+    fourth = variance**2 - 7 / 90 * (cosine**6 + sine**6)
     worst = np.zeros_like(cs)
     for s in (1.0, 2.0, 3.0):
         cs_s = sum(g**2 for g in _gradient(x, s)) if mode == "reblur-image" else _smooth(cs, s)
@@ -89,7 +92,8 @@ def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float
             ratio = cs / cs_s
             squared = s**2 / (ratio - 1) if mode == "reblur-image" else 2 * s**2 / (ratio**2 - 1)
         squared = np.where(ratio > 1, squared, np.inf)
-        worst = np.maximum(worst, np.sqrt(np.clip(squared - 0.36, 0, 1000.0**2)))
+        remainder = fourth / squared + fourth / (squared + s**2)
+        worst = np.maximum(worst, np.sqrt(np.clip(squared - variance - remainder, 0, 1000.0**2)))
     focus = 1 / np.maximum(worst, 0.6)
     value = np.where((focus > math.exp(-4)) & (cs > 1e-3 * cs.max()), focus, 0)
     value = value * cs**saliency_weight

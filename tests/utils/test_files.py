@@ -13,6 +13,7 @@ from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileE
 from curvireg_torch.evaluation.runner import POSE_SOURCES
 from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
+from curvireg_torch.utils.files import file_name, only_in
 
 OLD, NEW = b"a" * 1000, b"b" * 5_000_000
 
@@ -142,3 +143,19 @@ def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(FileNotFoundError):
         files.code_digest("no_such_room")
     files.code_digest.cache_clear()
+
+
+def test_file_name_has_no_folders():
+    assert (file_name("../../etc/passwd"), file_name("C:\\a\\b.png")) == ("passwd", "b.png")
+    assert file_name("a\nb\x1b.png") == "ab.png"
+    assert file_name("") == file_name("a/") == file_name("..") == "file"
+    assert file_name("ä" * 500 + ".png").endswith("ä.png")
+    assert len(file_name("ä" * 500).encode()) < 255
+
+
+def test_only_in_finds_files_of_one_folder(tmp_path):
+    find = only_in(tmp_path)
+    for name in ("a.png", "/etc/a.png", "../a.png", "C:\\a.png", "b/../a.png", "\0a.png", " a.png "):
+        assert find(name) == tmp_path / "a.png"
+    for name in ("", "..", "../..", "/", "x/.", "..\\.."):
+        assert find(name) == tmp_path / "file"

@@ -18,7 +18,7 @@ import trimesh
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.viewer import workspace as module
-from curvireg_torch.viewer.workspace import file_name, show_warning, unpack
+from curvireg_torch.viewer.workspace import show_warning, unpack
 from tests.viewer.test_session import write_scene
 
 
@@ -276,14 +276,6 @@ def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene,
     asyncio.run(work())
     assert [shot.path.name for shot in search.shots] == ["new.png"]
     assert all(shot.path.is_file() for shot in workspace.session.shots)
-
-
-def test_file_name_has_no_folders():
-    assert (file_name("../../etc/passwd"), file_name("C:\\a\\b.png")) == ("passwd", "b.png")
-    assert file_name("a\nb\x1b.png") == "ab.png"
-    assert file_name("") == file_name("a/") == file_name("..") == "file"
-    assert file_name("ä" * 500 + ".png").endswith("ä.png")
-    assert len(file_name("ä" * 500).encode()) < 255
 
 
 def pack(path, members):

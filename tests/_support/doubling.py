@@ -1,0 +1,36 @@
+"""Whether the time of a reader is linear in the size of its input."""
+
+import gc
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from curvireg_torch.errors import CurviregError
+
+FACTOR = 4  # between the sizes; a quadratic reader takes 16 times as long
+MOST = 9.0  # times as long, for that factor: linear, with some noise
+SHORTEST = 0.005  # seconds of processor time of the smaller input that count
+
+
+def check_linear(read: Callable[[Any], object], make: Callable[[int], Any], size: int) -> None:
+    """Assert that ``read(make(4 * size))`` takes about four times as long as ``read(make(size))``. Errors of ours are
+    results too."""
+    seconds = []
+    for count in (size, FACTOR * size):
+        content = make(count)
+        seconds.append(min(_seconds(read, content) for _ in range(3)))
+    small, large = seconds
+    assert large < MOST * max(small, SHORTEST), f"{small:.3f} s, and {large:.3f} s for {FACTOR} times the size"
+
+
+def _seconds(read: Callable[[Any], object], content: Any) -> float:
+    gc.collect()
+    gc.disable()  # what it takes depends on the tests before
+    start = time.process_time()
+    try:
+        with suppress(CurviregError):
+            read(content)
+        return time.process_time() - start
+    finally:
+        gc.enable()
