@@ -221,11 +221,11 @@ def focal_information(problem: ContourProblem, state: ContourState, radius: floa
 
 def with_focal_length(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, item: ImageItem) -> Poses:
     """Poses of a photograph fitted at full size together with their focal lengths."""
-    T, zoom, cameras = poses.T, torch.zeros(len(poses), dtype=torch.float64), poses.cameras
+    T = poses.T
     if item.camera_source == "estimated":
-        half = ContourProblem.of(describer.contours, crops, cameras, poses.crop_index, factor=2)
-        coarse = fit_focal_length(half, T, FocalPrior.of(item, cameras), HALF_RADII)
-        poses = replace(poses, cameras=scaled_cameras(cameras, coarse.log_zoom))
+        half = ContourProblem.of(describer.contours, crops, poses.cameras, poses.crop_index, factor=2)
+        coarse = fit_focal_length(half, T, FocalPrior.of(item, poses.cameras), HALF_RADII)
+        poses = replace(poses, cameras=scaled_cameras(poses.cameras, coarse.log_zoom))
         T = coarse.state.T
     full = ContourProblem.of(describer.contours, crops, poses.cameras, poses.crop_index)
     fit = fit_focal_length(full, T, FocalPrior.of(item, poses.cameras), FULL_RADII)

@@ -133,7 +133,8 @@ def image_items(
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
     Arguments and errors are those of ``Registrar``; each is read and checked whenever it is asked for, so that many
     large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed; a
-    file without one has the camera of its EXIF data. A box of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is refused."""
+    file without one has the camera of its EXIF data. A box of which less than ``MIN_BOX_SIDE`` px lie inside its
+    photograph in a direction is refused."""
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n, no_box = len(images), boxes is None

@@ -12,6 +12,7 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .edges import EdgeCrops
+from .focal import focal_covariance
 from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .poses import (
     Poses,
@@ -110,6 +111,11 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     scores = pose_scores(evidence, exact=True)
     distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
+    if item.focal_deviation:
+        first = torch.tensor(order[:1])
+        covariance, deviation = focal_covariance(describer, crops, poses[first], item)
+        poses = replace(poses, covariance=poses.covariance.index_copy(0, first, covariance))
+        item = replace(item, focal_deviation=deviation)
     hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
@@ -125,7 +131,9 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     warnings = item.warnings + registrar.mesh_warnings
     notes = registrar.mesh_notes
     ranking = Ranking.none()
-    return Registration(hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes)
+    return Registration(
+        hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes, camera=item.camera
+    )
 
 
 def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:

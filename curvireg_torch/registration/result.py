@@ -33,6 +33,7 @@ RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which anot
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
 MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
 STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
+WEAK_PERSPECTIVE = 0.15  # Deviation of an estimated focal length, as a fraction, from which it is hardly measured
 SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
@@ -419,6 +420,23 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
     if (count := document.get("symmetries", 1)) > 1:
         lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
     return lines
+
+
+def camera_in_words(document: Mapping[str, Any]) -> list[str]:
+    """A line about a camera that was not given exactly: where it is from, and how well its focal length is known."""
+    camera = document["camera"]
+    if camera is None or not camera["focal_deviation"]:
+        return []
+    picture = document["inputs"]["picture"]
+    widths = camera["matrix"][0][0] / picture["width"]
+    deviation = 100.0 * camera["focal_deviation"]
+    if camera["source"] == "exif":
+        return [f"camera: from the file's EXIF, {picture['focal_35mm']:g} mm"]
+    known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
+    if camera["source"] == "given":
+        return [f"camera: field of view given, focal length {known}"]
+    weak = ", as perspective is too weak to measure it" if camera["focal_deviation"] > WEAK_PERSPECTIVE else ""
+    return [f"camera: focal length estimated, {known}{weak}"]
 
 
 def view_in_words(view: Mapping[str, Any]) -> str:
