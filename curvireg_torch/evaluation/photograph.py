@@ -319,6 +319,6 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     if camera is not None:
         return camera, "exif"
     if given == "exif" or entry.start is not None:
-        what = "no usable focal length in its EXIF" if given == "exif" else "--start: needs the camera"
+        what = "no focal length in its EXIF" if given == "exif" else "--start: needs the camera"
         raise InvalidInputError(f"{what}; give {CAMERA_OPTIONS}", subject=entry.name)
     return None, None
