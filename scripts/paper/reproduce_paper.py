@@ -67,10 +67,9 @@ PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
 
 
 def measure(phase: str, cases: list[Case], settings: BankSettings, pose: str) -> list[dict[str, Any]]:
-    """Records of the cases of one mesh, in a process of their own."""
+    """Records of the cases of one mesh."""
     from scripts.paper.measure import measure_points, measure_views
 
-    torch.set_num_threads(1)
     start = time.process_time()
     found = measure_points(cases, settings) if phase == "points" else measure_views(cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
@@ -115,13 +114,15 @@ def collect(
         paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
     missing = [k for k, path in enumerate(paths) if not path.exists()]
     done = sum(len(group) for group, path in zip(groups, paths, strict=True) if path.exists())
-    with (
-        tqdm(total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet) as bar,
-        ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool,
-    ):
-        running = {k: pool.submit(measure, phase, groups[k], settings, pose) for k in missing}
-        for k, future in running.items():
-            write_json(paths[k], _finite(future.result()), indent=0)
+    options = [phase] * len(missing), [groups[k] for k in missing], [settings] * len(missing), [pose] * len(missing)
+    with tqdm(total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet) as bar:
+        if arguments.jobs == 1 or len(missing) < 2:
+            measured = map(measure, *options)
+        else:
+            pool = ProcessPoolExecutor(arguments.jobs, get_context("spawn"), torch.set_num_threads, (1,))
+            measured = pool.map(measure, *options)
+        for k, found in zip(missing, measured, strict=True):
+            write_json(paths[k], _finite(found), indent=0)
             bar.update(len(groups[k]))
     return [record for path in paths for record in json.loads(path.read_text(encoding="utf-8"))]
 

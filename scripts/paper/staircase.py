@@ -69,10 +69,10 @@ def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
         yield step.name, pipeline
 
 
-def benchmark_of(root: Path) -> Pascal3DBenchmark | BOPBenchmark:
+def benchmark_of(root: Path, pixel_origin: int) -> Pascal3DBenchmark | BOPBenchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
     if (root / "CAD").is_dir():
-        return Pascal3DBenchmark(Pascal3DPlus(root, pixel_origin=0), Protocol(pose="upright"))
+        return Pascal3DBenchmark(Pascal3DPlus(root, pixel_origin=pixel_origin), Protocol(pose="upright"))
     return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
 
 
@@ -89,14 +89,15 @@ def measure(benchmark: Pascal3DBenchmark | BOPBenchmark, folder: Path) -> tuple[
     return right, float(errors.nan_to_num(torch.inf).quantile(0.5))
 
 
-def climb(name: str, root: Path, out: Path, limit: int | None, steps: list[int], progress: bool) -> None:
+def climb(name: str, root: Path, options: argparse.Namespace) -> None:
     """Evaluate the steps of one set, and record each when it is known."""
-    benchmark = benchmark_of(root)
+    out = options.out
+    benchmark = benchmark_of(root, options.pixel_origin)
     for k, (change, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
-        if k not in steps:
+        if k not in options.steps:
             continue
         folder = out / name / f"{k:02d}"
-        evaluate(benchmark, folder, pipeline=pipeline, limit=limit, progress=progress)
+        evaluate(benchmark, folder, pipeline=pipeline, limit=options.limit, progress=not options.quiet)
         right, median = measure(benchmark, folder)
         row = [name, k, change, right.n, right.mean, right.low, right.high, median, commit()]
         kept = [old for old in read(out) if (old["set"], old["step"]) != (name, str(k))]
@@ -136,6 +137,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--limit", type=int, metavar="N", help="N objects of each set, spread evenly")
     parser.add_argument("--steps", type=int, nargs="+", default=list(range(len(STEPS))), help="default: all")
+    parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
     parser.add_argument("--page", type=Path, help="page of the documentation that gets the table")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     options = parser.parse_args()
@@ -144,7 +146,7 @@ def main() -> int:
             name, _, root = word.partition("=")
             if not root:
                 raise InvalidInputError(f"expected NAME=ROOT, got {word!r}")
-            climb(name, Path(root), options.out, options.limit, options.steps, not options.quiet)
+            climb(name, Path(root), options)
     except CurviregError as error:
         print(f"staircase: error: {error}", file=sys.stderr)
         return 2
