@@ -16,6 +16,8 @@ from PIL import Image
 from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
+from ..data.frames import VideoFrame
+from ..data.masks import mask_file
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
@@ -31,6 +33,7 @@ from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .opening import CAMERA_OPTIONS
+from .outputs import output_folder
 from .result_files import View, write_result
 
 __all__ = ["RegisteredPhotograph", "register"]
@@ -56,6 +59,7 @@ class Entry:
     views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
     as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     label: str = ""  # of a dataset's object: a name that no other object has
+    frame: VideoFrame | None = None  # of the video ``photo``
     error: str = ""  # why the object cannot be registered
 
     def request(self) -> list[Any]:
@@ -64,8 +68,21 @@ class Entry:
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
         given = [self.name, self.box, camera, self.instances, prior]
         views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
-        mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
+        mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
         return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
+
+    def read(self) -> Photo:
+        """The photograph, or the frame; errors are those of :func:`read_photo`."""
+        if self.frame is not None:
+            return Photo(self.frame.read(), 1, None, ())
+        return read_photo(self.photo, as_stored=self.as_stored)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The photographs, meshes and mask that are read."""
+        masks = [mask_file(self.mask)[0]] if isinstance(self.mask, str | PathLike) else []
+        photos = [self.photo, *(view.photo for view in self.views)]
+        return (*photos, *self.meshes, *masks)
 
     @property
     def key(self) -> str:
@@ -81,12 +98,14 @@ class RegisteredPhotograph(Registration):
         registrar: of the mesh.
         image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the object was found.
         document: the content of ``result.json``.
+        inputs: files that were read.
     """
 
     registrar: Registrar
     image: Tensor
     box: Tensor
     document: dict[str, Any]
+    inputs: tuple[Path, ...] = ()
 
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the box."""
@@ -97,8 +116,18 @@ class RegisteredPhotograph(Registration):
         return plots.picture(self.overlay())
 
     def save(self, folder: str | PathLike[str]) -> None:
-        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does."""
-        write_result(Path(folder), self.document, self.registrar, self, self.image, self.box)
+        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does.
+
+        Raises:
+            InvalidInputError: a file in the way that is an input, or no result of this method or that command.
+            OutputError: a file cannot be written.
+        """
+        with output_folder(Path(folder), "register", inputs=self.inputs):
+            self.write(Path(folder))
+
+    def write(self, folder: Path) -> None:
+        """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has checked."""
+        write_result(folder, self.document, self.registrar, self, self.image, self.box)
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""
@@ -128,7 +157,7 @@ def register(
         box: x0, y0, x1, y1 in px; without box and mask the object is searched for.
         camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a calibration file;
             "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.
-        mask: (H, W) of the object, white, or its path.
+        mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
         prior: limits on the pose.
         unit, up: of a mesh file, see :func:`load_mesh`.
         pipeline: the default is that of :class:`Registrar`.
@@ -147,8 +176,10 @@ def register(
         (torch.Size([4]), (720, 960, 3))
     """
     name = ""
+    path = Path()
     meshes: tuple[Path, ...] = ()
     if isinstance(image, str | PathLike):
+        path = Path(image)
         name, photo = str(image), read_photo(image)
     else:
         pixels = np.array(image.convert("RGB")) if isinstance(image, Image.Image) else image
@@ -161,13 +192,13 @@ def register(
         meshes = (Path(mesh),)
         mesh = ViewBank.load(mesh) if meshes[0].suffix == ".safetensors" else load_mesh(mesh, unit=unit, up=up)
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
-    entry = Entry(name=name, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
+    entry = Entry(name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
     return register_entry(entry, photo, registrar)
 
 
 def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
     """The photograph and what is known about it; refuses what cannot be used, as before meshes are opened."""
-    if isinstance(entry.mask, str | PathLike) and not Path(entry.mask).is_file():
+    if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
     item = image_items([photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks)[0]
@@ -227,7 +258,10 @@ def register_entry(
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     box = box.double() if result.corrected_box is None else result.corrected_box
-    return RegisteredPhotograph(**vars(result), registrar=registrar, image=item.image, box=box, document=document)
+    files = entry.files
+    return RegisteredPhotograph(
+        **vars(result), registrar=registrar, image=item.image, box=box, document=document, inputs=files
+    )
 
 
 def register_views(
