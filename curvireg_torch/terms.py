@@ -65,11 +65,19 @@ def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | 
     crops = crops if holes is None else fill_missing(crops, holes)
     crops = to_grey(crops) if grey else crops
     mask: Tensor | None
-    if type(field) is LearnedCurvilinearSaliency:
+    if type(field) is LearnedCurvilinearSaliency and not _has_hooks(field):
         out, mask = field.field_and_mask(crops)
     else:
-        out, mask = field(crops), field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
+        out = field(crops)
+        mask = field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0), mask
+
+
+def _has_hooks(module: nn.Module) -> bool:
+    """Whether a call of ``module`` does more than its ``forward``."""
+    own = module._forward_hooks, module._forward_pre_hooks, module._backward_hooks, module._backward_pre_hooks
+    of_all = torch.nn.modules.module
+    return any(own) or bool(of_all._global_forward_hooks or of_all._global_forward_pre_hooks)
 
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:

@@ -75,6 +75,8 @@ class Protocol:
         if self.hint != "none":
             self.hint_tolerance()
         check_integer(self.views, "views")
+        if self.seed and str(self) == str(replace(self, seed=0)):
+            raise InvalidInputError("protocol: seed: nothing is drawn at random; leave it out")
         if self.views > 1 and self.hint != "none":
             raise InvalidInputError("protocol: hints are given with one photograph; leave hint or views out")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data import Video
-from ..data.camera_files import Calibrations
+from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix

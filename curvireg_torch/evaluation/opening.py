@@ -113,7 +113,11 @@ class RegisterOptions:
         "result then has no covariance",
         type=camera_option,
     )
-    mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
+    mask: Path | None = _option(
+        None,
+        "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of --box or beside it",
+        type=Path,
+    )
     guess: str | float | None = _option(
         None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
     )
@@ -124,6 +128,7 @@ class RegisterOptions:
     unit: str = _option(
         "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
     )
+    unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
         None,
         "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
@@ -243,6 +248,9 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
     from ..utils.checks import check_numbers, check_pose
 
     content = read_json(path, dict, "docs/guides/known-pose.md")
+    if content.get("frame") == "world":
+        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
+        raise InvalidInputError(message, subject=path)
     if "rotation" in content and content.get("translation", ...) is None:
         message = "a result without a translation, as of a photograph without a camera; register with --camera first"
         raise InvalidInputError(message, subject=path)
@@ -291,8 +299,25 @@ def _open_bank(
         loaded = load_mesh(mesh, unit=options.unit, up=options.up)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
+    _check_bank(options, bank, mesh)
+    return bank
+
+
+def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
+    """Refuse options that are about the mesh and that the bank was not built with."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    unit = mesh_unit(bank.mesh)
+    up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if options.unit_is_given and options.unit != unit:
+        kind = f"with --unit {unit}" if unit else "without a unit"
+        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
+        raise BankError(message, subject=path)
+    if options.up not in (None, up):
+        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
+        raise BankError(message, subject=path)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
-    return bank
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)

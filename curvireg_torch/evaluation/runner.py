@@ -133,8 +133,8 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
         if isinstance(error, LostObjectError) and error.detection is not None:
             places = {"detection": places_document(error.detection), "inputs": {"picture": photo.facts()}}
         return failed_row(error, seconds=seconds, **places)
-    renderer = registrar.of_model(found.model).describer.renderer
-    write_file(picture, thumbnail(renderer, found.projection, found.image, found.box.tolist()))
+    describer = registrar.of_model(found.model).describer
+    write_file(picture, thumbnail(describer, found.projection, found.image, found.box.tolist()))
     return {"status": "ok", "message": "", **found.document}
 
 

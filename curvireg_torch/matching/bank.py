@@ -1,5 +1,6 @@
 """A bank of rendered views of a mesh, described once, stored as safetensors, and matched many times."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
 from functools import cached_property
@@ -16,7 +17,7 @@ from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.viewpoint import ViewSphere, up_rotation
-from ..mesh import has_colours, mesh_symmetries
+from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
 from ..mesh.colours import SurfaceColours, surface_colours
 from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
@@ -217,6 +218,7 @@ class ViewBank:
             "mesh": str(self.mesh.metadata.get("file_name", "")),
             "unit": mesh_unit(self.mesh) or "",
             "up": mesh_up(self.mesh),
+            "warnings": json.dumps([asdict(warning) for warning in mesh_warnings(self.mesh)]),
             "checksum": tensor_digest(contents, size=16),
         }
         write_tensors(Path(path), contents, metadata)
@@ -247,6 +249,8 @@ class ViewBank:
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
             tensors["descriptors"] = tensors["descriptors"].float()
             mesh = _mesh(tensors, metadata["unit"], metadata["up"])
+            noticed = json.loads(metadata.get("warnings", "[]"))
+            mesh.metadata["warnings"] = tuple(MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed)
             _check_contents(views, pipeline.bank, tensors)
         except BankError:
             raise
@@ -291,7 +295,7 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
         surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
         surface.check(len(mesh.faces))
         mesh.metadata["colours"] = surface
-    else:
+    if not has_colours(mesh):
         check_symmetries(mesh_symmetries(mesh))
     return mesh
 
