@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen
+from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, make_server
 
 
 async def page(scope, _, send):
@@ -54,6 +54,55 @@ def test_a_page_answers_to_its_own_names_and_origins_only():
     for host in ("192.168.1.7:80", "[fe80::1]:80", "bench"):
         assert status("0.0.0.0", host) == 200
     assert (status("bench.lan", "BENCH.lan:80"), status("bench.lan", "192.168.1.7")) == (200, 400)
+
+
+def test_ipv6_addresses_are_hosts_in_any_spelling():
+    for host in ("fe80::1", "FE80:0::1", "[fe80::1]", "fe80::1%eth0"):
+        assert status(host, "[fe80::1]:8080") == status(host, "[fe80:0:0::1]") == 200, host
+        for other in ("[fe80::2]:8080", "fe80", "[fe80::1", "fe80::1", "[]", "127.0.0.1", "[::1]"):
+            assert status(host, other) == 400, other
+    assert status("::1", "[::1]:8080") == status("0:0::1", "localhost:9") == 200
+    assert status("::1", "evil.example") == 400
+    for host in ("::", "0::0", "[::]"):
+        assert status(host, "bench:80") == 200
+
+
+def test_a_host_header_is_a_name_and_a_port_alone():
+    for header in ("evil@127.0.0.1", "127.0.0.1/x", "127.0.0.1:80:80", "127.0.0.1?", "127.0.0.1#", "127.0.0.1:x"):
+        assert status("127.0.0.1", header) == 400, header
+
+
+@pytest.mark.parametrize(
+    ("host", "shown", "is_warned"),
+    [
+        ("127.0.0.1", "127.0.0.1", False),
+        ("localhost", "localhost", False),
+        ("127.1", "127.1", False),
+        ("::1", "[::1]", False),
+        ("[::1]", "[::1]", False),
+        ("0.0.0.0", socket.gethostname(), True),
+        ("0", socket.gethostname(), True),
+        ("::", socket.gethostname(), True),
+    ],
+)
+def test_the_printed_address_names_the_host(tmp_path, capsys, host, shown, is_warned):
+    with listen(host, 0) as listener:
+        bound, port = listener.getsockname()[:2]
+        server = make_server(listener, host, browser_folder=None)
+    printed = capsys.readouterr()
+    assert re.match(rf"curvireg: http://{re.escape(shown)}:{port}/[\w-]{{20,}}/ ", printed.out)
+    assert ("everyone who reaches this machine" in printed.err) is is_warned
+    assert not list(tmp_path.iterdir())
+    for header in (f"{shown}:{port}", f"[{bound}]:{port}" if ":" in bound else f"{bound}:{port}"):
+        pairs = [(b"host", header.encode())]
+        sent = []
+
+        async def send(message, sent=sent):
+            sent.append(message)
+
+        scope = {"type": "http", "path": "/none", "method": "GET", "headers": pairs, "query_string": b""}
+        asyncio.run(server.config.app(scope, None, send))
+        assert sent[0]["status"] == 404, header
 
 
 def test_every_answer_has_the_security_headers():

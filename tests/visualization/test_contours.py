@@ -55,3 +55,11 @@ def test_contour_layer_draws_occluding_edges_but_no_steep_plane():
     assert orange.any(axis=1).all()
     assert set(np.nonzero(orange)[1]) <= {58, 59, 60, 61}
     assert not colour(contour_layer(facing(3.0, 3.0), CAMERA), ORANGE).any()
+
+
+def test_the_outline_is_drawn_over_the_creases_that_end_at_it():
+    slope = float(np.tan(np.deg2rad(20)))
+    layer = contour_layer(facing(-slope, slope), CAMERA)
+    assert colour(layer, ORANGE)[30:90, 58:62].any(axis=1).all()
+    for row in (15, 104):
+        assert colour(layer, GREEN)[row, 15:105].all(), "without a gap where the crease ends"
