@@ -101,7 +101,9 @@ MAX_MESH_LINES = 50_000_000  #: Lines of a text file with polygons; each takes s
 MAX_MESH_COORDINATE = 1e12
 #: Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views
 MIN_MESH_EXTENT = 1e-6
-MAX_MESH_PARTS = 10_000  #: Nodes with a mesh in a glTF scene
+#: Nodes with a mesh in a glTF scene; parts, materials and libraries of an OBJ file; files that a mesh names
+MAX_MESH_PARTS = 10_000
+MAX_TEXTURE_PIXELS = 1 << 28  #: Pixels of all textures of a mesh together: 16 of 4096 x 4096
 #: Sum of squared corners of all concave faces, which bounds the time of their division: a million quads, or five faces
 #: of 2000 corners
 MAX_POLYGON_WORK = 20_000_000

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from dataclasses import field as dataclass_field
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,7 +24,7 @@ from .filters import (
     MultiScaleCurvilinearSaliency,
     MultiScaleFocusCurves,
 )
-from .geometry import ViewSphere, sample_views, uniform_views
+from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
 from .utils.checks import check_option, check_positive
@@ -37,10 +38,12 @@ CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each cal
 FIELDS: dict[str, Callable[[], nn.Module]] = {
     "learned": LearnedCurvilinearSaliency,
     "focus": MultiScaleFocusCurves,
+    "MFC": partial(MultiScaleFocusCurves, mode="reblur-saliency", saliency_weight=0.0),
     "saliency": MultiScaleCurvilinearSaliency,
     "gradient": ImageGradient,
 }
-"""Photograph filters by name: modules that are built without arguments."""
+"""Photograph filters by name: modules that are built without arguments. "MFC" is the paper's, "focus" the same weighted
+by CS, with the exact formula of the blur."""
 
 DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
     "CS": DepthCurvilinearSaliency,
@@ -58,12 +61,14 @@ class ViewPolicy:
     """Which viewpoints a bank contains.
 
     Attributes:
-        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far below. "given": the
-            views were passed by the caller.
+        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far below. "paper": the
+            paper's grid, see :func:`curvireg_torch.geometry.paper_views`. "given": the views were passed by the caller.
         directions, theta_step: of "any": number of viewing directions on the sphere, and degrees between in-plane
             rotations.
         azimuth_step, elevations: of "upright", degrees.
-        distance: of the camera from the object's centre, in object radii.
+        distance: of the camera from the object's centre, in object radii; not of "paper".
+        frame: in which azimuth and elevation are measured. "own": the mesh's. "principal": that of its principal axes,
+            see :func:`curvireg_torch.mesh.normalization_transform`. Poses are reported in the mesh's own frame.
 
     Example:
         >>> len(ViewPolicy().sphere()), len(ViewPolicy(pose="upright").sphere())
@@ -76,21 +81,25 @@ class ViewPolicy:
     azimuth_step: float = 10.0
     elevations: tuple[float, ...] = (-10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
     distance: float = DEFAULT_DISTANCE
+    frame: str = "own"
 
     def __post_init__(self) -> None:
-        check_option(self.pose, ("any", "upright", "given"), "pose")
+        check_option(self.pose, ("any", "upright", "paper", "given"), "pose")
+        check_option(self.frame, ("own", "principal"), "frame")
         check_positive(self.theta_step, "theta_step")
         object.__setattr__(self, "elevations", tuple(float(e) for e in self.elevations))
 
     def key_fields(self) -> dict[str, Any]:
         """The attributes that decide the viewpoints; the others belong to another ``pose``."""
         names = {"any": ("directions", "theta_step", "distance"), "upright": ("azimuth_step", "elevations", "distance")}
-        return {name: getattr(self, name) for name in ("pose", *names.get(self.pose, ()))}
+        return {name: getattr(self, name) for name in ("pose", "frame", *names.get(self.pose, ()))}
 
     def sphere(self, up: str = "z") -> ViewSphere:
         """The viewpoints; ``up`` is the axis of the mesh that points up, for "upright"."""
         if self.pose == "given":
             raise InvalidInputError("views: the views of this pipeline were passed by the caller; pass them again")
+        if self.pose == "paper":
+            return paper_views().for_up(up)
         if self.pose == "upright":
             grid = sample_views(azimuth_step=self.azimuth_step, elevations=self.elevations, distances=[self.distance])
             return grid.for_up(up)
@@ -171,7 +180,7 @@ class Pipeline:
         terms: ranking terms, each at most once.
         box_jitter: error that boxes are allowed, as a fraction of their longer side in [0, 0.45]; 0: exact boxes.
         hypotheses: distinct views that are carried through search and contour fit.
-        search: search around hypotheses in small rotation steps.
+        search: the paper's search between the coherent ones of the three best views, without contour fit.
         contours: fit the mesh's contours to the photograph's edges.
         detection: how boxes that are not given are found.
 
@@ -207,6 +216,8 @@ class Pipeline:
             raise InvalidInputError(f"terms: {message}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
+        if self.search and self.contours:
+            raise InvalidInputError("search: the paper's search takes the place of the contour fit; set contours=False")
         jittered_boxes(torch.ones(0, 4), self.box_jitter)  # checks box_jitter
 
     def with_pose_prior(self, pose: str) -> "Pipeline":
@@ -318,16 +329,19 @@ PRESETS: dict[str, Pipeline] = {
     "classical": Pipeline(field="focus", terms=_CLASSICAL_TERMS),
     "fast": Pipeline(terms=_CLASSICAL_TERMS, box_jitter=0.0, contours=False),
     "paper": Pipeline(
-        bank=BankSettings(image_size=256, sigma=1.0, formula="paper", camera="orthographic"),
-        field="focus",
-        terms=(Correlation(whitening="bank"), Repeatability(mode="paper")),
+        views=ViewPolicy(pose="paper", frame="principal"),
+        bank=BankSettings(formula="paper", camera="orthographic"),
+        field="MFC",
+        terms=(Correlation(whitening="paper"), Repeatability(mode="paper")),
         box_jitter=0.0,
+        hypotheses=1,
         search=True,
+        contours=False,
     ),
 }
 """``learned``: :class:`LearnedCurvilinearSaliency` as the photograph's field, and the appearance term; ``classical``:
 focus curves, nothing learned; ``fast``: the learned field alone, without box jitter and contour fit; ``paper``:
-the paper's own settings, as far as it states them."""
+the paper to the letter, with none of our stages."""
 
 
 def preset_named(name: str) -> Pipeline:

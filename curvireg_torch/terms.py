@@ -197,13 +197,17 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class Correlation(Term):
-    """S_hog: normalised correlation of descriptors, the best over the jittered crops.
+    r"""S_hog: how well descriptors D agree, the best over the jittered crops.
+
+    With the mean :math:`\mu` and the covariance :math:`\Sigma` of the bank's views, which is shrunk (Ledoit-Wolf) where
+    a bank has fewer views than a descriptor has entries, the raw score is
+
+    - ``"none"``: the cosine of both descriptors, without the two;
+    - ``"bank"``: the cosine of :math:`\Sigma^{-1/2}(D_{view} - \mu)` and :math:`\Sigma^{-1/2}(D_{query} - \mu)`;
+    - ``"paper"``: :math:`(D_{view} - \mu)^T \Sigma^{-1} D_{query}`, as the paper prints it.
 
     Attributes:
-        whitening: "none", or "bank": both descriptors are whitened by the mean mu and the covariance Sigma of the
-            bank's views before the cosine. The paper scores (D_view - mu)^T Sigma^-1 D_query. Here the photograph's
-            descriptor is centred too, lengths are divided out, and Sigma is shrunk (Ledoit-Wolf), because a bank has
-            fewer views than a descriptor has entries.
+        whitening: which of these.
     """
 
     name: ClassVar[str] = "hog"
@@ -211,19 +215,26 @@ class Correlation(Term):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_option(self.whitening, ("none", "bank"), "whitening")
+        check_option(self.whitening, ("none", "bank", "paper"), "whitening")
 
     def build(self, views: Any) -> Comparison:
-        whitening = None if self.whitening == "none" else Whitening(*ledoit_wolf(views.descriptors))
+        whitening: Whitening | None = None if self.whitening == "none" else views.whitening
 
-        def normalized(descriptors: Tensor) -> Tensor:
-            return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
+        def described(descriptors: Tensor) -> Tensor:
+            if whitening is not None:
+                descriptors = whitening(descriptors)
+            return descriptors if self.whitening == "paper" else F.normalize(descriptors, dim=1)
 
-        known = normalized(views.descriptors)
+        known = described(views.descriptors)
+        # (x - mu)^T Sigma^-1 y, where :class:`Whitening` has centred y as well
+        offset = None
+        if whitening is not None and self.whitening == "paper":
+            offset = whitening(torch.zeros_like(views.descriptors[:1]))
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
-            queries = normalized(query.descriptors.flatten(0, 1)).to(known.dtype)
+            queries = described(query.descriptors.flatten(0, 1)).to(known.dtype)
+            queries = queries if offset is None else queries - offset
             return (queries @ known.T).float().view(B, K, len(known)).amax(dim=1)
 
         return compare
@@ -343,9 +354,10 @@ class Appearance(Term):
     with colours is rendered in grey and in its colours, and the better match counts for each view: a print
     distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines.
 
-    A bank of up to ``exhaustive_limit`` views stores the features of all its views. In a larger bank only the best
-    distinct views of the other terms are compared, ``top`` of them, at least ``min_angle`` degrees apart; every other
-    view gets the score of the nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. Of a larger bank a fixed packing is
+    compared, with views at least ``min_angle`` degrees apart: of its cells, the ``top`` that hold the best views of the
+    other terms. Every other view gets the score of the nearest compared view, and NaN as raw score.
+    ``weights`` is the digest of the network's.
     """
 
     name: ClassVar[str] = "appearance"

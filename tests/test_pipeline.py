@@ -9,7 +9,7 @@ from curvireg_torch import Pipeline, Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
-from curvireg_torch.geometry import sample_views
+from curvireg_torch.geometry import paper_views, sample_views
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
 from curvireg_torch.terms import TERMS, Correlation, Repeatability
@@ -50,14 +50,18 @@ def test_presets_have_the_stated_settings():
     assert isinstance(PRESETS["learned"].photograph_field(), LearnedCurvilinearSaliency)
     paper = PRESETS["paper"]
     assert (paper.bank.camera, paper.bank.formula) == ("orthographic", "paper")
-    assert paper.terms == (Correlation(whitening="bank"), Repeatability(mode="paper"))
+    assert paper.views == ViewPolicy(pose="paper", frame="principal")
+    assert paper.terms == (Correlation(whitening="paper"), Repeatability(mode="paper"))
+    field = paper.photograph_field()
+    assert (field.saliency_weight, field.mode) == (0.0, "reblur-saliency")
     assert [name for name, preset in PRESETS.items() if preset.search] == ["paper"]
 
 
 def test_json_contains_every_setting():
     base = Pipeline()
     settings = [{"field": "focus", "weights": ""}, {"terms": base.terms[:2]}, {"box_jitter": 0.2}, {"weights": "0123"}]
-    settings += [{"hypotheses": 6}, {"search": True}, {"contours": False}]
+    settings += [{"hypotheses": 6}, {"search": True, "contours": False}, {"contours": False}]
+    settings += [{"views": ViewPolicy(pose="paper")}, {"views": ViewPolicy(frame="principal")}]
     changed = [base.with_pose_prior("upright"), *(replace(base, **setting) for setting in settings)]
     for part, names in {
         "views": ("directions", "theta_step", "azimuth_step", "distance"),
@@ -128,3 +132,6 @@ def test_view_policy_sphere():
     assert upright.distance.tolist() == [3.0] * 4
     with pytest.raises(InvalidInputError, match="passed by the caller"):
         ViewPolicy(pose="given").sphere()
+    assert torch.equal(ViewPolicy(pose="paper").sphere().rotations, paper_views().rotations)
+    with pytest.raises(InvalidInputError, match="frame"):
+        ViewPolicy(frame="mine")

@@ -16,7 +16,7 @@ from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
 from . import commands, follow, register
-from .options import Parser, join_numbers
+from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
 
@@ -51,6 +51,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     arguments.argv = list(argv)
     if hasattr(arguments, "paths") and (problem := register.complete(arguments)):
         parser.error(f"register: {problem}")
+    if problem := ignored_option(arguments):
+        parser.error(problem)
     return arguments
 
 

@@ -12,7 +12,18 @@ from ..evaluation.opening import whole_number
 from ..evaluation.registry import DATASETS
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
-from .options import MESH, METHOD, PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
+from ..version import __version__
+from .options import (
+    MESH,
+    METHOD,
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    check_viewer,
+    input_files,
+    register_options,
+)
 
 LOCAL = "127.0.0.1"
 PICTURES = {
@@ -49,9 +60,11 @@ def build_bank(arguments: argparse.Namespace) -> None:
     check_given([], [arguments.mesh])
     if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
         raise InvalidInputError(f"--out {arguments.out}: expected the name of a file that ends in .safetensors")
-    check_writable(arguments.out.parent, "--out")
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    from ..evaluation.outputs import check_output_file
+
+    check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     from ..matching import ViewBank
     from ..mesh import load_mesh
     from ..utils.threads import one_torch_thread
@@ -211,7 +224,9 @@ def draw(arguments: argparse.Namespace) -> None:
     check_given([arguments.photo], [arguments.mesh])
     if arguments.out.suffix.lower() not in FORMATS:
         raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
-    check_writable(arguments.out.parent, "--out")
+    from ..evaluation.outputs import check_output_file
+
+    check_output_file(arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg")
     from ..data import read_photo
     from ..evaluation.opening import open_registrar
     from ..evaluation.photograph import register_entry
@@ -230,7 +245,9 @@ def draw(arguments: argparse.Namespace) -> None:
         else:
             figure = found.plot()
     content = BytesIO()
-    figure.savefig(content, format=arguments.out.suffix[1:].lower(), dpi=150)
+    kind = arguments.out.suffix[1:].lower()
+    author = {"Software" if kind == "png" else "Creator": f"curvireg_torch {__version__}"}
+    figure.savefig(content, format=kind, dpi=150, metadata=author)
     write_file(arguments.out, content.getvalue())
     print(arguments.out)
 
@@ -248,8 +265,8 @@ def add_demo(commands: Any) -> None:
 def demo(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
     out = arguments.out
-    check_writable(out, "--out")
     from ..data import read_photo
+    from ..evaluation.outputs import output_folder
     from ..evaluation.photograph import register_entry
     from ..geometry import Camera, rotation_error
     from ..synthetic import demo_scene
@@ -257,7 +274,7 @@ def demo(arguments: argparse.Namespace) -> None:
     from ..visualization.encoding import png, to_uint8
     from .register import opened_registrar, print_result
 
-    with one_torch_thread():
+    with one_torch_thread(), output_folder(out, "demo", inputs=input_files(arguments)):
         scene = demo_scene(arguments.seed)
         write_file(out / "mesh.ply", scene.mesh.export(file_type="ply"))
         write_file(out / "photo.png", png(to_uint8(scene.image)))
@@ -273,7 +290,7 @@ def demo(arguments: argparse.Namespace) -> None:
         truth = {"rotation": R.tolist(), "translation": t.tolist()}
         found.document.update(rotation_error_deg=degrees, translation_error=fraction, truth=truth)
         found.document["inputs"]["seed"] = arguments.seed
-        found.save(out)
+        found.write(out)
     print_result(found.document, out)
     print(
         f"error against the truth: rotation {degrees:.1f} degrees, translation {100 * fraction:.1f} % of the distance"

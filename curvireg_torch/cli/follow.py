@@ -6,17 +6,27 @@ import json
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
 from ..evaluation.opening import CAMERA_OPTIONS
-from ..utils.choices import VIDEOS, check_given
-from ..utils.files import check_writable
-from .options import PHOTOGRAPH, add_command, add_limits, add_options, check_viewer, register_options
+from ..utils.choices import check_given
+from ..utils.files import CsvFile
+from .options import (
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    check_viewer,
+    input_files,
+    register_options,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,6 +37,8 @@ if TYPE_CHECKING:
     Frame = tuple[str, Tensor | ImageError]  # its name, and its pixels or why they cannot be read
 
 FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camera that does not tell
+
+SCORES = ("confidence", "edge_support", "message")
 
 STATUSES = ("ok", "unsure", "lost", "failed")
 
@@ -73,37 +85,78 @@ def run(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("follow: give --out DIR, --show or --json")
     if arguments.show:
         check_viewer("follow --show")
+    with ExitStack() as stack:
+        if out is not None:
+            from ..evaluation.outputs import output_folder
+
+            frames = [] if live else _files(Path(source))
+            inputs = input_files(arguments, arguments.mesh, *frames)
+            stack.enter_context(output_folder(out, "follow", inputs=inputs))
+        stack.enter_context(one_torch_thread())
+        tally = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
+    files = ""
     if out is not None:
-        check_writable(out, "--out")
-    with one_torch_thread():
-        poses, seconds, video = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
-    counts = {status: sum(pose["status"] == status for pose in poses) for status in STATUSES}
-    summary = ", ".join([f"{counts['ok']} of {len(poses)} believed", *(f"{counts[s]} {s}" for s in STATUSES[1:])])
-    after_first = seconds[1:]  # the first frame is registered
-    rate = f", {len(after_first) / sum(after_first):.1f} frames per second" if after_first else ""
-    files = "" if out is None else f"; see {out}/results.csv" + (f" and {video}" if video else "")
-    print(f"{len(poses)} frames: {summary}{rate}{files}", file=sys.stderr if arguments.json else sys.stdout)
-    if not counts["ok"] and not counts["unsure"]:
-        reason = f"; the first: {poses[0]['message']}" if poses else ""
+        video = out / "overlay.mp4"
+        files = f"; see {out}/results.csv" + (f" and {video}" if video.is_file() else "")
+    print(f"{tally}{files}", file=sys.stderr if arguments.json else sys.stdout)
+    if not tally.counts["ok"] and not tally.counts["unsure"]:
+        reason = f"; the first: {tally.first_message}" if tally.frames else ""
         message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
         raise InvalidInputError(message, subject=source)
 
 
+def _files(source: Path) -> list[Path]:
+    """The files that are read: photographs of a folder, or a video."""
+    from ..evaluation.lists import find_photographs
+
+    return find_photographs(source) if source.is_dir() else [source]
+
+
+@dataclass
+class Tally:
+    """What became of the frames so far: all that is kept of them in memory, since a live video may last for days."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    first_message: str = ""  # why the first frame has no pose
+    seconds_after_first: float = 0.0  # the first frame is registered
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.counts.total()
+
+    def add(self, pose: dict[str, Any], seconds: float) -> None:
+        """Count a frame that took ``seconds``."""
+        if self.frames:
+            self.seconds_after_first += seconds
+        else:
+            self.first_message = pose.get("message", "")
+        self.counts[pose["status"]] += 1
+
+    def __str__(self) -> str:
+        others = ", ".join(f"{self.counts[status]} {status}" for status in STATUSES[1:])
+        rate = ""
+        if self.frames > 1:
+            rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
+        return f"{self.frames} frames: {self.counts['ok']} of {self.frames} believed, {others}{rate}"
+
+
 def _follow(
     options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool, show: bool
-) -> tuple[list[dict[str, Any]], list[float], Path | None]:
-    """The poses in ``out / "results.csv"``, which is also written after an interruption, seconds that each took, and
-    path of the overlay, if there is one."""
+) -> Tally:
+    """Follow the object; each pose is in ``out / "results.csv"`` once it is known."""
     from tqdm import tqdm
 
+    from ..evaluation.lists import POSE_COLUMNS
     from ..evaluation.opening import open_registrar
     from ..visualization import OverlayVideo
 
     frames, count, fps = _live(source) if live else _frames(options.photos[0])
     fps = fps if 0 < fps < 1000 else FOLDER_FPS
     registrar = open_registrar(options, options.meshes)
-    poses: list[dict[str, Any]] = []
-    seconds: list[float] = []
+    tally = Tally()
+    columns = ["photo", "status", *POSE_COLUMNS, *SCORES]
+    table = None if out is None else CsvFile(out / "results.csv", columns)
     start, video, page = time.monotonic(), None, None
     try:
         with ExitStack() as stack:
@@ -115,10 +168,14 @@ def _follow(
                 page = stack.enter_context(LivePage(registrar))
             bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
             for name, shown, result, took in _poses(options, registrar, bar):
-                seconds.append(took)
-                poses.append({"frame": name, "seconds": round(time.monotonic() - start, 4), **_document(result)})
+                pose = {"frame": name, "seconds": round(time.monotonic() - start, 4), **_document(result)}
+                if table is not None:
+                    if not tally.frames:  # an older one does not belong to these poses
+                        (table.path.parent / "overlay.mp4").unlink(missing_ok=True)
+                    table.add(_cells(pose))
+                tally.add(pose, took)
                 if as_json:
-                    print(json.dumps(poses[-1], allow_nan=False), flush=True)
+                    print(json.dumps(pose, allow_nan=False), flush=True)
                 if video is not None:
                     video.add(shown, result)
                 if page is not None:
@@ -126,10 +183,7 @@ def _follow(
     except KeyboardInterrupt:
         if not live:  # a file has an end
             raise
-    finally:
-        if poses and out is not None:
-            _write_table(out, poses)
-    return poses, seconds, None if video is None or not video.path.is_file() else video.path
+    return tally
 
 
 def _poses(
@@ -173,7 +227,7 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
 
     source, photo = options.photos[0], Photo(image, 1, None, ())
     if source.is_dir():
-        source = next(find_photographs(source, 1, source))
+        source = find_photographs(source)[0]
         photo = read_photo(source) if options.guess == "exif" else photo
     camera, _ = camera_of(options.entry(source), photo)
     assert camera is not None  # the command refuses to start without one
@@ -183,12 +237,12 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
     """The frames of a video or a folder, their number, and frames per second."""
     from ..data import Video, read_photo
-    from ..evaluation.lists import find_photographs
+    from ..evaluation.lists import find_photographs, is_video
 
-    if path.suffix.lower() in VIDEOS and path.is_file():
+    if is_video(path):
         video = Video(path)
         return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, video.fps
-    photos = list(find_photographs(path, 1, path))
+    photos = find_photographs(path)
 
     def read() -> Iterator["Frame"]:
         for photo in photos:
@@ -253,13 +307,9 @@ def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:
     return {"status": "ok" if believed else "unsure", **pose, **scores}
 
 
-def _write_table(out: Path, poses: list[dict[str, Any]]) -> None:
-    from ..evaluation.lists import POSE_COLUMNS
-    from ..utils.files import write_csv
-
-    rows: list[list[Any]] = [["photo", "status", *POSE_COLUMNS, "confidence", "edge_support", "message"]]
-    for pose in poses:
-        numbers = [*itertools.chain(*pose["rotation"]), *pose["translation"]] if "rotation" in pose else [""] * 12
-        more = [pose.get(name, "") for name in ("confidence", "edge_support", "message")]
-        rows.append([pose["frame"], pose["status"], *numbers, *more])
-    write_csv(out / "results.csv", rows)
+def _cells(pose: dict[str, Any]) -> list[Any]:
+    """The row of a frame in ``results.csv``."""
+    numbers = [""] * 12
+    if "rotation" in pose:
+        numbers = [*itertools.chain(*pose["rotation"]), *pose["translation"]]
+    return [pose["frame"], pose["status"], *numbers, *(pose.get(name, "") for name in SCORES)]

@@ -1,6 +1,8 @@
 """``curvireg register PHOTO... MESH``."""
 
 import argparse
+import json
+import os
 import sys
 import tempfile
 import time
@@ -12,9 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
 from ..evaluation.opening import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
-from ..utils.choices import check_given, is_one_photograph
-from ..utils.files import check_writable
-from .options import PHOTOGRAPH, add_command, add_limits, add_options, numbers_among, register_options
+from ..utils.choices import VIDEOS, check_given, is_one_photograph
+from .options import (
+    PHOTOGRAPH,
+    add_command,
+    add_limits,
+    add_options,
+    input_files,
+    numbers_among,
+    register_options,
+)
 
 if TYPE_CHECKING:
     from ..evaluation.lists import Counts
@@ -109,10 +118,17 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
         return f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
-    if arguments.camera is not None and arguments.guess is not None:
-        return "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG"
     if (arguments.box or arguments.mask) and arguments.instances is not None:
         return "--instances applies only without a box; leave --box and --mask out"
+    if arguments.instances is not None and (arguments.start or rig is not None):
+        return "--start and --views are of one object; leave --instances out"
+    if arguments.top is not None and arguments.start:
+        return "--start refines one pose; leave --top out"
+    alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
+    if alone and arguments.jobs > 1:
+        return "--jobs: several processes share several photographs; leave it out for one result"
+    if arguments.every > 1 and not any(photo.suffix.lower() in VIDEOS for photo in arguments.photos):
+        return "--every applies to the frames of videos; leave it out"
     if arguments.start is not None and (arguments.box or arguments.mask or listed or len(arguments.meshes) > 1):
         return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
@@ -121,8 +137,6 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
-    if limits == ["front"] and not listed:
-        return "--front limits nothing by itself; give --azimuth, for instance"
     if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
         return f"--distance: needs a camera; give {CAMERA_OPTIONS}"
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
@@ -137,7 +151,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.store import run_processes
+    from ..evaluation.store import STARTED, run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
@@ -148,9 +162,8 @@ def run(arguments: argparse.Namespace) -> int:
             reliable = register(options, arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if run_processes(arguments.jobs, arguments.argv):
-        return 0
-    with one_torch_thread(), tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) if arguments.out is None else arguments.out
+        return _strict_code(*_counted(arguments.out)) if arguments.strict else 0
+    with one_torch_thread(), _output(arguments) as out:
         counts = _register_several(options, arguments, out)
         if counts is None:  # another process writes the tables
             return 0
@@ -166,9 +179,46 @@ def run(arguments: argparse.Namespace) -> int:
     if not counts.ok:
         message = "no photograph could be registered; the message of each gives the reason"
         raise InvalidInputError(message, subject=arguments.list or "")
-    if not arguments.strict:
+    if not arguments.strict or STARTED in os.environ:  # the process that started this one reports
         return 0
-    return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
+    return _strict_code(counts.reliable, len(counts.failures))
+
+
+def _strict_code(reliable: int, failed: int) -> int:
+    """The exit code of ``--strict`` for numbers of photographs."""
+    if not reliable:
+        return NONE_RELIABLE
+    return SOME_FAILED if failed else 0
+
+
+def _counted(out: Path) -> tuple[int, int]:
+    """Numbers of reliable and of failed photographs among results that other processes wrote."""
+    lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
+    reliable = sum(bool(row.get("reliable")) for row in rows)
+    return reliable, sum(row["status"] != "ok" for row in rows)
+
+
+@contextmanager
+def _output(arguments: argparse.Namespace) -> Iterator[Path]:
+    """The folder of the results, or one for the time being."""
+    if arguments.out is not None:
+        yield arguments.out
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+@contextmanager
+def _one_result(arguments: argparse.Namespace, *inputs: Path) -> Iterator[None]:
+    """Context in which the files of one result may be written."""
+    if arguments.out is None:
+        yield
+        return
+    from ..evaluation.outputs import output_folder
+
+    with output_folder(arguments.out, "register", inputs=input_files(arguments, *inputs)):
+        yield
 
 
 def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
@@ -181,19 +231,19 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     out, path = arguments.out, options.photos[0]
     photo, entry = read_photo(path), options.entry(path)
     check_entry(entry, photo)
-    if out is not None:
-        check_writable(out, "--out")
-    if options.progress and not (options.box or options.mask or options.start):
-        print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
-    with opened_registrar(options) as (registrar, seconds):
-        try:
-            found = register_entry(entry, photo, registrar, bank_seconds=seconds)
-        except LostObjectError as error:
-            if out is not None:
-                write_lost(out, str(error))
-            raise
-    if out is not None:
-        found.save(out)
+    with _one_result(arguments, *entry.files):
+        if options.progress and not (options.box or options.mask or options.start):
+            print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+        with opened_registrar(options) as (registrar, seconds):
+            try:
+                found = register_entry(entry, photo, registrar, bank_seconds=seconds)
+            except LostObjectError as error:
+                if out is not None:
+                    write_lost(out, str(error))
+                raise
+        if out is not None:
+            found.write(out)
+        _write_pose(arguments, found.document)
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks, inputs = list(photo.notes), found.document["inputs"]
@@ -215,13 +265,13 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..registration.result import view_in_words
 
     out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
-    if out is not None:
-        check_writable(out, "--out")
-    with opened_registrar(options) as (registrar, seconds):
-        result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
-    document["mesh"] = str(options.meshes[result.model])
-    if out is not None:
-        write_views(out, document, registrar, result, photographs)
+    with _one_result(arguments, *options.meshes, *(view.photo for view in rig)):
+        with opened_registrar(options) as (registrar, seconds):
+            result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
+        document["mesh"] = str(options.meshes[result.model])
+        if out is not None:
+            write_views(out, document, registrar, result, photographs)
+        _write_pose(arguments, document)
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["views"]:
@@ -230,13 +280,18 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     return result.reliable
 
 
-def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
-    """Print the result, and write it in the format of another tool."""
+def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Write the pose in the format of another tool, if one is asked for."""
     from ..evaluation.result_files import write_pose_stamped
-    from ..evaluation.store import to_json
 
     if arguments.format:
         write_pose_stamped(arguments.out / "pose.yaml", document)
+
+
+def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+    """Print the result."""
+    from ..evaluation.store import to_json
+
     if arguments.json:
         print(to_json(document), end="")
     else:
@@ -250,13 +305,13 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
     from ..pipeline import field_digest
 
     if arguments.list is None:
-        check_writable(out, "--out")
-        photos = list_photographs(options, every=arguments.every, frames=out / "frames")
+        photos = list_photographs(options, every=arguments.every)
+        source = [str(path.resolve()) for path in options.photos]
         if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
             print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     else:
         photos = read_list(arguments.list, options)
-        check_writable(out, "--out")
+        source = [str(arguments.list.resolve())]
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
     names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
@@ -265,7 +320,8 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
         "field": None if options.network is None else field_digest(options.network),
         **{name: getattr(options, name) for name in names},
     }
-    return register_list(photos, out, partial(open_registrar, options), settings=settings, progress=options.progress)
+    how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}
+    return register_list(photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how)
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:

@@ -6,7 +6,7 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 
 from ._base import ObjectDataset
 from .bop import BOPDataset
-from .camera_files import load_camera
+from .calibrations import load_camera
 from .images import Photo, Video, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .pose_folder import PoseFolder

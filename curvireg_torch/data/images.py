@@ -212,14 +212,23 @@ class Video:
         file.release()
 
     def __iter__(self) -> Iterator[tuple[int, Tensor]]:
+        for number, file in self._grabbed():
+            known, pixels = file.retrieve()
+            if not known:
+                raise ImageError(f"frame {number} cannot be read; save the video again", subject=self.path)
+            yield number, torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1)))
+
+    def numbers(self) -> list[int]:
+        """Return the numbers of the frames that are yielded, which are counted: ``count`` may be wrong."""
+        return [number for number, _ in self._grabbed()]
+
+    def _grabbed(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
+        """Yield each frame's number, and the file that it can be retrieved from."""
         file, number = self._open(), 0
         try:
             while file.grab():
                 if number % self.every == 0:
-                    known, pixels = file.retrieve()
-                    if not known:
-                        raise ImageError(f"frame {number} cannot be read; save the video again", subject=self.path)
-                    yield number, torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1)))
+                    yield number, file
                 number += 1
             if number == 0:
                 raise ImageError("a video without frames; save it again", subject=self.path)

@@ -75,6 +75,8 @@ class Protocol:
         if self.hint != "none":
             self.hint_tolerance()
         check_integer(self.views, "views")
+        if self.seed and str(self) == str(replace(self, seed=0)):
+            raise InvalidInputError("protocol: seed: nothing is drawn at random; leave it out")
         if self.views > 1 and self.hint != "none":
             raise InvalidInputError("protocol: hints are given with one photograph; leave hint or views out")
 
@@ -161,6 +163,7 @@ class Benchmark(ABC):
         thresholds: degrees of the accuracies in the summary.
         groups: name of the groups that are scored by themselves, and key of the group in a sample.
         columns: of the table of predictions.
+        reports: names of the files that are written from all results.
         dataset, protocol: as given.
         samples, entries: annotations without photographs, and what is registered, in the order of the dataset.
 
@@ -176,6 +179,7 @@ class Benchmark(ABC):
     thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
     groups: ClassVar[tuple[str, str]] = ("per_object", "category")
     columns: ClassVar[Sequence[str]] = ()
+    reports: ClassVar[Sequence[str]] = ("summary.json", "predictions.csv", "errors.csv", "index.html")
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
         if protocol.views > 1 and not self.gives_camera:

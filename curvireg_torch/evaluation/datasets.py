@@ -4,6 +4,7 @@ import math
 import platform
 from collections import Counter
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import torch
@@ -19,6 +20,7 @@ from ..utils.files import code_digest, write_file
 from ..version import __version__
 from ..visualization.sheet import SheetEntry, write_sheet
 from .benchmarks import Benchmark, copy_shown, detection_recall
+from .outputs import output_folder
 from .runner import POSE_SOURCES, run_entries, thumbnail_of
 from .store import ResultStore, Row, to_json
 
@@ -67,7 +69,8 @@ def evaluate(
     """
     pipeline = pipeline or PRESETS[DEFAULT]
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
-    pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
+    if pipeline.views.pose != "paper":  # the paper's grid stays, whatever is known
+        pipeline = pipeline.with_pose_prior(benchmark.protocol.pose)
     if limit is not None:
         check_positive(limit, "limit")
     if (out / "results.csv").exists():
@@ -87,15 +90,13 @@ def evaluate(
         banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
         return Registrar(banks, pipeline=pipeline, renderer=renderer)
 
-    store = run_entries(
-        [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error],
-        out,
-        open_registrar,
-        settings=settings,
-        label=benchmark.name,
-        progress=progress,
-    )
-    return None if store is None else report(benchmark, store, settings, limit)
+    entries = [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error]
+    how: Row = {"settings": settings, "label": benchmark.name, "progress": progress, "reports": benchmark.reports}
+    files = chain.from_iterable(entry.files for entry in entries)
+    source = ["{dataset} {root} {split}".format_map(settings)]
+    with output_folder(out, "evaluate", inputs=files, source=source):
+        store = run_entries(entries, out, open_registrar, **how)
+        return None if store is None else report(benchmark, store, settings, limit)
 
 
 def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:

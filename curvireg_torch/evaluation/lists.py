@@ -1,21 +1,24 @@
 """Lists of photographs: CSV files, folders and videos; and their results."""
 
 import glob
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from ..data import Video
-from ..data.camera_files import Calibrations
+from ..data.calibrations import Calibrations
+from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
-from ..utils.files import FindFile, read_csv, write_csv, write_file
-from ..visualization.encoding import png, to_uint8
+from ..utils.files import FindFile, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
+from .outputs import output_folder
 from .photograph import Entry
 from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
@@ -29,6 +32,8 @@ POSE_COLUMNS = (*("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 
 RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
 """Columns of ``results.csv`` after those of the list."""
+
+REPORTS = ("results.csv", "index.html")  # written from all results at the end
 
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 
@@ -90,32 +95,52 @@ def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, 
     return tuple(numbers)
 
 
-def list_photographs(options: RegisterOptions, *, every: int = 1, frames: Path) -> list[Entry]:
+def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]:
     """The photographs of the options, which have the same box, camera and limits on the pose.
 
-    ``every`` n-th frame of videos is written into the folder ``frames``. Errors are those of :func:`find_photographs`.
+    A photograph is called by its path as it was given, or that of its folder; a frame of a video by the video's path
+    and its number, as in ``left/cam.avi:000012``. So no two of them share a name. ``every`` n-th frame of videos is
+    taken. Errors are those of :func:`find_photographs`, and of :class:`.Video`.
     """
     fours = (BOX, options.box), (CAMERA, None if isinstance(options.camera, Camera) else options.camera)
     numbers = {name: str(v) for names, four in fours for name, v in zip(names, four or [""] * 4, strict=True)}
-    found = [photo for path in options.photos for photo in find_photographs(path, every, frames)]
-    return [replace(options.entry(photo), cells={"photo": str(photo), **numbers}) for photo in found]
+    entries = []
+    for path in options.photos:
+        if is_video(path):
+            common = options.entry(path)
+            entries += [replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)]
+        else:
+            entries += [options.entry(photo) for photo in find_photographs(path)]
+    return [replace(entry, cells={"photo": entry.name, **numbers}) for entry in entries]
 
 
-def find_photographs(path: Path, every: int, frames: Path) -> Iterator[Path]:
-    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frames of a video, or ``path`` itself."""
-    if path.suffix.lower() in VIDEOS and path.is_file():
-        for number, image in Video(path, every=every):
-            frame = frames / f"{path.stem}-{number:06d}.png"
-            write_file(frame, png(to_uint8(image)))
-            yield frame
-    elif path.is_dir() or is_pattern(path):
-        inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
-        photographs = sorted(found for found in inside if found.suffix.lower() in IMAGES and found.is_file())
-        if not photographs:
-            raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
-        yield from photographs
-    else:
-        yield path
+def is_video(path: Path) -> bool:
+    """Whether a path is that of a video file."""
+    return path.suffix.lower() in VIDEOS and path.is_file()
+
+
+def video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
+    """Name of ``every`` n-th frame of a video, and the frame, which is read later."""
+    reader = FrameReader(path, every=every)
+    for number in Video(path, every=every).numbers():
+        yield f"{path}:{number:06d}", VideoFrame(reader, number)
+
+
+def find_photographs(path: Path) -> list[Path]:
+    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frame-2 before frame-10; or ``path``."""
+    if not (path.is_dir() or is_pattern(path)):
+        return [path]
+    inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
+    photographs = [found for found in inside if found.suffix.lower() in IMAGES and found.is_file()]
+    if not photographs:
+        raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
+    return sorted(photographs, key=_counting_order)
+
+
+def _counting_order(path: Path) -> tuple[list[str | int], str]:
+    """Key by which names are in order, and numbers within them by value."""
+    parts = re.split(r"(\d+)", str(path))  # texts and numbers in turn
+    return [int(part) if number % 2 else part for number, part in enumerate(parts)], str(path)
 
 
 def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
@@ -175,17 +200,23 @@ def register_list(
     *,
     settings: Mapping[str, Any],
     progress: bool = True,
+    inputs: Sequence[Path] = (),
+    source: Sequence[str] = (),
 ) -> Counts | None:
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
 
     A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose arguments and errors
-    are the same. Returns None in processes that do not write the tables.
+    are the same. ``inputs`` are files besides those of the entries, and ``source`` is what the entries are of, see
+    :func:`.outputs.output_folder`. Returns None in processes that do not write the tables.
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
     if (out / "summary.json").exists():
         raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
-    store = run_entries(usable, out, open_registrar, settings=settings, label="register", progress=progress)
-    return None if store is None else _write_tables(entries, out, store)
+    files = chain(inputs, chain.from_iterable(entry.files for entry in usable))
+    how: dict[str, Any] = {"settings": settings, "label": "register", "progress": progress, "reports": REPORTS}
+    with output_folder(out, "register several", inputs=files, source=source):
+        store = run_entries(usable, out, open_registrar, **how)
+        return None if store is None else _write_tables(entries, out, store)
 
 
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:

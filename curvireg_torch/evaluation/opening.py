@@ -124,6 +124,7 @@ class RegisterOptions:
     unit: str = _option(
         "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
     )
+    unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
         None,
         "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
@@ -141,8 +142,8 @@ class RegisterOptions:
     )
     preset: str | None = _option(
         None,
-        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without search "
-        f"and contour fit. paper: the published method (default: that of a bank, else {DEFAULT})",
+        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
+        f"contour fit. paper: the published method, to the letter (default: that of a bank, else {DEFAULT})",
         choices=PRESET_NAMES,
     )
     pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)
@@ -243,6 +244,9 @@ def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]
     from ..utils.checks import check_numbers, check_pose
 
     content = read_json(path, dict, "docs/guides/known-pose.md")
+    if content.get("frame") == "world":
+        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
+        raise InvalidInputError(message, subject=path)
     if "rotation" in content and content.get("translation", ...) is None:
         message = "a result without a translation, as of a photograph without a camera; register with --camera first"
         raise InvalidInputError(message, subject=path)
@@ -274,7 +278,7 @@ def open_registrar(
         elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
             pipeline = replace(pipeline, views=banks[0].pipeline.views)
     if not options.refine:
-        pipeline = replace(pipeline, contours=False)
+        pipeline = replace(pipeline, contours=False, search=False)
     if options.top is not None:
         pipeline = replace(pipeline, hypotheses=options.top)
     settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
@@ -291,8 +295,25 @@ def _open_bank(
         loaded = load_mesh(mesh, unit=options.unit, up=options.up)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
+    _check_bank(options, bank, mesh)
+    return bank
+
+
+def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
+    """Refuse options that are about the mesh and that the bank was not built with."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    unit = mesh_unit(bank.mesh)
+    up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if options.unit_is_given and options.unit != unit:
+        kind = f"with --unit {unit}" if unit else "without a unit"
+        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
+        raise BankError(message, subject=path)
+    if options.up not in (None, up):
+        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
+        raise BankError(message, subject=path)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
-    return bank
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
+from ..data.frames import VideoFrame
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
@@ -31,6 +32,7 @@ from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .opening import CAMERA_OPTIONS
+from .outputs import output_folder
 from .result_files import View, write_result
 
 __all__ = ["RegisteredPhotograph", "register"]
@@ -56,6 +58,7 @@ class Entry:
     views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
     as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     label: str = ""  # of a dataset's object: a name that no other object has
+    frame: VideoFrame | None = None  # of the video ``photo``
     error: str = ""  # why the object cannot be registered
 
     def request(self) -> list[Any]:
@@ -66,6 +69,19 @@ class Entry:
         views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
         return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
+
+    def read(self) -> Photo:
+        """The photograph, or the frame; errors are those of :func:`read_photo`."""
+        if self.frame is not None:
+            return Photo(self.frame.read(), 1, None, ())
+        return read_photo(self.photo, as_stored=self.as_stored)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The photographs, meshes and mask that are read."""
+        masks = [Path(self.mask)] if isinstance(self.mask, str | PathLike) else []
+        photos = [self.photo, *(view.photo for view in self.views)]
+        return (*photos, *self.meshes, *masks)
 
     @property
     def key(self) -> str:
@@ -81,12 +97,14 @@ class RegisteredPhotograph(Registration):
         registrar: of the mesh.
         image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the object was found.
         document: the content of ``result.json``.
+        inputs: files that were read.
     """
 
     registrar: Registrar
     image: Tensor
     box: Tensor
     document: dict[str, Any]
+    inputs: tuple[Path, ...] = ()
 
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the box."""
@@ -97,8 +115,18 @@ class RegisteredPhotograph(Registration):
         return plots.picture(self.overlay())
 
     def save(self, folder: str | PathLike[str]) -> None:
-        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does."""
-        write_result(Path(folder), self.document, self.registrar, self, self.image, self.box)
+        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does.
+
+        Raises:
+            InvalidInputError: a file in the way that is an input, or no result of this method or that command.
+            OutputError: a file cannot be written.
+        """
+        with output_folder(Path(folder), "register", inputs=self.inputs):
+            self.write(Path(folder))
+
+    def write(self, folder: Path) -> None:
+        """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has checked."""
+        write_result(folder, self.document, self.registrar, self, self.image, self.box)
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""
@@ -147,8 +175,10 @@ def register(
         (torch.Size([4]), (720, 960, 3))
     """
     name = ""
+    path = Path()
     meshes: tuple[Path, ...] = ()
     if isinstance(image, str | PathLike):
+        path = Path(image)
         name, photo = str(image), read_photo(image)
     else:
         pixels = np.array(image.convert("RGB")) if isinstance(image, Image.Image) else image
@@ -161,7 +191,7 @@ def register(
         meshes = (Path(mesh),)
         mesh = ViewBank.load(mesh) if meshes[0].suffix == ".safetensors" else load_mesh(mesh, unit=unit, up=up)
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
-    entry = Entry(name=name, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
+    entry = Entry(name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
     return register_entry(entry, photo, registrar)
 
 
@@ -227,7 +257,10 @@ def register_entry(
     if source in ("exif", "fov"):  # the error of a guessed camera is unknown
         document["covariance"] = document["standard_deviations"] = None
     box = box.double() if result.corrected_box is None else result.corrected_box
-    return RegisteredPhotograph(**vars(result), registrar=registrar, image=item.image, box=box, document=document)
+    files = entry.files
+    return RegisteredPhotograph(
+        **vars(result), registrar=registrar, image=item.image, box=box, document=document, inputs=files
+    )
 
 
 def register_views(

@@ -72,7 +72,7 @@ def views_picture(registrar: Registrar, result: Registration, views: Sequence[Vi
             box = None if pose.box is None else pose.box.tolist()
             projection = pose.T_cam_from_model, view.camera.matrix
             shown.append((projection, view.image, box, f"{view.name}: {pose.failure or score}"))
-    return png(views_sheet(registrar.of_model(result.model).describer.renderer, shown))
+    return png(views_sheet(registrar.of_model(result.model).describer, shown))
 
 
 def views_glb(registrar: Registrar, result: Registration, views: Sequence[View]) -> bytes:

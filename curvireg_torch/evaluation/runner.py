@@ -12,7 +12,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..data import read_photo
 from ..errors import BankError, CurviregError, InvalidInputError, LostObjectError, MeshError, MissingFileError
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
@@ -43,6 +42,7 @@ def run_entries(
     settings: Mapping[str, Any],
     label: str,
     progress: bool = True,
+    reports: Sequence[str] = REPORTS,
 ) -> ResultStore | None:
     """Register the entries, without ``error`` and of different keys, whose results ``out`` does not hold yet.
 
@@ -50,7 +50,8 @@ def run_entries(
     covers ``settings`` (all that every result depends on), the code of this library, the entry's own request and every
     file of its meshes. Entries of the same meshes follow each other, so that only one bank is in memory, and are
     registered side by side on torch's threads; each row is on disk as soon as it is known. An input that cannot be used
-    makes a row with ``failed`` as ``status`` and does not stop the others.
+    makes a row with ``failed`` as ``status`` and does not stop the others. ``reports``, files that are written from all
+    results, are removed first.
 
     Returns:
         The store, which holds all entries; None in processes that leave the report to the first one.
@@ -66,7 +67,7 @@ def run_entries(
 
     with workers() as group:
         if group.rank == 0:
-            for name in REPORTS:
+            for name in reports:
                 (out / name).unlink(missing_ok=True)
         group.wait()
         store = ResultStore(out, group)
@@ -119,7 +120,7 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
     """The result of an entry; its thumbnail is on disk before."""
     start = time.perf_counter()
     try:
-        photo = read_photo(entry.photo, as_stored=entry.as_stored)
+        photo = entry.read()
     except (CurviregError, OSError) as error:
         return failed_row(error, skipped="unreadable_image")
     if isinstance(registrar, Exception):
@@ -132,8 +133,8 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
         if isinstance(error, LostObjectError) and error.detection is not None:
             places = {"detection": places_document(error.detection), "inputs": {"picture": photo.facts()}}
         return failed_row(error, seconds=seconds, **places)
-    renderer = registrar.of_model(found.model).describer.renderer
-    write_file(picture, thumbnail(renderer, found.projection, found.image, found.box.tolist()))
+    describer = registrar.of_model(found.model).describer
+    write_file(picture, thumbnail(describer, found.projection, found.image, found.box.tolist()))
     return {"status": "ok", "message": "", **found.document}
 
 

@@ -30,6 +30,7 @@ from .crops import whole_image_box as whole_image_box
 from .pose_prior import PosePrior as PosePrior
 from .pose_prior import object_frame as object_frame
 from .viewpoint import ViewSphere as ViewSphere
+from .viewpoint import paper_views as paper_views
 from .viewpoint import rotation_error as rotation_error
 from .viewpoint import rotation_from_viewpoint as rotation_from_viewpoint
 from .viewpoint import sample_views as sample_views

@@ -138,10 +138,12 @@ class ViewSphere:
 
     def for_up(self, up: str) -> "ViewSphere":
         """Return the same views of an object whose axis ``up`` (:func:`up_rotation`) points up, in its own frame."""
-        if up == "z":
-            return self
+        return self if up == "z" else self.in_frame(up_rotation(up))
+
+    def in_frame(self, rotation: Tensor) -> "ViewSphere":
+        """Return the same views in the frame that ``rotation`` (3, 3) turns into the frame of these."""
         exact = rotation_from_viewpoint(self.azimuth.double(), self.elevation.double(), self.theta.double())
-        azimuth, elevation, theta = viewpoint_from_rotation(exact @ up_rotation(up).to(exact.device))
+        azimuth, elevation, theta = viewpoint_from_rotation(exact @ rotation.to(exact))
         return ViewSphere(azimuth.to(self.azimuth), elevation.to(self.azimuth), theta.to(self.azimuth), self.distance)
 
 
@@ -174,6 +176,34 @@ def sample_views(
     axes = [heights, azimuths, check_numbers(thetas, "thetas"), check_numbers(distances, "distances")]
     elevation, azimuth, theta, distance = (v.flatten().float() for v in torch.meshgrid(*axes, indexing="ij"))
     return ViewSphere(azimuth, elevation, theta, distance)
+
+
+PAPER_RADIUS = 0.2  # m, of the object: the paper's distances are metric, its objects are not described
+
+
+def paper_views() -> ViewSphere:
+    """The paper's grid: azimuth in steps of 20 degrees, elevation of 50 degrees, distance of 0.3 m up to 2 m, for an
+    object with a radius of 0.2 m.
+
+    The paper says "around 700" views. Its steps give that number where elevation runs on over the poles, around the
+    whole circle (0, 50, ..., 300 degrees): 18 x 7 x 6 = 756. Past a pole the camera is upside down. An orthographic
+    camera, as the paper's, does not see the distance: there, 126 of these views differ.
+
+    Example:
+        >>> len(paper_views())
+        756
+    """
+    distances = [0.3 * i / PAPER_RADIUS for i in range(1, 7)]
+    grids = []
+    for turn in range(0, 350, 50):
+        # Past the pole the camera stands on the other side, upside down.
+        shift = 180.0 if 90 < turn < 270 else 0.0
+        elevation = math.degrees(math.asin(math.sin(math.radians(turn))))
+        grid = sample_views(azimuth_step=20.0, elevations=[elevation], distances=distances)
+        azimuth = (grid.azimuth + shift) % 360.0
+        grids.append(ViewSphere(azimuth, grid.elevation, grid.theta - shift, grid.distance))
+    names = ("azimuth", "elevation", "theta", "distance")
+    return ViewSphere(*(torch.cat([getattr(grid, name) for grid in grids]) for name in names))
 
 
 def uniform_views(

@@ -1,7 +1,9 @@
 """A bank of rendered views of a mesh, described once, stored as safetensors, and matched many times."""
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields, replace
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,12 +16,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
-from ..geometry.viewpoint import ViewSphere
-from ..mesh import has_colours, mesh_symmetries
+from ..geometry.viewpoint import ViewSphere, up_rotation
+from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up
-from ..pipeline import BankSettings, Pipeline
+from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
+from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
+from ..terms import Whitening, ledoit_wolf
 from ..utils.checks import check_symmetries, check_tensor
 from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
@@ -41,7 +44,10 @@ class ViewBank:
         boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
         appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank. Meshes with colours
             have grey features followed by coloured ones.
+        described_views_file: where those of a large bank are kept, as views are described; None keeps them in memory.
     """
+
+    described_views_file: Path | None = None
 
     def __init__(
         self, mesh: trimesh.Trimesh, views: ViewSphere, pipeline: Pipeline, tensors: Mapping[str, Tensor]
@@ -76,6 +82,11 @@ class ViewBank:
     def distances(self) -> Tensor:
         """(N,) float64 distances of the object's centre, in the mesh's unit."""
         return self.views.distance.to(self.device, torch.float64) * mesh_radius(self.mesh)
+
+    @cached_property
+    def whitening(self) -> Whitening:
+        """Mean and shrunk covariance of the views' descriptors, for :class:`Correlation`."""
+        return Whitening(*ledoit_wolf(self.descriptors))
 
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""
@@ -132,7 +143,7 @@ class ViewBank:
         options: dict[str, Any] = {"image_size": image_size, "camera": camera}
         pipeline = replace(pipeline, bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}))
         if views is None:
-            views = pipeline.views.sphere(mesh_up(mesh))
+            views = views_of(mesh, pipeline.views)
         elif len(views) == 0:
             raise InvalidInputError("views: expected at least one viewpoint")
         else:
@@ -144,10 +155,7 @@ class ViewBank:
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
-            tensors = describe(*chunk)
-            for name in ("points", "silhouettes"):  # (N, S, S) bool to (N, ceil(S * S / 8)) uint8
-                packed = np.packbits(tensors[name].flatten(1).cpu().numpy(), axis=1)
-                tensors[name] = torch.from_numpy(packed).to(device)
+            tensors = packed(describe(*chunk))
             if appearance is not None:
                 tensors["appearance"] = appearance.describe(describe.shaded(*chunk)).half()
             return tensors
@@ -167,7 +175,10 @@ class ViewBank:
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
-        return ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
+        bank = ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
+        on_cpu = bank.device.type == "cpu"  # another device rounds differently: a file has the features of a CPU
+        bank.described_views_file = self.described_views_file if on_cpu else None
+        return bank
 
     @property
     def tensors(self) -> dict[str, Tensor]:
@@ -202,6 +213,7 @@ class ViewBank:
             "mesh": str(self.mesh.metadata.get("file_name", "")),
             "unit": mesh_unit(self.mesh) or "",
             "up": mesh_up(self.mesh),
+            "warnings": json.dumps([asdict(warning) for warning in mesh_warnings(self.mesh)]),
             "checksum": tensor_digest(contents, size=16),
         }
         write_tensors(Path(path), contents, metadata)
@@ -232,6 +244,8 @@ class ViewBank:
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
             tensors["descriptors"] = tensors["descriptors"].float()
             mesh = _mesh(tensors, metadata["unit"], metadata["up"])
+            noticed = json.loads(metadata.get("warnings", "[]"))
+            mesh.metadata["warnings"] = tuple(MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed)
             _check_contents(views, pipeline.bank, tensors)
         except BankError:
             raise
@@ -240,6 +254,25 @@ class ViewBank:
         except (KeyError, TypeError, ValueError, CurviregError) as error:
             raise BankError(f"incomplete bank ({error!r}); {REBUILD}", subject=path) from error
         return cls(mesh, views, pipeline, tensors).to(device)
+
+
+def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:
+    """(3, 3) float64 rotation from the mesh's frame to the one in which the policy's azimuth and elevation are."""
+    return principal_rotation(mesh) if policy.frame == "principal" else up_rotation(mesh_up(mesh))
+
+
+def views_of(mesh: trimesh.Trimesh, policy: ViewPolicy) -> ViewSphere:
+    """The policy's views of a mesh, in the mesh's own frame."""
+    if policy.frame == "principal":
+        return policy.sphere().in_frame(view_frame(mesh, policy))
+    return policy.sphere(mesh_up(mesh))
+
+
+def packed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """What :class:`ViewDescriber` says of N views, with its masks (N, S, S) bool as (N, ceil(S * S / 8)) uint8."""
+    masks = {name: tensors[name] for name in ("points", "silhouettes")}
+    small = {name: np.packbits(mask.flatten(1).cpu().numpy(), axis=1) for name, mask in masks.items()}
+    return {**tensors, **{name: torch.from_numpy(bits).to(masks[name].device) for name, bits in small.items()}}
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
@@ -257,7 +290,7 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
         surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
         surface.check(len(mesh.faces))
         mesh.metadata["colours"] = surface
-    else:
+    if not has_colours(mesh):
         check_symmetries(mesh_symmetries(mesh))
     return mesh
 

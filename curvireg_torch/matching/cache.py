@@ -22,7 +22,7 @@ from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
-from .bank import FORMAT_VERSION, ViewBank, colour_arrays
+from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
 #: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
 CACHE_LIMIT = 2_000_000_000
@@ -41,7 +41,8 @@ class CachedBank(NamedTuple):
 
 def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Only files named
-    ``bank-<32 digits>.safetensors`` in its folder ``banks`` are ever listed, overwritten or removed."""
+    ``bank-<32 digits>.safetensors`` or ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder
+    ``banks`` are ever listed, overwritten or removed."""
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):
@@ -93,7 +94,7 @@ def cached_bank(
     """
     mesh, folder, pipeline = as_mesh(mesh), folder or cache_folder(), pipeline or Pipeline()
     if views is None:
-        views = pipeline.views.sphere(mesh_up(mesh))
+        views = views_of(mesh, pipeline.views)
     else:
         pipeline = pipeline.with_pose_prior("given")
 
@@ -110,10 +111,12 @@ def cached_bank(
             with suppress(OSError):  # a read-only cache
                 os.utime(path)
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
+            bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
             return bank
     bank = build()
     bank.pipeline = pipeline
     bank.descriptors = bank.descriptors.half().float()  # as the file stores them, so that both rank alike
+    bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
     try:
         bank.save(path)
         _trim(folder, keep=path)
@@ -128,15 +131,25 @@ def cached_bank(
 
 def list_cache(folder: Path | None = None) -> list[CachedBank]:
     """The banks of the cache, most recently used first."""
-    return [bank for bank in _files(folder or cache_folder()) if bank.path.suffix != ".tmp"]
+    return [file for file in _files(folder or cache_folder()) if _is_bank(file)]
 
 
 def clear_cache(folder: Path | None = None) -> int:
-    """Remove every bank of the cache and incomplete files of killed processes; returns the number of banks."""
+    """Remove every bank of the cache, the features of its views, and incomplete files of killed processes; returns the
+    number of banks."""
     files = _files(folder or cache_folder())
     for file in files:
         file.path.unlink(missing_ok=True)
-    return sum(file.path.suffix != ".tmp" for file in files)
+    return sum(map(_is_bank, files))
+
+
+def _described_views_file(bank: Path) -> Path:
+    """The file with features of the views of a cached bank."""
+    return bank.with_name(bank.name.replace("bank-", "views-"))
+
+
+def _is_bank(file: CachedBank) -> bool:
+    return file.path.name.startswith("bank-") and file.path.suffix != ".tmp"
 
 
 def _trim(folder: Path, *, keep: Path) -> None:
@@ -152,11 +165,11 @@ def _trim(folder: Path, *, keep: Path) -> None:
 
 
 def _files(folder: Path) -> list[CachedBank]:
-    """Banks and incomplete files, most recently used first."""
+    """Banks, features of their views, and incomplete files, most recently used first."""
     found = []
     with suppress(OSError):  # the folder does not exist yet, or cannot be read
         for path in (folder / "banks").iterdir():
-            if re.fullmatch(r"bank-[0-9a-f]{32}\.safetensors(\.[0-9a-f]{8}\.tmp)?", path.name):
+            if re.fullmatch(r"(bank|views)-[0-9a-f]{32}\.safetensors(\.[0-9a-f]{8}\.tmp)?", path.name):
                 with suppress(FileNotFoundError):  # removed by another process
                     found.append(CachedBank(path, path.stat().st_size, path.stat().st_mtime))
     return sorted(found, key=lambda file: file.used, reverse=True)

@@ -8,6 +8,7 @@ import trimesh
 from torch import Tensor, nn
 
 from ..features import HOG, field_points
+from ..filters import apparent_ridges, average_shading_gradient
 from ..geometry.cameras import boxes_around, projected, transform
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..mesh.colours import has_colours
@@ -20,12 +21,14 @@ from ..rendering.contours import LEVELS, MeshContours
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
 VIEW_FACES = LEVELS[-1][1]  # to which larger meshes are simplified for views: their contours are those of full size
 EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
+# Depth fields of the surface that a perspective camera sees: without the camera they are nearly HFN
+OF_SURFACE = {"ASG": average_shading_gradient, "AR": apparent_ridges}
 # Distances to step back so that a perspective view approximates parallel projection to a few per mille
 PARALLEL_DISTANCE = 20.0
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
-    """The filter that turns rendered depth into vector fields."""
+    """The filter that turns rendered depth into vector fields; see :meth:`ViewDescriber.field` for perspective ones."""
     options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
     layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
     return layer
@@ -108,9 +111,25 @@ class ViewDescriber:
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
+        depth, _, boxes = self._seen(rotations, distances)
+        return depth, boxes
+
+    def _seen(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Depth (N, 1, S, S), camera matrices (N, 3, 3) and boxes (N, 4) of the framed views."""
         T, K, boxes = self.cameras(rotations, distances)
         depth = self.view_renderer.render(T, K, (self.settings.image_size,) * 2, orthographic=self._orthographic)
-        return depth.to(self._device), boxes.to(self._device)
+        return depth.to(self._device), K.to(self._device), boxes.to(self._device)
+
+    def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
+        """(N, 2, S, S) fields of the framed views."""
+        depth, K, _ = self._seen(rotations, distances)
+        return self.field(depth, K)
+
+    def field(self, depth: Tensor, K: Tensor) -> Tensor:
+        """(N, 2, S, S) field of depth (N, 1, S, S) that was seen by cameras (N, 3, 3) of the settings' kind."""
+        of_surface = None if self._orthographic else OF_SURFACE.get(self.settings.depth_field)
+        field: Tensor = self._filter(depth) if of_surface is None else of_surface(depth, camera_matrix=K)
+        return field
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
@@ -122,7 +141,8 @@ class ViewDescriber:
     def described(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """:meth:`descriptors` and :meth:`shaded`, of the same depth images."""
         depth, T, K = self._framed(rotations, distances)
-        return self.descriptor(self._filter(depth.to(self._device))), self._shaded(depth, T, K)
+        field = self.field(depth.to(self._device), K.to(self._device))
+        return self.descriptor(field), self._shaded(depth, T, K)
 
     def _framed(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         T, K, _ = self.cameras(rotations, distances)
@@ -150,17 +170,19 @@ class ViewDescriber:
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) descriptors of the framed views."""
         chunks = zip(rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True)
-        return torch.cat([self.descriptor(self._filter(self.depth(R, z)[0])) for R, z in chunks])
+        return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
         """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once.
         ``descriptors`` (N, D) float32; ``points`` and ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4) float64 of the
         object in normalised image coordinates (focal length 1), its centre on the axis; orthographic in model units."""
-        source, quarters = quarter_turns(rotations, distances)
+        # An orthographic camera does not see the distance.
+        seen = torch.ones_like(distances) if self._orthographic else distances
+        source, quarters = quarter_turns(rotations, seen)
         rendered = source == torch.arange(len(source))
-        depth, boxes = self.depth(rotations[rendered], distances[rendered])
-        field = self._filter(depth)
+        depth, K, boxes = self._seen(rotations[rendered], distances[rendered])
+        field = self.field(depth, K)
         points, silhouettes = field_points(field, fraction=self.settings.point_fraction)[:, 0], depth[:, 0] > 0
         descriptors = self.descriptor(field)
         if not bool(rendered.all()):

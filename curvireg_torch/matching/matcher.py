@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from ..features import field_points
+from ..geometry import ViewSphere
+from ..mesh import mesh_radius
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
@@ -24,10 +26,10 @@ from ..terms import (
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.threads import map_on_threads
-from .bank import ViewBank
+from .bank import VIEWS_AT_A_TIME, ViewBank, packed
+from .cells import DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
-MAX_CACHED_VIEWS = 2048  # Views whose appearance is cached, 35 kB each at 128 px
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
@@ -41,8 +43,8 @@ class Ranking:
         scores: (B, N) in [0, 1], the product of the terms' scores, each to the power of its weight.
         order: (B, N) view indices, best first; ties in the order of the bank.
         terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
-            [-1, 1] if they are whitened; "repeatability": fraction of the photograph's points found in the view; "box":
-            similarity of the boxes' aspect ratios in [0, 1], best view 1.
+            [-1, 1] if they are whitened, or the paper's product; "repeatability": fraction of the photograph's points
+            found in the view; "box": similarity of the boxes' aspect ratios in [0, 1], best view 1.
         allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,) the best of the others
             more than 30 degrees from the best view, or -1.
     """
@@ -145,7 +147,7 @@ class ViewMatcher(nn.Module):
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
         self.bank, self._renderer = bank, renderer
-        self._known_appearance: dict[int, Tensor] = {}
+        self._described_views = DescribedViews(bank.described_views_file)
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
@@ -224,6 +226,21 @@ class ViewMatcher(nn.Module):
             dim=0
         )
 
+    @torch.no_grad()
+    def compare_views(self, query: QueryFeatures, views: ViewSphere) -> Tensor:
+        """(N,) log scores of further views of the mesh for one described photograph, 0 for the best of them, by all
+        terms but appearance; mu and Sigma of whitened descriptors are those of the bank."""
+        radius = mesh_radius(self.bank.mesh)
+        parts = zip(views.rotations.split(VIEWS_AT_A_TIME), views.distance.split(VIEWS_AT_A_TIME), strict=True)
+        described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
+        tensors = {name: torch.cat([part[name] for part in described]) for name in described[0]}
+        few = ViewBank(self.bank.mesh, views, self.bank.pipeline, tensors)
+        if any(getattr(term, "whitening", "none") != "none" for term, _ in self._terms):
+            few.whitening = self.bank.whitening
+        scores = [term.weight * term.log_score(term.build(few)(query)) for term, _ in self._terms]
+        log = torch.stack(scores).sum(dim=0)[0]
+        return log - log.max()
+
     def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""
         if (appearance := self._appearance) is None:
@@ -234,9 +251,8 @@ class ViewMatcher(nn.Module):
             score = term.log_score(raw)
         elif len(log):
             R = self.bank.rotations
-            order = log.argsort(dim=1, descending=True, stable=True)
-            selected = [distinct_views(o, R, count=term.top, angle=term.min_angle) for o in order]
-            selected = [index[row[index] > -torch.inf] for index, row in zip(selected, log, strict=True)]
+            representatives, cells = self._packing
+            selected = [representatives[best_cells(row, cells, count=term.top)] for row in log]
             compared = torch.cat(selected).unique()
             similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
             for b, index in enumerate(selected):
@@ -245,28 +261,34 @@ class ViewMatcher(nn.Module):
                 score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return log + term.weight * score, {term.name: raw}
 
+    @cached_property
+    def _packing(self) -> tuple[Tensor, Tensor]:
+        """(C,) views that are at least the appearance term's ``min_angle`` apart, and (N,) the nearest of these to each
+        view. They are the same for every photograph, so that few views of a mesh are ever described."""
+        assert self._appearance is not None
+        R = self.bank.rotations
+        every = torch.arange(len(R), device=R.device)
+        representatives = distinct_views(every, R, count=len(R), angle=self._appearance.term.min_angle)
+        return representatives, cells_of_views(R, representatives)
+
     def _features_of_views(self, views: Tensor) -> Tensor:
-        """(U, D) features of (U,) ascending views: from the bank, from the cache, or computed and cached."""
+        """(U, D) features of (U,) ascending views: from the bank, described before, or described now."""
         if (features := self.bank.appearance) is not None:
             return features if len(views) == len(features) else features[views.to(self.bank.device)]
-        appearance, cache = self._appearance, self._known_appearance
+        return self._described_views.features(views.tolist(), self._describe_views)
+
+    def _describe_views(self, views: list[int]) -> Tensor:
+        """(U, D) appearance features of views, rendered and described."""
+        appearance = self._appearance
         assert appearance is not None
-        found = {view: known for view in views.tolist() if (known := cache.get(view)) is not None}
-        missing = [view for view in views.tolist() if view not in found]
 
         def describe(chunk: list[int]) -> Tensor:
             R, distances = self.bank.rotations[chunk], self.bank.distances[chunk]
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        chunks = [missing[k : k + FEATURES_AT_A_TIME] for k in range(0, len(missing), FEATURES_AT_A_TIME)]
-        parts = map_on_threads(describe, chunks, device=self.bank.device)
-        new = dict(zip(missing, (feature for part in parts for feature in part), strict=True))
-        if len(cache) + len(new) > MAX_CACHED_VIEWS:
-            cache.clear()
-        cache.update(new)
-        found.update(new)
-        return torch.stack([found[view] for view in views.tolist()])
+        chunks = [views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)]
+        return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
         """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus

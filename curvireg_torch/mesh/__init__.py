@@ -9,4 +9,7 @@ from .mesh import mesh_centre as mesh_centre
 from .mesh import mesh_radius as mesh_radius
 from .mesh import mesh_unit as mesh_unit
 from .mesh import mesh_up as mesh_up
+from .mesh import mesh_warnings as mesh_warnings
+from .mesh import normalization_transform as normalization_transform
+from .source import MeshWarning as MeshWarning
 from .symmetry import mesh_symmetries as mesh_symmetries

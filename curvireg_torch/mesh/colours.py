@@ -9,9 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MAX_IMAGE_PIXELS
+from ..errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
+from ..utils.pictures import PICTURE_STARTS, open_picture
 
 TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
+SAMPLES = 20_000  # Points of the surface at which colours are compared
+# Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a word on a box is
+# more, noise of a JPEG less
+VARIED_FRACTION, VARIED_BY = 0.002, 12
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
@@ -83,18 +88,36 @@ class SurfaceColours:
 
 
 def has_colours(mesh: Any) -> bool:
-    """Whether a mesh has colours, see :func:`surface_colours`."""
-    return surface_colours(mesh) is not None
+    """Whether a mesh has colours that vary over its surface: one plain material is no print. The only place where it is
+    decided; symmetries, appearance and fits to colours follow it."""
+    colours = surface_colours(mesh)
+    return colours is not None and _vary(colours, mesh)
 
 
-def colours_of_parts(meshes: Iterable[Any], *, close: bool = False) -> list[SurfaceColours | None]:
-    """:func:`surface_colours` of each mesh; None, with a warning, where they cannot be used. A texture is decoded once,
-    however many meshes share it. ``close`` frees its picture then."""
+def _vary(colours: SurfaceColours, mesh: Any) -> bool:
+    corners = colours.corners.reshape(-1, 3)
+    if not len(corners) or (not colours.textures and (corners == corners[0]).all()):
+        return False
+    rng = np.random.default_rng(0)
+    area = np.cumsum(mesh.area_faces)
+    face = np.searchsorted(area, rng.uniform(0.0, area[-1], SAMPLES)).clip(max=len(area) - 1).astype(np.int32)
+    u, v = rng.uniform(0.0, 1.0, (2, SAMPLES)).astype(np.float32)
+    outside = u + v > 1.0
+    u[outside] = 1.0 - u[outside]
+    v[outside] = 1.0 - v[outside]
+    found = 255.0 * colours.at(face, u, v)
+    differs = (np.abs(found - np.median(found, axis=0)) > VARIED_BY).any(axis=1)
+    return float(differs.mean()) > VARIED_FRACTION
+
+
+def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
+    """The colours of each mesh, plain ones too; None, with a warning, where they cannot be used. A texture is decoded
+    once, however many meshes share it."""
     known: _Textures = {}
     found = []
     for mesh in meshes:
         try:
-            colours = _surface_colours(mesh, known, close=close)
+            colours = _surface_colours(mesh, known)
             if colours is not None and len(colours) != len(mesh.faces):
                 raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
@@ -110,7 +133,7 @@ def surface_colours(mesh: Any) -> SurfaceColours | None:
     return _surface_colours(mesh, {})
 
 
-def _surface_colours(mesh: Any, known: _Textures, *, close: bool = False) -> SurfaceColours | None:
+def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
@@ -133,7 +156,7 @@ def _surface_colours(mesh: Any, known: _Textures, *, close: bool = False) -> Sur
         x = np.asarray(factor[:3], np.float64) / 255
         srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
         colour = np.asarray((255 * srgb).round(), np.uint8)
-    texture = None if image is None or visual.uv is None else _decoded(image, known, close)
+    texture = None if image is None or visual.uv is None else _decoded(image, known)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
         uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
@@ -142,7 +165,7 @@ def _surface_colours(mesh: Any, known: _Textures, *, close: bool = False) -> Sur
     return None if unset else SurfaceColours.plain(len(faces), colour)
 
 
-def _decoded(image: Any, known: _Textures, close: bool) -> NDArray[np.uint8] | None:
+def _decoded(image: Any, known: _Textures) -> NDArray[np.uint8] | None:
     """(h, w, 3) uint8 of a PIL image, decoded once; None, with a warning, if it cannot be used."""
     if id(image) not in known:
         texture = None
@@ -151,13 +174,23 @@ def _decoded(image: Any, known: _Textures, close: bool) -> NDArray[np.uint8] | N
         except Exception as error:  # decoders raise anything
             message = f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
             warnings.warn(message, stacklevel=2)
-        if close:
-            image.close()
         known[id(image)] = image, texture
     return known[id(image)][1]
 
 
+def texture_pixels(content: bytes, most: int) -> tuple[NDArray[np.uint8], int]:
+    """(h, w, 3) uint8 of a picture's file, reduced, and how many pixels it has: ``most`` at most."""
+    with open_picture(content) as image:
+        count = image.width * image.height
+        if count > most:
+            raise ValueError(f"the textures have more than {MAX_TEXTURE_PIXELS:,} pixels together")
+        return _texture(image), count
+
+
 def _texture(image: Any) -> NDArray[np.uint8]:
+    """The pixels of a PIL image; of one that is not decoded yet, only in the formats of photographs."""
+    if image.format is not None and image.format not in PICTURE_STARTS:
+        raise ValueError(f"the format {image.format} is not read")
     if image.width * image.height > MAX_IMAGE_PIXELS:
         raise ValueError(f"{image.width} x {image.height} px are too many")
     rgba = np.asarray(image.convert("RGBA"), np.uint8)

@@ -19,47 +19,76 @@ from ..errors import MAX_MESH_COORDINATE, MAX_MESH_FACES, MIN_MESH_EXTENT, Curvi
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
 from .colours import SurfaceColours, colours_of_parts
-from .files import read_mesh
+from .files import read_source
+from .health import precision_warning, stray_faces, stray_warning
+from .source import MeshSource, MeshWarning
 
 Found = TypeVar("Found")
 
 
-def load_mesh(path: str | PathLike[str], *, unit: str = "m", up: str | None = None) -> trimesh.Trimesh:
+def load_mesh(
+    path: str | PathLike[str],
+    *,
+    unit: str | None = None,
+    up: str | None = None,
+    link: str | None = None,
+    textures: str | PathLike[str] | None = None,
+) -> trimesh.Trimesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
     Nothing is rescaled: vertices, and every pose computed from them, stay in the file's frame and unit.
 
     Args:
-        path: .obj, .ply, .stl, .off, .glb or .gltf.
-        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. An object that
-            would be smaller than 5 mm or larger than 100 m gets a warning.
-        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in ``mesh.metadata["up"]``; None: y for
-            glTF, else z.
+        path: .obj, .ply, .stl, .off, .glb, .gltf, .3mf or .urdf; with the extra ``cad`` also .step, .stp, .iges, .igs
+            and .dae.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. None: that which
+            the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else m. An object that would be smaller
+            than 5 mm or larger than 100 m gets a warning.
+        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in ``mesh.metadata["up"]``; None: that
+            which the file states, else y for glTF and z for other formats.
+        link: the link of a URDF whose mesh is read, in the link's frame; None: all links, with all joints at zero.
+        textures: a further folder in which files are looked for that the mesh names.
 
     Returns:
-        Vertices (V, 3) float64, faces (F, 3) without degenerate ones, and textures and other colours as one
-        :class:`SurfaceColours` in ``mesh.metadata["colours"]``.
+        Vertices (V, 3) float64, faces (F, 3) without degenerate ones and without small parts far away, and textures
+        and other colours as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``, which count if they vary
+        (:func:`has_colours`). What the mesh lacks is in :func:`mesh_warnings`, and a :class:`CurviregWarning` each.
 
     Raises:
         MissingFileError: the file does not exist.
-        MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices, or beyond
-            :mod:`curvireg_torch.errors`.
+        MissingDependencyError: a package is needed for the format.
+        MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices, beyond
+            :mod:`curvireg_torch.errors`, or states another unit than ``unit``.
     """
-    check_option(unit, UNITS, "unit")
     path = Path(path)
-    up = format_up(path.suffix) if up is None else up
-    check_option(up, UP_AXES, "up")
+    if unit is not None:
+        check_option(unit, UNITS, "unit")
+    if up is not None:
+        check_option(up, UP_AXES, "up")
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the mesh", subject=path)
     if path.suffix.lower() not in MESHES:
         raise MeshError(f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path)
-    mesh = as_mesh(read_mesh(path), name=str(path))
-    mesh.units = unit
-    mesh.metadata.update(file_name=path.name, up=up)
-    size = float(np.linalg.norm(mesh.extents)) * UNITS[unit]
+    if textures is not None and not Path(textures).is_dir():
+        raise MissingFileError("no such folder; check the folder of the textures", subject=textures)
+    source = MeshSource(path, [] if textures is None else [Path(textures)])
+    found = read_source(source, link)
+    if unit is not None and found.unit not in (None, unit):
+        message = f"the file states its unit, {found.unit}, which is not {unit!r}; leave the unit out"
+        raise MeshError(message, subject=path)
+    whole = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    whole.metadata["colours"] = found.colours
+    whole.metadata["warnings"] = tuple(source.warnings)
+    mesh = as_mesh(whole, name=str(path))
+    mesh.units = unit or found.unit or "m"
+    mesh.metadata.update(file_name=path.name, up=up or found.up or format_up(path.suffix))
+    size = float(np.linalg.norm(mesh.extents)) * UNITS[mesh.units]
     if not 0.005 <= size <= 100.0:
-        message = f"in unit {unit!r} the object is {size:g} m across; if that is wrong, give the unit (mm?)"
+        advice = "" if found.unit else "; if that is wrong, give the unit (mm?)"
+        message = f"in unit {mesh.units!r} the object is {size:g} m across{advice}"
         warnings.warn(CurviregWarning(message, subject=path), stacklevel=2)
+    for warning in mesh_warnings(mesh):
+        warnings.warn(CurviregWarning(warning.text, subject=path), stacklevel=2)
     return mesh
 
 
@@ -67,6 +96,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as :func:`load_mesh`."""
     if isinstance(source, str | PathLike):
         return load_mesh(source)
+    noticed = list(mesh_warnings(source)) if isinstance(source, trimesh.Trimesh) else []
     if isinstance(source, trimesh.Scene):
         try:
             source, colours = _joined(source)
@@ -77,16 +107,31 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
     triangles, is_degenerate = _checked_triangles(source, name)
-    vertices, faces = np.asarray(source.vertices, dtype=np.float64), triangles[~is_degenerate]
-    mesh = trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    vertices = np.asarray(source.vertices, dtype=np.float64)
+    mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
+    colours = None if colours is None else colours[~is_degenerate]
+    stray = stray_faces(mesh)
+    if stray.any():
+        noticed.append(stray_warning(mesh, stray))
+        mesh = trimesh.Trimesh(vertices=vertices, faces=mesh.faces[~stray], process=False)
+        colours = None if colours is None else colours[~stray]
     mesh.remove_unreferenced_vertices()
+    noticed += [warning for warning in [precision_warning(mesh)] if warning is not None and warning not in noticed]
     unit = mesh_unit(source)
     if unit is not None:  # trimesh keeps None as the word "none"
         mesh.units = unit
     mesh.metadata.update(file_name=source.metadata.get("file_name", ""), up=mesh_up(source))
+    if noticed:
+        mesh.metadata["warnings"] = tuple(noticed)
     if colours is not None:
-        mesh.metadata["colours"] = colours[~is_degenerate]
+        mesh.metadata["colours"] = colours
     return mesh
+
+
+def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
+    """What a mesh lacks, or what was changed in it, as :func:`load_mesh` noticed."""
+    found = mesh.metadata.get("warnings", ())
+    return tuple(warning for warning in found if isinstance(warning, MeshWarning))
 
 
 MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
@@ -211,3 +256,40 @@ def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
 def mesh_radius(mesh: trimesh.Trimesh) -> float:
     """Half the diagonal of the axis-aligned box, in model units."""
     return 0.5 * float(np.linalg.norm(mesh.extents))
+
+
+def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
+    """(4, 4) float64 similarity from the model's frame to the paper's normalised frame.
+
+    The area-weighted centroid goes to the origin and the farthest vertex to distance 1; the principal axes of the
+    surface go to x, y, z in decreasing order of variance. The third moments of the surface along x and y are positive,
+    and z completes a right-handed frame. Of axes with equal variance, rounding decides.
+
+    Example:
+        >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))
+        >>> round(1 / float(torch.linalg.det(T[:3, :3])) ** (1 / 3), 6)        # half the diagonal
+        3.0
+    """
+    corners = np.asarray(mesh.triangles, dtype=np.float64)
+    area = np.asarray(mesh.area_faces, dtype=np.float64)
+    centroid = np.average(corners.mean(axis=1), axis=0, weights=area)
+    # Edge midpoints integrate the second moments of a triangle exactly.
+    points = (0.5 * (corners + np.roll(corners, 1, axis=1)) - centroid).reshape(-1, 3)
+    weights = np.repeat(area / area.sum() / 3.0, 3)
+    _, axes = np.linalg.eigh((points * weights[:, None]).T @ points)
+    R = axes.T[::-1].copy()
+    third = ((points @ R.T) ** 3 * weights[:, None]).sum(axis=0)
+    R[:2] *= np.where(third[:2] < 0, -1.0, 1.0)[:, None]
+    R[2] = np.cross(R[0], R[1])
+    scale = 1.0 / np.linalg.norm(mesh.vertices - centroid, axis=1).max()
+    T = np.eye(4)
+    T[:3, :3] = scale * R
+    T[:3, 3] = -scale * (R @ centroid)
+    return torch.from_numpy(T)
+
+
+def principal_rotation(mesh: trimesh.Trimesh) -> Tensor:
+    """(3, 3) float64 rotation of :func:`normalization_transform`."""
+    R = normalization_transform(mesh)[:3, :3]
+    rotation: Tensor = R / torch.linalg.vector_norm(R[0])
+    return rotation

@@ -156,7 +156,10 @@ class Follower:
         hypothesis = hypothesis_of(poses, 0, tracked.features, score="region")
         probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
-        return Registration((hypothesis,), probabilities, Ranking.none(), dict(tracked.features), warnings=warnings)
+        notes = self.registrar.mesh_notes
+        features = dict(tracked.features)
+        ranking = Ranking.none()
+        return Registration((hypothesis,), probabilities, ranking, features, warnings=warnings, notes=notes)
 
 
 def _confidence(result: Registration) -> float:

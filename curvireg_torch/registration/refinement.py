@@ -122,7 +122,9 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
         confidence = min(confidence, _registered_probability(registrar, item, poses[torch.tensor(order[:1])]))
         probabilities = (confidence if limit is None else min(confidence, limit), *[0.0] * (len(hypotheses) - 1))
     warnings = item.warnings + registrar.mesh_warnings
-    return Registration(hypotheses, probabilities, Ranking.none(), dict(features), warnings=warnings)
+    notes = registrar.mesh_notes
+    ranking = Ranking.none()
+    return Registration(hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes)
 
 
 def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:

@@ -15,7 +15,7 @@ from ..errors import CurviregError, InvalidInputError
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
-from ..mesh import has_colours, mesh_symmetries
+from ..mesh import has_colours, mesh_symmetries, mesh_warnings
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
@@ -313,6 +313,11 @@ class Registrar:
             return ()
         return ("the mesh is flat and has no colours: front and back look alike",)
 
+    @property
+    def mesh_notes(self) -> tuple[str, ...]:
+        """What the mesh lacks, in words: see :func:`curvireg_torch.mesh.mesh_warnings`."""
+        return tuple(warning.text for warning in mesh_warnings(self.bank.mesh))
+
     @cached_property
     def describer(self) -> ViewDescriber:
         """Renderer, contours and descriptor of the mesh, on a grid twice as fine as the bank's."""
@@ -377,14 +382,10 @@ class Registrar:
             query: the same, cropped and described by the matcher.
         """
         work = self._rank(item, query)
+        if self.pipeline.search:
+            return self._searched(work)
         starts, outside, by_landmarks = self._starts(work)
         poses = starts
-        if self.pipeline.search:
-            self.report_progress("search")
-            rotation = search(self.describer, work.descriptor, poses)
-            poses = self._in_box(work, rotation, poses.distance, poses.view, poses.rank)
-            if work.limits is not None:
-                poses = work.limits.moved_inside(poses)
         if work.crops is not None:
             self.report_progress("contours")
             unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
@@ -458,6 +459,19 @@ class Registrar:
             return poses, outside, by_landmarks
         other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(by_landmarks, (0, 1))
+
+    def _searched(self, work: _Work) -> Registration:
+        """The result of the paper's search, and further distinct views of the ranking, in its order."""
+        self.report_progress("search")
+        view, rank = best_views(work.ranking, self.bank, count=self.pipeline.hypotheses, symmetries=work.symmetries)
+        rotation, distance = search(self.matcher, work.query, work.ranking)
+        found = self._in_box(work, rotation[None], distance[None], view[:1], rank[:1])
+        poses = self._of_views(work, view, rank).replaced(torch.tensor([0]), found)
+        if work.limits is not None:
+            poses = work.limits.moved_inside(poses)
+        distinct = torch.ones(len(poses), dtype=torch.bool)
+        by_rank = replace(work, exact=False)
+        return self._result(by_rank, poses, self._features(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
@@ -575,6 +589,7 @@ class Registrar:
             prior=work.item.prior,
             prior_contradiction=contradiction,
             warnings=work.item.warnings + self.mesh_warnings,
+            notes=self.mesh_notes,
         )
 
 

@@ -184,6 +184,7 @@ class Registration:
         prior_contradiction: "better outside": a pose outside the limits fits better, or the box asks for a distance
             outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None otherwise.
         warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
+        notes: what the mesh lacks, as its textures, or what was left out of it, in words; reliable all the same.
         model: number of the mesh, of several.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
             ``T_world_from_model``, along the world's axes.
@@ -198,6 +199,7 @@ class Registration:
     prior: PosePrior | None = None
     prior_contradiction: str | None = None
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     model: int = 0
     views: tuple[PhotographPose, ...] = ()
 
@@ -268,7 +270,7 @@ class Registration:
             "viewpoint   azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*self.viewpoint),
             f"hypotheses  {len(self.hypotheses)}" + (f", {self.ambiguous}" if self.ambiguous else ""),
         ]
-        return "\n".join([*lines, *(f"warning     {text}" for text in self.warnings[:2])])
+        return "\n".join([*lines, *(f"warning     {text}" for text in (self.warnings + self.notes)[:2])])
 
     def _repr_html_(self) -> str:
         """For notebooks."""
@@ -292,7 +294,7 @@ class Registration:
             "score": self.score,
             "confidence": self.confidence,
             "reliable": self.reliable,
-            "warnings": list(self.warnings),
+            "warnings": [*self.warnings, *self.notes],
             "probabilities": list(self.probabilities),
             "none": self.none,
             "ambiguous": self.ambiguous,

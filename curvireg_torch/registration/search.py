@@ -1,48 +1,122 @@
-"""Coarse-to-fine search around views of rankings (the paper's section "Registration of 2D images"), batched."""
-
-from dataclasses import replace
+"""The paper's search between coherent views (its section "Registration of 2D images")."""
 
 import torch
 from torch import Tensor
 
-from ..geometry import rotation_error, rotation_from_axis_angle
-from ..matching import ViewDescriber
-from .poses import Poses, similarities
+from ..geometry import ViewSphere, rotation_from_viewpoint, viewpoint_from_rotation
+from ..geometry.viewpoint import PAPER_RADIUS
+from ..matching import Ranking, ViewMatcher
+from ..matching.bank import view_frame
+from ..mesh import mesh_radius
+from ..terms import QueryFeatures
 
-STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops (METHOD 6)
-SEARCH_ANGLE = 15.0  # Largest rotation in degrees from the start: 1.5 times the spacing of a bank of 10 degrees
-# Degrees: half the spacing of the bank; finer steps move the contours of a crop by less than a pixel
-FIRST_STEP, FINEST_STEP = 5.0, 1.0
-MAX_ROUNDS = 8  # Largest number of rounds of six poses each
+BEST_VIEWS = 3  # "at least the highest three correspondences"
+STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops, translation in object radii (METHOD 6)
+ANGLE_STEP = 5.0  # Degrees, of elevation, azimuth and in-plane rotation in the first round
+DISTANCE_STEP = 0.05 / PAPER_RADIUS  # 5 cm, in object radii
+# Steps of azimuth, elevation and in-plane rotation in degrees within which two views of the paper's grid are
+# neighbours. Elevations run around the whole circle: 50 degrees apart, the last and the first of them 60
+NEIGHBOUR_STEPS = (20.0, 60.0, 20.0)
+MAX_ROUNDS = 8
+
+
+def angles_near(angles: Tensor, reference: Tensor) -> Tensor:
+    """(N, 3) azimuth, elevation, theta in degrees of the same views as ``angles`` (N, 3), as near ``reference`` (3,) as
+    they can be: past a pole the elevation runs on."""
+    turn = torch.tensor([180.0, 180.0, 180.0], dtype=angles.dtype)
+    over = turn + angles * torch.tensor([1.0, -1.0, 1.0], dtype=angles.dtype)
+    both = torch.stack([angles, over])
+    both = reference + torch.remainder(both - reference + turn, 360.0) - turn
+    nearer = (both - reference).abs().sum(dim=2).argmin(dim=0)
+    return both[nearer, torch.arange(len(angles))]
+
+
+def coherent_views(angles: Tensor, steps: tuple[float, float, float] = NEIGHBOUR_STEPS) -> Tensor:
+    """(K,) bool: which of K views, the best one first, are connected with it by neighbours.
+
+    Args:
+        angles: (K, 3) azimuth, elevation, theta in degrees, from :func:`angles_near`.
+        steps: between neighbours, at most.
+
+    Example:
+        >>> coherent_views(torch.tensor([[0.0, 0, 0], [20, 50, 0], [180, 0, 0]])).tolist()
+        [True, True, False]
+    """
+    apart = (angles[:, None] - angles).abs()
+    beside = (apart <= torch.tensor(steps, dtype=angles.dtype) + 0.1).all(dim=2)
+    connected = beside[0]
+    for _ in range(len(angles)):
+        connected = beside[connected].any(dim=0)
+    return connected
+
+
+def divided(low: float, high: float, step: float) -> Tensor:
+    """Numbers from ``low`` to ``high``, both among them, in equal steps of about ``step``."""
+    count = round((high - low) / step) + 1 if high > low else 1
+    return torch.linspace(low, high, max(count, 2 if high > low else 1), dtype=torch.float64)
+
+
+def motion(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
+    """E = |T^-1 T' - Id|_F of two poses with rotations (3, 3) and the object's centre at distances () in radii on the
+    optical axis."""
+    R, distance = first
+    S, other = second
+    turned = R.T @ S - torch.eye(3, dtype=torch.float64)
+    along = other - distance
+    return float((turned.square().sum() + along.square()).sqrt())
 
 
 @torch.no_grad()
-def search(describer: ViewDescriber, descriptor: Tensor, starts: Poses) -> Tensor:
-    """Return (H, 3, 3) allocentric rotations whose views match a photograph's ``descriptor`` (1, D) best, near the
-    starts. Every round takes the six rotations by +-step about the camera's axes around the best pose; the step is
-    halved where none of them is better, and the search ends where the pose stops moving at the finest step."""
-    axes = torch.cat([torch.eye(3, dtype=torch.float64), -torch.eye(3, dtype=torch.float64)])
+def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tuple[Tensor, Tensor]:
+    """Return the rotation (3, 3) and the distance () in model units, float64, of the view that matches one photograph
+    best, between the least and the greatest angles and distances of the coherent ones of its three best views.
 
-    def scores_of(poses: Poses) -> Tensor:
-        return similarities(describer.descriptors(poses.rotation, poses.distance), descriptor)
-
-    best, score = starts.rotation, scores_of(starts)
-    step = torch.full((len(starts),), FIRST_STEP, dtype=torch.float64)
-    active = torch.arange(len(starts))
+    Every round compares all views of a grid, :data:`ANGLE_STEP` and :data:`DISTANCE_STEP` wide at first and half as
+    wide in each further round (the paper does not say how they go on), between the coherent views of the round before.
+    The search ends where the best pose moves by :data:`STOP_MOTION` or less. An orthographic camera does not see the
+    distance: views that differ in nothing else count as one, and that of the best view stays.
+    """
+    bank = matcher.bank
+    frame = view_frame(bank.mesh, bank.pipeline.views)
+    perspective = bank.settings.camera == "perspective"
+    order = ranking.order[0].cpu()
+    if ranking.allowed is not None:
+        order = order[ranking.allowed[0].cpu()[order]]
+    rotations = bank.rotations.cpu().double() @ frame.T
+    distances = bank.views.distance.cpu().double()
+    angles = torch.stack(viewpoint_from_rotation(rotations), dim=1)
+    steps, width, farther = NEIGHBOUR_STEPS, ANGLE_STEP, DISTANCE_STEP
+    pose = rotations[order[0]], distances[order[0]]
     for _ in range(MAX_ROUNDS):
-        if len(active) == 0:
+        best = order[:BEST_VIEWS] if perspective else _different(rotations, order)
+        near = angles_near(angles[best], angles[best[0]])
+        coherent = coherent_views(near, steps)
+        chosen, away = near[coherent], distances[best[coherent]]
+        low, high = chosen.amin(dim=0).tolist(), chosen.amax(dim=0).tolist()
+        axes = [divided(a, b, width) for a, b in zip(low, high, strict=True)]
+        axes.append(divided(float(away.min()), float(away.max()), farther) if perspective else pose[1][None])
+        *columns, distances = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+        angles = torch.stack(columns, dim=1)
+        rotations = rotation_from_viewpoint(*columns)
+        azimuth, elevation, theta = (column.float() for column in columns)
+        views = ViewSphere(azimuth, elevation, theta, distances.float()).in_frame(frame)
+        order = matcher.compare_views(query, views).argsort(descending=True, stable=True).cpu()
+        found = rotations[order[0]], distances[order[0]]
+        moved = motion(pose, found)
+        pose = found
+        if moved <= STOP_MOTION:
             break
-        turns = rotation_from_axis_angle(axes * torch.deg2rad(step[active])[:, None, None])
-        candidates = turns @ best[active, None]
-        each = replace(starts[active.repeat_interleave(6)], rotation=candidates.flatten(0, 1))
-        scores = scores_of(each)
-        far = rotation_error(candidates, starts.rotation[active, None]).flatten() > SEARCH_ANGLE
-        value, winner = scores.masked_fill(far, -1.0).view(-1, 6).max(dim=1)
-        better = value > score[active]
-        moved = torch.where(better[:, None, None], candidates[torch.arange(len(active)), winner], best[active])
-        motion = torch.linalg.matrix_norm(best[active].mT @ moved - torch.eye(3, dtype=torch.float64))
-        best, score = best.index_copy(0, active, moved), score.index_copy(0, active, value.maximum(score[active]))
-        done = ~better & (step[active] <= FINEST_STEP) & (motion <= STOP_MOTION)
-        step[active] = torch.where(better, step[active], (step[active] / 2.0).clamp(min=FINEST_STEP))
-        active = active[~done]
-    return best
+        steps = (width, width, width)
+        width, farther = width / 2.0, farther / 2.0
+    return pose[0] @ frame, pose[1] * mesh_radius(bank.mesh)
+
+
+def _different(rotations: Tensor, order: Tensor) -> Tensor:
+    """The first views of ``order`` (N,) with different rotations (N, 3, 3), :data:`BEST_VIEWS` of them."""
+    chosen: list[int] = []
+    for view in order.tolist():
+        if all(float((rotations[view] - rotations[other]).abs().max()) > 1e-4 for other in chosen):
+            chosen.append(view)
+        if len(chosen) == BEST_VIEWS:
+            break
+    return torch.tensor(chosen, dtype=torch.long)

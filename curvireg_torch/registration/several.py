@@ -158,5 +158,6 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
         ranking=first.result.ranking,
         confidence_features=features,
         warnings=tuple(sorted(set.intersection(*(set(p.result.warnings) for p in rig.photographs)))),
+        notes=first.result.notes,
         views=tuple(views),
     )

@@ -1,7 +1,7 @@
 """Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered picture."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -12,8 +12,10 @@ from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
 from .embree import RayScene, float32
 
-MAX_OCCLUDING, MAX_CREASES = 256, 128  # Points per pose on occluding contours and on creases
-OCCLUDING_CANDIDATES, CREASE_CANDIDATES = 640, 256  # Places per pose at which visibility is tested; some are hidden
+MAX_OCCLUDING = 256  # Points per pose on occluding contours
+MAX_CREASES = 128  # Points per pose on creases
+OCCLUDING_CANDIDATES = 640  # Places per pose on occluding contours at which visibility is tested; some are hidden
+CREASE_CANDIDATES = 256  # The same on creases
 ASIDE = 1.0  # Distance in px from the contour, on the outer side, at which a ray looks past the object
 # Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface
 OCCLUSION_JUMP = 0.05
@@ -26,6 +28,7 @@ CREASE_BEND = 0.36
 # 0.3 px of that crop
 LEVELS = ((64, 800), (128, 2500), (256, 8000))
 NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
+BEHIND = 16  # Bit of a vertex nearer than that
 
 
 @dataclass(frozen=True)
@@ -51,36 +54,141 @@ class _Level:
     """A mesh simplified to at most ``max_faces`` faces, relative to its ``centre`` (3,)."""
 
     def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int) -> None:
-        self.radius, self.edges = radius, MeshEdges(mesh, centre, max_faces)
+        self.radius = radius
+        self.edges = MeshEdges(mesh, centre, max_faces)
         self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
 
-    def seen(
-        self, R: np.ndarray, position: np.ndarray, K: np.ndarray, size: int, of: np.ndarray, edge: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(N, V, 3) float32 vertices in the cameras' frames, and (M,) float32 lengths in px of edges ``edge`` (M,) of
-        the poses ``of`` (M,); 0 for those outside the crop and behind the camera."""
-        vertices = R @ self._vertices.T + position[..., None]
-        x, y, z = vertices.transpose(1, 0, 2)
-        behind = z <= NEAR_PLANE * self.radius
-        z = np.maximum(z, np.float32(NEAR_PLANE * self.radius))
-        fx, fy, cx, cy = (K[:, i, j, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        u, v = fx * x / z + cx, fy * y / z + cy
-        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + 16 * behind
-        a, b = of * u.shape[1] + self.edges.edges[edge].T
-        (ua, ub), (va, vb), (at_a, at_b) = ((x.take(a), x.take(b)) for x in (u, v, beyond))
-        outside = (at_a & at_b) | ((at_a | at_b) & 16)
-        length: np.ndarray = np.sqrt((ub - ua) ** 2 + (vb - va) ** 2) * (outside == 0)
-        return vertices.transpose(0, 2, 1), length
+    def vertices_in_cameras(self, R: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """(N, V, 3) float32 vertices in the cameras' frames, of poses with rotations (N, 3, 3) and positions (N, 3) of
+        the centre."""
+        vertices: np.ndarray = R @ self._vertices.T + position[..., None]
+        return vertices.transpose(0, 2, 1)
 
-    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-        """Depth (N, M) of the mesh at pixels (N, M, 2) that ``at`` (N, M) marks; inf elsewhere and beside the mesh."""
-        xy = (uv - K[:, None, :2, 2]) / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
+    def lengths_in_crop(
+        self, vertices: np.ndarray, K: np.ndarray, size: int, pose: np.ndarray, edge: np.ndarray
+    ) -> np.ndarray:
+        """(M,) float32 lengths in px of edges ``edge`` (M,) in the poses ``pose`` (M,), whose vertices (N, V, 3) are
+        in the cameras' frames; 0 for those outside the crop and behind the camera."""
+        x, y, z = vertices.transpose(2, 0, 1)
+        nearest = np.float32(NEAR_PLANE * self.radius)
+        is_behind = z <= NEAR_PLANE * self.radius
+        z = np.maximum(z, nearest)
+        u = K[:, 0, 0, None] * x / z + K[:, 0, 2, None]
+        v = K[:, 1, 1, None] * y / z + K[:, 1, 2, None]
+        # One bit for each side of the crop beyond which a vertex lies: an edge is outside if its ends share a bit.
+        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + BEHIND * is_behind
+        start, end = pose * u.shape[1] + self.edges.edges[edge].T
+        beyond_start = beyond.take(start)
+        beyond_end = beyond.take(end)
+        is_outside = (beyond_start & beyond_end) | ((beyond_start | beyond_end) & BEHIND)
+        across = u.take(end) - u.take(start)
+        down = v.take(end) - v.take(start)
+        length: np.ndarray = np.sqrt(across**2 + down**2) * (is_outside == 0)
+        return length
+
+    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Depth (N, M) of the mesh at pixels (N, M, 2) that ``wanted`` (N, M) marks; inf elsewhere and beside the
+        mesh."""
+        focal_lengths = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)
+        xy = (uv - K[:, None, :2, 2]) / focal_lengths[:, None]
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
         origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
-        depth = np.full(at.shape, np.inf, np.float32)
-        depth[at] = self._scene.distance(origins[at], rays[at]) * self.radius
+        depth = np.full(wanted.shape, np.inf, np.float32)
+        depth[wanted] = self._scene.distance(origins[wanted], rays[wanted]) * self.radius
         return depth
+
+
+@dataclass(frozen=True)
+class _Views:
+    """N poses of a mesh in square crops, as contours are looked for in them.
+
+    Attributes:
+        level: the mesh, simplified for the size of the crops.
+        size: side of the crops in px.
+        R, position, K: (N, 3, 3) rotations, (N, 3) positions of the mesh's centre, (N, 3, 3) camera matrices, float32.
+        eye: (N, 3) float32 positions of the cameras, relative to the mesh's centre.
+        vertices: (N, V, 3) float32 vertices in the cameras' frames.
+        side: (N, E) bool, on which side of the plane through camera and edge the faces of the edge lie.
+    """
+
+    level: _Level
+    size: int
+    R: np.ndarray
+    position: np.ndarray
+    K: np.ndarray
+    eye: np.ndarray
+    vertices: np.ndarray
+    side: np.ndarray
+
+    def places(self, edge: np.ndarray, fraction: np.ndarray) -> "_Places":
+        """Places on edges (N, M), at fractions (N, M) of their lengths."""
+        rows = np.arange(len(edge))[:, None]
+        ends = self.level.edges.edges[edge]  # (N, M, 2)
+        start = self.vertices[rows, ends[..., 0]]
+        along = self.vertices[rows, ends[..., 1]]
+        along -= start
+        at = start + fraction[..., None] * along
+        sign = np.where(self.side[rows, edge], -1, 1).astype(np.float32)
+        normal = _across(_cross(start, along), self.K) * sign[..., None]
+        return _Places(edge, fraction, at, normal)
+
+    def pixels(self, at: np.ndarray) -> np.ndarray:
+        """(N, M, 2) pixels of points (N, M, 3) in the cameras' frames."""
+        depth = np.maximum(at[..., 2], np.float32(NEAR_PLANE * self.level.radius))
+        pixels: np.ndarray = at @ self.K[:, :2].transpose(0, 2, 1) / depth[..., None]
+        return pixels
+
+    def depth_at(self, pixels: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """See :meth:`_Level.depth_at`."""
+        return self.level.depth_at(pixels, self.K, self.R, self.eye, wanted)
+
+    def smoothed(self, places: "_Places") -> "_Places":
+        """Places whose normals are those of the smooth surface, where the mesh stands for one."""
+        edges = self.level.edges
+        ends = edges.edges[places.edge]
+        start = edges.normals[ends[..., 0]]
+        end = edges.normals[ends[..., 1]]
+        surface_normal = start + places.fraction[..., None] * (end - start)
+        smooth = _across(surface_normal @ self.R.transpose(0, 2, 1), self.K)
+        cosine = (smooth * places.normal).sum(axis=-1)
+        agrees = edges.is_smooth[places.edge] & (np.abs(cosine) > 0.5)
+        normal = np.where(agrees[..., None], np.sign(cosine)[..., None] * smooth, places.normal)
+        return replace(places, normal=normal)
+
+    def seen_on_occluding_contours(self, places: "_Places", valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(N, M) bool: which of the ``valid`` places are not hidden and lie in front of something farther away, and
+        which of these have the background beside them."""
+        outside = self.pixels(places.at) + np.float32(ASIDE) * places.normal
+        depth = self.depth_at(outside, valid)
+        is_seen = valid & (depth - places.at[..., 2] > OCCLUSION_JUMP * self.level.radius)
+        return is_seen, is_seen & np.isinf(depth)
+
+    def seen_on_creases(self, places: "_Places", valid: np.ndarray) -> np.ndarray:
+        """(N, M) bool: which of the ``valid`` places are not hidden, and fold the surface at the scale of the crop."""
+        radius = self.level.radius
+        z = places.at[..., 2]
+        pixel = self.pixels(places.at)
+        step = np.float32(CREASE_SCALE * self.size)
+        is_seen = valid & (self.depth_at(pixel, valid) > z - VISIBLE_TOLERANCE * radius)
+        ahead = self.depth_at(pixel + step * places.normal, is_seen)
+        back = self.depth_at(pixel - step * places.normal, is_seen)
+        with np.errstate(invalid="ignore"):
+            bend = np.abs(ahead - 2.0 * z + back) / step * self.K[:, :1, 0] / z
+            largest_jump = np.maximum(np.abs(ahead - z), np.abs(back - z))
+        is_fold: np.ndarray = is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP * radius)
+        return is_fold
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Places (N, M) on edges of N views: the edge, the fraction of its length, the point (N, M, 3) in the camera's
+    frame, and the unit normal (N, M, 2) across the edge in the image."""
+
+    edge: np.ndarray
+    fraction: np.ndarray
+    at: np.ndarray
+    normal: np.ndarray
 
 
 class MeshContours:
@@ -100,10 +208,12 @@ class MeshContours:
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self.centre, self.radius = mesh_centre(mesh), mesh_radius(mesh)
+        self.centre = mesh_centre(mesh)
+        self.radius = mesh_radius(mesh)
         self._levels: dict[int, _Level] = {}
         for size, faces in reversed(LEVELS):  # each is simplified from the next finer one
-            self._levels[size] = level = _Level(mesh, self.centre.numpy(), self.radius, faces)
+            level = _Level(mesh, self.centre.numpy(), self.radius, faces)
+            self._levels[size] = level
             mesh = trimesh.Trimesh(level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False)
 
     def points(
@@ -111,84 +221,82 @@ class MeshContours:
     ) -> ContourPoints:
         """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
         ``density`` is a fraction of the usual number of points."""
-        T, K = T_cam_from_model.numpy(), camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
+        T = T_cam_from_model.numpy()
+        K = camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
         edges = level.edges
-        position = T[:, :3, :3] @ self.centre.numpy() + T[:, :3, 3]
-        eye = -(position[:, None] @ T[:, :3, :3])[:, 0]
+        R = T[:, :3, :3]
+        position = R @ self.centre.numpy() + T[:, :3, 3]
+        eye = -(position[:, None] @ R)[:, 0]
         on_contour, side = edges.sides(eye)
-        R, position, K, eye = (float32(each) for each in (T[:, :3, :3], position, K, eye))
-        of, edge = np.nonzero(on_contour | edges.is_crease)
-        vertices, length = level.seen(R, position, K, size, of, edge)
-        is_occluding = on_contour[of, edge]
-        rows, parts = np.arange(len(T))[:, None], []
-        for chosen, count, most, occluding in (
-            (is_occluding, OCCLUDING_CANDIDATES, MAX_OCCLUDING, True),
-            (~is_occluding, CREASE_CANDIDATES, MAX_CREASES, False),
-        ):
-            number, fraction, valid = _spread(of[chosen], length[chosen], len(T), round(density * count))
-            index = np.append(edge[chosen], 0)[number]
-            ends = edges.edges[index]  # (N, M, 2)
-            a, along = vertices[rows, ends[..., 0]], vertices[rows, ends[..., 1]]
-            along -= a
-            at = a + fraction[..., None] * along
-            z = at[..., 2]
-            normal = _across(_cross(a, along), K) * np.where(side[rows, index], -1, 1).astype(np.float32)[..., None]
-            if occluding:  # of a smooth surface, interpolate the vertices' normals
-                n0, n1 = edges.normals[ends[..., 0]], edges.normals[ends[..., 1]]
-                smooth = _across((n0 + fraction[..., None] * (n1 - n0)) @ R.transpose(0, 2, 1), K)
-                agreement = (smooth * normal).sum(axis=-1)
-                agree = edges.is_smooth[index] & (np.abs(agreement) > 0.5)
-                normal = np.where(agree[..., None], np.sign(agreement)[..., None] * smooth, normal)
-            pixel = at @ K[:, :2].transpose(0, 2, 1) / np.maximum(z, np.float32(NEAR_PLANE * self.radius))[..., None]
+        vertices = level.vertices_in_cameras(float32(R), float32(position))
+        views = _Views(level, size, float32(R), float32(position), float32(K), float32(eye), vertices, side)
+        pose, edge = np.nonzero(on_contour | edges.is_crease)
+        length = level.lengths_in_crop(vertices, views.K, size, pose, edge)
+        is_occluding = on_contour[pose, edge]
+
+        def points_on(chosen: np.ndarray, candidates: int, most: int, *, occluding: bool) -> tuple[np.ndarray, ...]:
+            """``most`` points of each pose on the ``chosen`` (M,) edges, of ``candidates`` whose visibility is tested:
+            the fields of :class:`ContourPoints`."""
+            number, fraction, valid = _spread(pose[chosen], length[chosen], len(T), round(density * candidates))
+            places = views.places(np.append(edge[chosen], 0)[number], fraction)
             if occluding:
-                hit = level.depth_at(pixel + np.float32(ASIDE) * normal, K, R, eye, valid)
-                valid &= hit - z > OCCLUSION_JUMP * self.radius
-                outline = valid & np.isinf(hit)
+                places = views.smoothed(places)
+                is_seen, is_outline = views.seen_on_occluding_contours(places, valid)
             else:
-                step = np.float32(CREASE_SCALE * size)
-                valid &= level.depth_at(pixel, K, R, eye, valid) > z - VISIBLE_TOLERANCE * self.radius
-                ahead, back = (level.depth_at(pixel + k * normal, K, R, eye, valid) for k in (step, -step))
-                with np.errstate(invalid="ignore"):
-                    bend = np.abs(ahead - 2.0 * z + back) / step * K[:, :1, 0] / z
-                    flat = np.maximum(np.abs(ahead - z), np.abs(back - z)) < 2.0 * OCCLUSION_JUMP * self.radius
-                valid &= (bend > CREASE_BEND) & flat
-                outline = np.zeros_like(valid)
-            chosen, valid = _evenly(valid, round(density * most))
-            model = (at[rows, chosen] - position[:, None]).astype(np.float64) @ T[:, :3, :3] + self.centre.numpy()
-            parts.append((model, normal[rows, chosen].astype(np.float64), valid, outline[rows, chosen] & valid))
-        return ContourPoints(*(torch.from_numpy(np.concatenate(each, axis=1)) for each in zip(*parts, strict=True)))
+                is_seen = views.seen_on_creases(places, valid)
+                is_outline = np.zeros_like(is_seen)
+            index, is_point = _evenly(is_seen, round(density * most))
+            rows = np.arange(len(T))[:, None]
+            from_centre = (places.at[rows, index] - views.position[:, None]).astype(np.float64)
+            model = from_centre @ R + self.centre.numpy()
+            normals = places.normal[rows, index].astype(np.float64)
+            return model, normals, is_point, is_outline[rows, index] & is_point
+
+        contours = points_on(is_occluding, OCCLUDING_CANDIDATES, MAX_OCCLUDING, occluding=True)
+        creases = points_on(~is_occluding, CREASE_CANDIDATES, MAX_CREASES, occluding=False)
+        together = (np.concatenate(parts, axis=1) for parts in zip(contours, creases, strict=True))
+        return ContourPoints(*map(torch.from_numpy, together))
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The first two components of the cross products of (N, M, 3)."""
-    return np.stack([a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1], a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]], -1)
+    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    return np.stack([x, y], axis=-1)
 
 
 def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 2 or 3),
     appear."""
-    n = plane[..., :2] / np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)[:, None]
-    unit: np.ndarray = n / np.maximum(np.hypot(n[..., :1], n[..., 1:]), np.float32(1e-30))
+    focal_lengths = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)
+    normal = plane[..., :2] / focal_lengths[:, None]
+    length = np.hypot(normal[..., :1], normal[..., 1:])
+    unit: np.ndarray = normal / np.maximum(length, np.float32(1e-30))
     return unit
 
 
-def _spread(of: np.ndarray, length: np.ndarray, poses: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``of`` (M,) are the edges'
+def _spread(pose: np.ndarray, length: np.ndarray, poses: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose`` (M,) are the edges'
     poses, ascending. Returns (N, count): the number of the edge, the fraction of its length, whether there is one."""
     end = np.concatenate([[0.0], np.nan_to_num(length).cumsum(dtype=np.float64)])
-    borders = np.searchsorted(of, np.arange(poses + 1))
-    start, total = end[borders[:-1], None], np.diff(end[borders])[:, None]
-    target = start + (np.arange(count) + 0.5) / count * total
-    number = np.clip(np.searchsorted(end, target) - 1, borders[:-1, None], np.maximum(borders[1:, None] - 1, 0))
-    fraction = (target - end[number]) / np.maximum(np.diff(end, append=np.inf)[number], 1e-30)
-    return number, fraction.clip(0.0, 1.0).astype(np.float32), np.broadcast_to(total > 0, number.shape).copy()
+    borders = np.searchsorted(pose, np.arange(poses + 1))
+    first = borders[:-1, None]
+    last = np.maximum(borders[1:, None] - 1, 0)
+    total = np.diff(end[borders])[:, None]
+    target = end[first] + (np.arange(count) + 0.5) / count * total
+    number = np.clip(np.searchsorted(end, target) - 1, first, last)
+    length_of_edge = np.diff(end, append=np.inf)[number]
+    fraction = (target - end[number]) / np.maximum(length_of_edge, 1e-30)
+    has_edges = np.broadcast_to(total > 0, number.shape).copy()
+    return number, fraction.clip(0.0, 1.0).astype(np.float32), has_edges
 
 
 def _evenly(valid: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices (N, most) of valid entries (N, M), evenly chosen where there are more, and which are not padding."""
     order = np.argsort(~valid, axis=1, kind="stable")
     count = valid.sum(axis=1, keepdims=True)
-    k = np.arange(most)[None]
-    rank = np.where(count > most, (k * np.maximum(count, 1)) // most, k)
-    return np.take_along_axis(order, np.minimum(rank, valid.shape[1] - 1), axis=1), k < count
+    place = np.arange(most)[None]
+    rank = np.where(count > most, (place * np.maximum(count, 1)) // most, place)
+    index = np.take_along_axis(order, np.minimum(rank, valid.shape[1] - 1), axis=1)
+    return index, place < count

@@ -62,6 +62,36 @@ def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     write_file(path, text.getvalue().encode(errors="backslashreplace"))  # file names may be no UTF-8
 
 
+class CsvFile:
+    """A CSV file that grows: each row is on disk once it is known. It begins, anew, with the first row.
+
+    Cells are written as by :func:`write_csv`.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Sequence[str]) -> None:
+        self.path = path
+        self._header: Sequence[str] | None = header
+
+    def add(self, row: Sequence[object]) -> None:
+        """Write one row."""
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        mode = "ab"
+        if self._header is not None:
+            writer.writerow(self._header)
+            mode = "wb"
+        writer.writerow(list(map(_inert, row)))
+        try:
+            with self.path.open(mode) as file:
+                file.write(text.getvalue().encode(errors="backslashreplace"))
+        except OSError as error:
+            raise OutputError(f"cannot be written ({error.strerror}); make room", subject=self.path) from error
+        self._header = None
+
+
 def _inert(cell: object) -> object:
     """The cell, as a text that no spreadsheet takes for a formula; numbers are none."""
     if not isinstance(cell, str) or not cell.startswith(("=", "+", "-", "@", "\t", "\r")):

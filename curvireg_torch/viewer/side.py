@@ -139,11 +139,11 @@ class Answers:
         result, photo, box = shot.require_result(), shot.photo, shot.found_box
         assert photo is not None
         image, around = photo.image, [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
-        renderer, hypotheses = result.registrar.describer.renderer, result.registration.hypotheses
+        describer, hypotheses = result.registrar.describer, result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
         def make() -> list[bytes]:
-            return [thumbnail(renderer, shot.projection_of(pose), image, around) for pose in hypotheses]
+            return [thumbnail(describer, shot.projection_of(pose), image, around) for pose in hypotheses]
 
         pictures = await self.workspace.run("page", make) or ()
         self.cards.clear()

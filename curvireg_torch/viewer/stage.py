@@ -324,4 +324,4 @@ def pose_layers(
     solid = np.zeros((*small, 4), np.uint8)
     solid[mask, :3] = (grey[mask, None] * np.array([255, 235, 190])).round().astype(np.uint8)
     solid[mask, 3] = 255
-    return png(solid), png(contour_layer(depth, K)), mask
+    return png(solid), png(contour_layer(registrar.describer, T, K, small)), mask

@@ -1,4 +1,4 @@
-"""Contours of a rendered mesh as anti-aliased lines with a dark rim, which show on any background."""
+"""The contours that were fitted, as anti-aliased lines with a dark rim, which show on any background."""
 
 from collections.abc import Sequence
 
@@ -7,14 +7,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..rendering import DepthRenderer
+from ..geometry.cameras import boxes_around, projected
+from ..geometry.crops import crop_transforms, square_boxes
+from ..matching import ViewDescriber
+from ..rendering.contours import LEVELS
 from .encoding import to_uint8
 
 OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
-JUMP = 0.03  # step at an occluding edge inside the outline, as a fraction of the depth range
-CREASE_ANGLE = np.deg2rad(25.0)  # least angle between the faces at a crease, in the section along a row or a column
-SMOOTH, SHORT = 0.01, 0.06  # fractions of the object's size: over which faces are averaged; of the shortest inner edge
+FIT_SIZE = LEVELS[-1][0]  # Side in px of the crop in which contours are found, as in the last rounds of a fit
+# Side of the object in px of the picture for which a fit's number of points would be drawn without gaps
+SIDE_WITHOUT_GAPS = 20.0
+MAX_DENSITY = 80.0  # Largest multiple of a fit's number of points
+# Shortest inner edge that is drawn, as a fraction of the object's size: rough meshes have bumps of all directions
+SHORT = 0.06
 
 
 def line_width(size: Sequence[int]) -> float:
@@ -32,7 +38,7 @@ def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, 
 
 
 def draw_window(
-    renderer: DepthRenderer,
+    describer: ViewDescriber,
     projection: tuple[Tensor, Tensor] | None,
     image: Tensor,
     window: Sequence[int],
@@ -61,39 +67,92 @@ def draw_window(
     if projection is not None:
         T, K = projection
         K = resize @ K.cpu().double()
-        layer = contour_layer(renderer.render(T[None], K, picture.shape[:2])[0, 0], K)
+        layer = contour_layer(describer, T, K, picture.shape[:2])
         drawn = layer[..., 3] > 0
         alpha = layer[drawn][:, 3:] / 255.0
         picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
     return picture
 
 
-def contour_layer(depth: Tensor, camera_matrix: Tensor) -> np.ndarray:
-    """Outline (green), occluding edges and creases (orange) of a depth view, on a transparent layer.
+def contour_layer(describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]) -> np.ndarray:
+    """Outline (green), inner occluding edges and creases (orange) of a mesh at a pose, on a transparent layer.
 
-    ``depth`` (H, W) is 0 in the background; the result is (H, W, 4) uint8 RGBA.
+    Args:
+        describer: of the mesh.
+        T, K: (4, 4) ``T_cam_from_model`` and (3, 3) camera matrix in px of the layer.
+        size: (H, W) of the layer.
+
+    Returns:
+        (H, W, 4) uint8 RGBA.
     """
-    z = depth.cpu().float().numpy()
-    layer = np.zeros((*z.shape, 4), np.uint8)
-    rows, columns = np.nonzero(z.any(axis=1))[0], np.nonzero(z.any(axis=0))[0]
-    if len(rows) == 0:
+    layer = np.zeros((*size, 4), np.uint8)
+    pixels, is_outline = contour_pixels(describer, T, K, size)
+    outline = _mask(pixels[is_outline], size)
+    object_size = float(np.ptp(pixels, axis=0).max(initial=0.0)) if len(pixels) else 0.0
+    inner = _long_lines(_mask(pixels[~is_outline], size), SHORT * object_size) & ~outline
+    drawn = outline | inner
+    if not drawn.any():
         return layer
-    width = line_width(z.shape)
+    width = line_width(size)
     margin = int(3 * width) + 2
-    near = np.s_[
-        max(0, rows[0] - margin) : rows[-1] + margin + 1, max(0, columns[0] - margin) : columns[-1] + margin + 1
-    ]
-    outline, inner = _edges(z[near], camera_matrix.diagonal()[:2].tolist())
-    to_outline, to_inner = _distance(outline), _distance(inner)
-    green, orange = _coverage(to_outline, width / 2), _coverage(to_inner, max(0.75, width / 3))
-    dark = RIM_OPACITY * np.maximum(_coverage(to_outline, width), _coverage(to_inner, 0.85 * width))
-    colour, alpha = np.zeros((*outline.shape, 3), np.float32), dark
+    rows = np.nonzero(drawn.any(axis=1))[0]
+    columns = np.nonzero(drawn.any(axis=0))[0]
+    top = max(0, rows[0] - margin)
+    left = max(0, columns[0] - margin)
+    near = np.s_[top : rows[-1] + margin + 1, left : columns[-1] + margin + 1]
+    to_outline = _distance(outline[near])
+    to_inner = _distance(inner[near])
+    green = _coverage(to_outline, width / 2)
+    orange = _coverage(to_inner, max(0.75, width / 3))
+    alpha = RIM_OPACITY * np.maximum(_coverage(to_outline, width), _coverage(to_inner, 0.85 * width))
+    colour = np.zeros((*alpha.shape, 3), np.float32)
     for paint, cover in ((CREASE, orange), (OUTLINE, green)):
         colour += cover[..., None] * (np.array(paint, np.float32) - colour)
         alpha = cover + (1 - cover) * alpha
     layer[near][..., :3] = np.round(colour / np.maximum(alpha, 1e-6)[..., None])
     layer[near][..., 3] = np.round(255 * alpha)
     return layer
+
+
+def contour_pixels(
+    describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (P, 2) of the contours that a fit compares at a pose, and which of them are on the outline (P,) bool.
+
+    They are found in the crop of the projected mesh, as in the last rounds of a fit, or in the picture of ``size``
+    (H, W) if a part of the mesh is behind the camera, with as many points as a line without gaps needs.
+    """
+    pose = T[None].double().cpu()
+    K = K.double().cpu()
+    depth = describer.hull @ pose[0, 2, :3] + pose[0, 2, 3]
+    if bool((depth > 0).all()):
+        box = boxes_around(projected(describer.hull, pose, K))
+    else:
+        box = torch.tensor([[0.0, 0.0, size[1], size[0]]], dtype=torch.float64)
+    crop_camera = crop_transforms(square_boxes(box, describer.settings.margin), FIT_SIZE) @ K
+    side = float((box[0, 2:] - box[0, :2]).max())
+    density = min(max(side / SIDE_WITHOUT_GAPS, 1.0), MAX_DENSITY)
+    points = describer.contours.points(pose, crop_camera, FIT_SIZE, density=density)
+    is_point = points.valid[0]
+    pixels = projected(points.model[0, is_point], pose, K)[0]
+    return pixels.numpy(), points.outline[0, is_point].numpy()
+
+
+def _mask(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """(H, W) bool: the pixels in which points (P, 2) lie; points outside are left out."""
+    mask = np.zeros(tuple(size), bool)
+    columns, rows = np.round(pixels).astype(np.int64).T
+    is_inside = (rows >= 0) & (rows < size[0]) & (columns >= 0) & (columns < size[1])
+    mask[rows[is_inside], columns[is_inside]] = True
+    return mask
+
+
+def _long_lines(lines: np.ndarray, least: float) -> np.ndarray:
+    """Lines (H, W) without their parts that are shorter than ``least`` px; points at most two px apart are a line."""
+    connected = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8))
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(connected, connectivity=8)
+    extent = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) - 2
+    return np.asarray(lines & (extent >= least)[labels])
 
 
 def _distance(lines: np.ndarray) -> np.ndarray:
@@ -107,41 +166,3 @@ def _distance(lines: np.ndarray) -> np.ndarray:
 
 def _coverage(distance: np.ndarray, reach: float) -> np.ndarray:
     return np.asarray(np.clip(reach + 0.5 - distance, 0.0, 1.0))
-
-
-def _edges(z: np.ndarray, focal: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (H, W) on the outline, and on occluding edges and creases inside it."""
-    mask = z > 0
-    inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    size = max(mask.any(axis=0).sum(), mask.any(axis=1).sum())
-    window, limit = max(2, round(SMOOTH * size)), JUMP * float(np.ptp(z[mask]))
-    rows = _jumps(z, limit) & inside | _creases(z, focal[0], window, limit)
-    columns = _jumps(z.T, limit) & inside.T | _creases(np.ascontiguousarray(z.T), focal[1], window, limit)
-    return mask & ~inside, _long(rows | columns.T, SHORT * size)
-
-
-def _jumps(z: np.ndarray, limit: float) -> np.ndarray:
-    """Steps along the rows larger than a neighbouring one by ``limit``: on a steep face all steps are equal."""
-    step = np.abs(np.diff(z, axis=1))
-    padded = np.pad(step, [(0, 0), (1, 1)], mode="edge")
-    return np.pad(step - np.minimum(padded[:, :-2], padded[:, 2:]) > limit, [(0, 0), (0, 1)])
-
-
-def _creases(z: np.ndarray, focal: float, window: int, limit: float) -> np.ndarray:
-    """Where the surface's mean direction changes along the rows from one ``window`` of px to the next."""
-    inverse = 1.0 / np.where(z > 0, z, 1.0)  # linear in px across a plane
-    step, middle = np.diff(inverse, axis=1), 0.5 * (inverse[:, 1:] + inverse[:, :-1])
-    connected = (z[:, 1:] > 0) & (z[:, :-1] > 0) & (np.abs(np.diff(z, axis=1)) < limit)
-    direction = np.where(connected, np.arctan(focal * step / middle), 0.0)
-    kernel = np.repeat([-1.0, 1.0], window)[None] / window  # no window reaches across an occluding edge
-    whole = cv2.erode(connected.astype(np.uint8), np.ones(kernel.shape), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    change = np.abs(cv2.filter2D(direction, -1, kernel)) * whole
-    peak = cv2.dilate(change, np.ones((1, 2 * window + 1)))
-    return np.pad((change >= peak) & (change > CREASE_ANGLE), [(0, 0), (0, 1)])
-
-
-def _long(lines: np.ndarray, least: float) -> np.ndarray:
-    """Lines without their parts that are shorter than ``least`` px: bumps of rough meshes."""
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(lines.astype(np.uint8), connectivity=8)
-    extent = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-    return np.asarray(lines & (extent >= least)[labels])

@@ -11,12 +11,11 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from ..geometry import rotation_error
-from ..matching.describe import depth_filter
+from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
 from ..registration.result import pose_in_words, verdict
-from ..rendering import DepthRenderer
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
@@ -43,12 +42,12 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
     """
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
-    renderer = registrar.of_model(getattr(result, "model", 0)).describer.renderer
-    return draw_window(renderer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist())
+    describer = registrar.of_model(getattr(result, "model", 0)).describer
+    return draw_window(describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist())
 
 
 def views_sheet(
-    renderer: DepthRenderer, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
+    describer: ViewDescriber, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
 ) -> np.ndarray:
     """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or None, caption."""
     columns = math.ceil(math.sqrt(len(views)))
@@ -56,7 +55,7 @@ def views_sheet(
     tiles = []
     for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        tiles.append((caption, draw_window(renderer, projection, image, (0, 0, W, H), side / max(H, W), box)))
+        tiles.append((caption, draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box)))
     height = max(picture.shape[0] for _, picture in tiles)
     sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
     _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
@@ -95,7 +94,7 @@ def side_pictures(
         "photograph": to_uint8(crop[0]),
         "photograph field": _field_picture(field[0]),
         "pose": to_uint8(shaded[-3:] if len(shaded) > 1 else shaded),
-        "view field": _field_picture(depth_filter(settings)(registrar.describer.depth(*at)[0])[0]),
+        "view field": _field_picture(registrar.describer.fields(*at)[0]),
     }
 
 
@@ -121,8 +120,7 @@ def registration_sheet(
     registrar = registrar.of_model(result.model)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
-    renderer = registrar.describer.renderer
-    photograph = draw_window(renderer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist())
+    photograph = draw_window(registrar.describer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist())
     height, width = photograph.shape[0], max(NARROWEST, photograph.shape[1])
     count = 3 + len(result.hypotheses)
     rows = -(-count // (width // TILE))
@@ -166,9 +164,10 @@ def _small_pictures(
     registrar: Registrar, result: Registration, item: ImageItem, side: int
 ) -> list[tuple[str, np.ndarray]]:
     """Captions and pictures, at most ``side`` px wide and high."""
-    window, renderer = close_up(item.size, item.box.tolist()), registrar.describer.view_renderer
+    window = close_up(item.size, item.box.tolist())
     scale = side / max(window[2] - window[0], window[3] - window[1])
-    close_ups = [draw_window(renderer, h.projection, item.image, window, scale) for h in result.hypotheses]
+    describer = registrar.describer
+    close_ups = [draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses]
     sides = side_pictures(registrar, result, item.image, item.box)
     names = "photograph field", "view field", "pose"
     captions = "edges of the photograph", "edges of the mesh", "mesh at this pose"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from ..rendering import DepthRenderer
+from ..matching import ViewDescriber
 from ..utils.files import write_file
 from .contours import close_up, draw_window
 from .encoding import jpeg
@@ -48,14 +48,16 @@ class SheetEntry:
     rank: tuple[float, ...] = ()
 
 
-def thumbnail(renderer: DepthRenderer, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]) -> bytes:
+def thumbnail(
+    describer: ViewDescriber, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]
+) -> bytes:
     """JPEG of a (3, H, W) uint8 photograph around a box in px, with the mesh's contours at the pose.
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3) of the photograph.
     """
     window = close_up(image.shape[-2:], box)
     scale = min(1.0, SIDE / max(window[2] - window[0], window[3] - window[1]))
-    return jpeg(draw_window(renderer, projection, image, window, scale, box), 80)
+    return jpeg(draw_window(describer, projection, image, window, scale, box), 80)
 
 
 def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int = MAX_ENTRIES) -> None:

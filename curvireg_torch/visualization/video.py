@@ -82,9 +82,9 @@ def annotated_frame(registrar: Registrar, image: Tensor, result: Registration | 
     """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose, and a caption."""
     H, W = image.shape[-2:]
     found = isinstance(result, Registration)
-    renderer = registrar.of_model(result.model if found else 0).describer.renderer
+    describer = registrar.of_model(result.model if found else 0).describer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
-    picture = draw_window(renderer, result.projection if found else None, image, (0, 0, W, H), scale)
+    picture = draw_window(describer, result.projection if found else None, image, (0, 0, W, H), scale)
     text, colour = caption(result)
     scale = max(0.4, picture.shape[1] / 1200)
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)

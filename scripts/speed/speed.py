@@ -9,10 +9,14 @@ Writes scripts/results/speed.json and, without --out, the table of docs/performa
 of its own; each step counts with its least time and memory over the rounds. Ratios are fair on a busy machine, times
 only on an idle one. The other checkout is of 2026-11-23 or later.
 
-- cold, warm: ``curvireg register`` from process start to its files, without and with a cached bank
+New photographs were never registered with the cache in use: what a first registration describes may not be kept for the
+second. An earlier command has registered ten others of the same mesh, but for ``cold`` and ``fresh``.
+
+- cold, warm: ``curvireg register`` from process start to its files, a new photograph, without and with a cached bank
 - bank: ``ViewBank.build`` of all views
-- rank: a photograph without contour fit; one: the whole registration; both are means of four poses
-- many: each of many photographs in one call
+- rank: a new photograph without contour fit
+- fresh: each of the first ten photographs of a mesh whose bank is cached, one by one
+- one: a new photograph; repeated: the same photograph again; many: each of many new photographs in one call
 - follow: each frame of a video in which the photograph moves by 2 px
 - layers: forward and backward pass of three filter layers, each followed by HOG; a photograph of a batch
 """
@@ -20,6 +24,7 @@ only on an idle one. The other checkout is of 2026-11-23 or later.
 import argparse
 import json
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -29,8 +34,10 @@ from typing import Any
 from scripts import _shared
 
 ROOT = Path(__file__).resolve().parents[2]
-STEPS = ("cold", "warm", "bank", "rank", "one", "many", "follow", "layers")
-FRAMES, POSES = 12, 4
+STEPS = ("cold", "warm", "bank", "rank", "fresh", "one", "repeated", "many", "follow", "layers")
+FRAMES = 12
+EARLIER = 10  # photographs that an earlier command registered
+NEW = 4  # new photographs of the steps that register one after another
 SUBDIVISIONS = 6  # of an icosphere: 81,920 faces
 CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
 
@@ -38,8 +45,8 @@ HERE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed
 """Import of this file in a process that imports another checkout's package."""
 
 
-def write_inputs(folder: str) -> None:
-    """Write a dented sphere, photographs of it in several poses and their boxes; runs in this checkout."""
+def write_inputs(folder: str, photographs: int) -> None:
+    """Write a dented sphere, photographs of it in random poses and their boxes; runs in this checkout."""
     import cv2
     import numpy as np
     import torch
@@ -54,8 +61,10 @@ def write_inputs(folder: str) -> None:
     mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
     mesh.export(Path(folder, "mesh.ply"))
     K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
-    generator, size, boxes = torch.Generator().manual_seed(0), (480, 640), []
-    for k in range(POSES):
+    generator = torch.Generator().manual_seed(0)
+    size = (480, 640)
+    boxes = []
+    for k in range(EARLIER + photographs):
         pose = random_pose(mesh, K, size, generator)
         photograph, box = synthesize_photograph(mesh, pose, K, size, generator)
         pixels = (255 * photograph.permute(1, 2, 0).flip(2).numpy()).round().astype("uint8")
@@ -84,8 +93,8 @@ def measure_layers(photographs: int, device: str) -> float:
     return min(seconds) / photographs
 
 
-def measure(step: str, folder: str, photographs: int, device: str) -> float:
-    """Seconds of a step in whichever checkout this process imports."""
+def measure(step: str, folder: str, photographs: int, device: str) -> dict[str, float]:
+    """Wall and processor seconds of a step in whichever checkout this process imports."""
     from dataclasses import replace
 
     import torch
@@ -93,13 +102,14 @@ def measure(step: str, folder: str, photographs: int, device: str) -> float:
     import curvireg_torch as cr
 
     if step == "layers":
-        return measure_layers(photographs, device)
-    mesh, K = cr.load_mesh(Path(folder, "mesh.ply")), cr.camera_matrix(*CAMERA, dtype=torch.float64)
-    paths = [str(Path(folder, f"photo{k}.png")) for k in range(POSES)]
+        return {"seconds": measure_layers(photographs, device)}
+    mesh = cr.load_mesh(Path(folder, "mesh.ply"))
+    K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     if step == "bank":
-        start = time.perf_counter()
+        watch = Stopwatch()
         cr.ViewBank.build(mesh, progress=False, device=device)
-        return time.perf_counter() - start
+        return watch.seconds(1)
+    paths = [str(Path(folder, f"photo{k}.png")) for k in range(EARLIER + photographs)]
     boxes = torch.tensor(json.loads(Path(folder, "boxes.json").read_text()))
     pipeline = replace(cr.Pipeline(), contours=step != "rank")
     registrar = cr.Registrar(mesh, pipeline=pipeline, device=device, progress=False)
@@ -107,73 +117,122 @@ def measure(step: str, folder: str, photographs: int, device: str) -> float:
         from curvireg_torch.data import read_image
         from curvireg_torch.registration import Follower
 
-        first, follower = read_image(paths[0]), Follower(registrar, K)
+        first = read_image(paths[0])
+        follower = Follower(registrar, K)
         assert follower(first, boxes[0]).ok
         frames = [first.roll(2 * k, dims=-1) for k in range(1, FRAMES)]
-        start = time.perf_counter()
+        watch = Stopwatch()
         for frame in frames:
             follower(frame)
-        return (time.perf_counter() - start) / len(frames)
+        return watch.seconds(len(frames))
 
-    def register(images: list[str], boxes: torch.Tensor) -> float:
-        start = time.perf_counter()
-        results = registrar(images, boxes, K)
+    def register(index: Sequence[int]) -> None:
+        results = registrar([paths[k] for k in index], boxes[list(index)], K)
         assert all(result.ok for result in results)
-        return time.perf_counter() - start
 
-    register(paths[:1], boxes[:1])
+    earlier = range(EARLIER)
+    new = range(EARLIER, EARLIER + photographs)
+    if step == "earlier":
+        register(earlier)
+        return {"seconds": 0.0}
+    if step == "fresh":
+        one_by_one: Sequence[int] = earlier
+    else:
+        register(earlier[:1])  # loads what every later photograph shares
+        one_by_one = new[:NEW]
+    if step == "repeated":
+        for k in one_by_one:
+            register([k])
+    watch = Stopwatch()
     if step == "many":
-        index = torch.arange(photographs) % POSES
-        return register([paths[k] for k in index.tolist()], boxes[index]) / photographs
-    return sum(min(register(paths[k : k + 1], boxes[k : k + 1]) for _ in range(3)) for k in range(POSES)) / POSES
+        register(new)
+        return watch.seconds(len(new))
+    for k in one_by_one:
+        register([k])
+    return watch.seconds(len(one_by_one))
+
+
+class Stopwatch:
+    """Wall and processor time since it was made."""
+
+    def __init__(self) -> None:
+        self.wall = time.perf_counter()
+        self.processor = time.process_time()
+
+    def seconds(self, count: int) -> dict[str, float]:
+        """Of one of ``count`` equal parts."""
+        wall = (time.perf_counter() - self.wall) / count
+        processor = (time.process_time() - self.processor) / count
+        return {"seconds": wall, "processor_seconds": processor}
 
 
 def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str) -> dict[str, float]:
-    """Seconds and MB of a step in a checkout."""
+    """Seconds, processor seconds and MB of a step in a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
-    if step in ("cold", "warm"):
-        box = json.loads((folder / "boxes.json").read_text())[0]
-        words = ["-m", "curvireg_torch", "register", "photo0.png", "mesh.ply", "--out", "out", "--box", *map(str, box)]
-        words += ["--camera", *map(str, CAMERA)]
-        if step == "cold":
-            environment["CURVIREG_CACHE"] = tempfile.mkdtemp(dir=folder)
-        seconds, usage, _ = _shared.run_process(words, folder, environment)
-    else:
-        words = ["-c", f"{HERE}; print(measure({step!r}, {str(folder)!r}, {photographs}, {device!r}))"]
+    if step not in ("cold", "warm"):
+        words = [
+            "-c",
+            f"{HERE}; import json; print(json.dumps(measure({step!r}, {str(folder)!r}, {photographs}, {device!r})))",
+        ]
         _, usage, output = _shared.run_process(words, folder, environment)
-        seconds = float(output.split()[-1])
-    return {"seconds": seconds, "megabytes": usage.ru_maxrss / 1024}
+        return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
+    boxes = json.loads((folder / "boxes.json").read_text())
+    words = ["-m", "curvireg_torch", "register", f"photo{EARLIER}.png", "mesh.ply", "--out", "out"]
+    words += ["--box", *map(str, boxes[EARLIER]), "--camera", *map(str, CAMERA)]
+    seconds, usage, _ = _shared.run_process(words, folder, environment)
+    processor = usage.ru_utime + usage.ru_stime
+    return {"seconds": seconds, "processor_seconds": processor, "megabytes": usage.ru_maxrss / 1024}
 
 
 def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
-        folder, environment = Path(temporary), {**os.environ, "PYTHONPATH": str(ROOT)}
-        _shared.run_process(["-c", f"{HERE}; write_inputs({temporary!r})"], folder, environment)
-        for name, checkout in checkouts.items():  # the first registration caches the bank
-            measured("one", checkout, folder, folder / name, photographs, device)
+        folder = Path(temporary)
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        _shared.run_process(["-c", f"{HERE}; write_inputs({temporary!r}, {photographs})"], folder, environment)
+        for name, checkout in checkouts.items():
+            bank_alone = folder / f"{name}-bank"
+            measured("follow", checkout, folder, bank_alone, photographs, device)  # stores the bank
+            for features in bank_alone.glob("banks/views-*"):
+                features.unlink()
+            used = folder / f"{name}-used"
+            shutil.copytree(bank_alone, used)
+            measured("earlier", checkout, folder, used, photographs, device)
         for step in tuple(steps) * rounds:
             for name, checkout in checkouts.items():
-                new = measured(step, checkout, folder, folder / name, photographs, device)
+                cache = folder / "cache"  # a copy for each measurement: what this one stores, the next one lacks
+                if step != "cold":
+                    shutil.copytree(folder / f"{name}-{'bank' if step == 'fresh' else 'used'}", cache)
+                new = measured(step, checkout, folder, cache, photographs, device)
+                shutil.rmtree(cache, ignore_errors=True)
                 old = found[name].get(step, new)
                 found[name][step] = {key: min(old[key], value) for key, value in new.items()}
     return found
 
 
 def table(record: dict[str, Any]) -> str:
-    """Seconds and memory of each step in Markdown, with the ratio if there are two checkouts."""
+    """Seconds and memory of each step in Markdown, with the ratio of processor times if there are two checkouts."""
     times = record["times"]
-    rows = [["step", *(f"{name} ({record['commits'][name]})" for name in times), "ratio"]]
+    columns = [f"{name} ({record['commits'][name]})" for name in times]
+    rows = [["step", *columns, "ratio of processor times"]]
     for step in times["now"]:
-        each = [found[step] for found in times.values()]
-        cells = [f"{one['seconds']:.2f} s, {one['megabytes']:.0f} MB" for one in each]
-        rows.append([f"`{step}`", *cells, f"{each[-1]['seconds'] / each[0]['seconds']:.2f}"])
+        measurements = [steps[step] for steps in times.values()]
+        key = "processor_seconds" if "processor_seconds" in measurements[-1] else "seconds"
+        ratio = measurements[-1][key] / measurements[0][key]
+        rows.append([f"`{step}`", *map(cell, measurements), f"{ratio:.2f}"])
     if len(times) == 1:
         rows = [row[:-1] for row in rows]
     many = f"{record['photographs']} photographs in `many`"
     stamp = f"{20 * 4**SUBDIVISIONS} faces, {many}; {record['processor']}, {record['date']}."
     return "\n".join([*_shared.table_lines(rows), "", stamp, ""])
+
+
+def cell(measurement: dict[str, float]) -> str:
+    """Seconds, processor seconds and memory of a step."""
+    processor = measurement.get("processor_seconds")
+    also = "" if processor is None else f" ({processor:.2f})"
+    return f"{measurement['seconds']:.2f} s{also}, {measurement['megabytes']:.0f} MB"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -17,6 +17,7 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation.outputs import MARKER
 from curvireg_torch.evaluation.result_files import write_pose_stamped
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
@@ -54,7 +55,8 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     np.testing.assert_allclose(T[:3], np.c_[found["rotation"], found["translation"]], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
-    (tmp_path / "out" / "pose.yaml").write_text("of an older result")
+    assert register(*words, "--format", "ros") == 0
+    assert {"pose.yaml"} == {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
     assert register(*words) == 0
     assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
 
@@ -88,4 +90,5 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, 
     monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
     words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
     assert register(*words) == 2
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "overlay.png", "pose.glb"} - {file}
+    written = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
+    assert written == {"result.json", "overlay.png", "pose.glb"} - {file}

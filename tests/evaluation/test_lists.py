@@ -71,7 +71,7 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     folder.mkdir()
     (folder / os.fsdecode(b"caf\xe9.png")).write_bytes(entry.photo.read_bytes())
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
-    photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box), frames=tmp_path)
+    photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box))
     counts = register_rows(photos, tmp_path / "out", registrar)
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import curvireg_torch as cr
 from curvireg_torch.cli import main
+from curvireg_torch.evaluation.outputs import MARKER
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 from tests._support.scenes import learned_registrar, scene
@@ -37,8 +38,9 @@ def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(folde
     assert result.confidence == document["confidence"]
     assert cr.camera_matrix(*map(float, CAMERA)).dtype == torch.float64
     result.save(tmp_path / "out")
-    files = {path.name for path in (tmp_path / "out").iterdir()}
-    assert files == {path.name for path in tmp_path.iterdir()} - {"out"} == {"result.json", "overlay.png", "pose.glb"}
+    files = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
+    of_command = {path.name for path in tmp_path.iterdir()} - {"out", MARKER}
+    assert files == of_command == {"result.json", "overlay.png", "pose.glb"}
     assert json.loads((tmp_path / "out" / "result.json").read_text())["rotation"] == result.rotation.tolist()
 
 

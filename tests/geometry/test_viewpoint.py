@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 import curvireg_torch as cr
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import ViewSphere, sample_views, uniform_views, up_rotation
+from curvireg_torch.geometry import ViewSphere, paper_views, rotation_error, sample_views, uniform_views, up_rotation
 from curvireg_torch.utils.choices import UP_AXES
 
 
@@ -57,6 +57,21 @@ def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
     nearest = torch.cat([(p @ directions.T).amax(1) for p in probes.split(20_000)])
     radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))
     assert 0.9 * 157 / math.sqrt(count) < radius <= 157 / math.sqrt(count)
+
+
+def test_paper_views_is_the_grid_of_the_paper() -> None:
+    views = paper_views()
+    assert len(views) == 756
+    assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx([1.5, 3.0, 4.5, 6.0, 7.5, 9.0])
+    one_shell = views[views.distance == views.distance[0]]
+    assert len(one_shell) == 126
+    R = one_shell.rotations.double()
+    assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0  # no view twice
+    # Neighbours in elevation differ by 50 degrees about the camera's x axis.
+    grid = one_shell.rotations.view(7, 18, 3, 3)
+    assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)
+    step = grid[1:] @ grid[:-1].mT
+    assert torch.allclose(step[..., 0, 0], torch.tensor(1.0), atol=1e-5)
 
 
 def test_view_functions_refuse_invalid_options() -> None:

@@ -5,12 +5,16 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import sample_views
+from curvireg_torch.matching import ViewBank
 from curvireg_torch.matching.describe import VIEW_FACES, ViewDescriber, quarter_turns
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, Pipeline
 from curvireg_torch.rendering import make_renderer
+from curvireg_torch.terms import Correlation
+
+CAMERAS = ("perspective", "orthographic")
 
 
-@pytest.mark.parametrize("camera", ["perspective", "orthographic"])
+@pytest.mark.parametrize("camera", CAMERAS)
 def test_describer_renders_quarter_turns_once(truck, camera):
     describe = ViewDescriber(truck, BankSettings(image_size=64, camera=camera))
     views = sample_views(azimuth_step=180, elevations=[20], thetas=[0, 35, 90, 180, 215, 270, 305])
@@ -49,3 +53,38 @@ def test_quarter_turns_groups_views_of_equal_direction_and_distance():
     theta = views.theta.round().long()
     assert quarters.tolist() == ((theta[first] - theta) // 90 % 4).tolist()
     assert torch.equal(views.azimuth[first], views.azimuth)
+
+
+def lengths(mesh, name, camera):
+    """(P,) lengths of the fields of six views."""
+    describe = ViewDescriber(mesh, BankSettings(depth_field=name, camera=camera))
+    views = sample_views(azimuth_step=120, elevations=[0, 30])
+    return describe.fields(views.rotations, views.distance * describe.radius).norm(dim=1).flatten()
+
+
+@pytest.mark.parametrize("name", ["ASG", "AR"])
+def test_shading_and_apparent_ridges_see_the_surface_of_perspective_views(truck, name):
+    """Without the camera they are nearly the Hessian's Frobenius norm."""
+    found = {kind: torch.stack([lengths(truck, n, kind) for n in (name, "HFN")]) for kind in CAMERAS}
+    correlation = {kind: float(torch.corrcoef(x)[0, 1]) for kind, x in found.items()}
+    assert correlation["perspective"] < 0.6
+    assert correlation["orthographic"] > 0.7
+    settings = BankSettings(depth_field=name)
+    describe = ViewDescriber(truck, settings)
+    views = sample_views(azimuth_step=180, elevations=[20])
+    at = views.rotations, views.distance * describe.radius
+    bank = ViewBank.build(truck, views, pipeline=Pipeline(bank=settings, terms=(Correlation(),)), progress=False)
+    torch.testing.assert_close(bank.descriptors, describe.descriptor(describe.fields(*at)), rtol=0, atol=2e-3)
+    torch.testing.assert_close(describe.descriptors(*at), describe.descriptor(describe.fields(*at)))
+    torch.testing.assert_close(describe.described(*at)[0], describe.descriptor(describe.fields(*at)))
+
+
+def test_an_orthographic_view_is_rendered_once_for_all_distances(truck):
+    describe = ViewDescriber(truck, BankSettings(image_size=64, camera="orthographic"))
+    views = sample_views(azimuth_step=180, elevations=[20], distances=[2.0, 3.0, 8.0])
+    describe.view_renderer = Mock(wraps=describe.view_renderer)
+    together = describe(views.rotations, views.distance * describe.radius)
+    (call,) = describe.view_renderer.render.call_args_list
+    assert len(call.args[0]) == 2
+    assert torch.equal(together["descriptors"][0], together["descriptors"][2])
+    assert not torch.equal(together["descriptors"][0], together["descriptors"][3])

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, MeshError
+from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
-from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up
+from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up, principal_rotation
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])
@@ -22,6 +24,26 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float
     whole, few = (x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points))
     width = whole.amax(dim=0) - whole.amin(dim=0)
     assert float(((whole.amax(dim=0) - few.amax(dim=0)) / width).max()) < 0.0015
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_normalization_transform_is_invariant_to_similarities(truck: trimesh.Trimesh, seed: int) -> None:
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = 7.0 * torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
+    T[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
+    meshes = truck, truck.copy().apply_transform(T.numpy())
+    transforms = [normalization_transform(mesh) for mesh in meshes]
+    first, second = (
+        torch.tensor(mesh.copy().apply_transform(T.numpy()).vertices)
+        for mesh, T in zip(meshes, transforms, strict=True)
+    )
+    torch.testing.assert_close(first, second, rtol=0, atol=1e-9)
+    spread = first.square().mean(dim=0)
+    assert spread[0] > spread[1] > spread[2]
+    assert float(first.norm(dim=1).max()) == pytest.approx(1.0)
+    rotation = principal_rotation(truck)
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3).double(), rtol=0, atol=1e-12)
+    assert float(torch.linalg.det(rotation)) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

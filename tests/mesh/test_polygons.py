@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh.files import divide_faces, obj_with_triangles
+from curvireg_torch.mesh.polygons import divide_faces
 
 U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
 
@@ -93,12 +94,16 @@ def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: s
         assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
 
 
-def test_obj_with_triangles_keeps_texture_coordinates_at_their_corners(tmp_path: Path) -> None:
+def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_path: Path) -> None:
     path = tmp_path / "u.obj"
     write(path, "obj with texture")
-    path.write_bytes(obj_with_triangles(path.read_bytes()))
-    mesh = trimesh.load(path, process=False)
-    np.testing.assert_allclose(mesh.visual.uv, mesh.vertices[:, :2] / 4, atol=1e-6)
+    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 5
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd a.png\n")
+    path.write_text("mtllib a.mtl\nusemtl skin\n" + path.read_text())
+    mesh = cr.load_mesh(path)
+    uv = mesh.metadata["colours"].uv
+    np.testing.assert_allclose(uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / 4, atol=1e-6)
     assert mesh.area == pytest.approx(30)
 
 

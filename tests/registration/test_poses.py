@@ -1,8 +1,7 @@
-"""Poses under work: which views start them, which are distinct or put back; and the search of the preset "paper"."""
+"""Poses under work: which views start them, and which are distinct or put back."""
 
 import math
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import fields
 
 import pytest
 import torch
@@ -11,7 +10,6 @@ from torch import Tensor
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
 from curvireg_torch.registration.poses import Poses, best_views, distinct_poses
-from curvireg_torch.registration.search import search
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 
@@ -51,34 +49,3 @@ def test_poses_fill_their_box():
     assert float(rotation_error(again.T[0, :3, :3], T[:3, :3])) < 2.0
     assert float((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
     torch.testing.assert_close(again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None])
-
-
-class RotationDescriber:
-    """Describes a view by its rotation: the similarity of two is (1 + 2 cos of the angle between them) / 3."""
-
-    def descriptors(self, rotations: Tensor, _: Tensor) -> Tensor:
-        return rotations.flatten(1)
-
-
-def searched(truth: Tensor, start: Tensor) -> Tensor:
-    """(3, 3) rotation that a search for ``truth`` finds."""
-    describer: Any = RotationDescriber()
-    return search(describer, truth.flatten()[None], replace(poses([0.0]), rotation=start[None]))[0]
-
-
-def test_search_converges_to_the_truth_and_stays_near_the_start():
-    truth, start = rotation(3.0, -6.0, 4.0), rotation(0, 0, 0)
-    assert float(rotation_error(searched(truth, start), truth)) < 1.5
-    for away in (16.0, 40.0, 170.0):
-        assert 10.0 < float(rotation_error(searched(rotation(0.0, away, 0.0), start), start)) <= 15.0
-
-
-def test_registrar_searches_if_it_is_told_to():
-    """Views are 15 degrees apart: without contours, the search alone gets nearer."""
-    errors: dict[bool, list[float]] = {True: [], False: []}
-    for seed in range(4):
-        image, box, T = scene(seed)
-        for search_first in (True, False):
-            result = truck_registrar(search=search_first, contours=False)([image], box[None], CAMERA)[0]
-            errors[search_first].append(float(rotation_error(result.rotation, T[:3, :3])))
-    assert sorted(errors[True])[1] < sorted(errors[False])[1]

@@ -47,13 +47,17 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
 
 
-def test_large_bank_compares_the_best_distinct_views(small_bank, truck, matcher):
+def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matcher):
     large_bank = ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
     before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(*photograph(2))
     assert large_bank.appearance is None
     reranking = ViewMatcher(large_bank, pipeline=large(top=5, min_angle=40.0))
     ranking = reranking(*photograph(2))
-    compared = distinct_views(before.order[0], large_bank.rotations, count=5, angle=40.0)
+    R = large_bank.rotations
+    packing = distinct_views(torch.arange(len(R)), R, count=len(R), angle=40.0)
+    assert 5 < len(packing) < len(R)
+    nearest = packing[rotation_error(R[:, None], R[packing][None]).argmin(dim=1)]
+    compared = torch.tensor(list(dict.fromkeys(nearest[before.order[0]].tolist()))[:5])
     raw = ranking.terms["appearance"][0]
     assert sorted(raw.isfinite().nonzero()[:, 0].tolist()) == sorted(compared.tolist())
     exhaustive = matcher(*photograph(2)).terms["appearance"][0]

@@ -55,6 +55,27 @@ def test_matcher_ranks_by_whitened_correlation(bank):
     torch.testing.assert_close(matcher(images, boxes).hog, expected, atol=1e-4, rtol=1e-3)
 
 
+def test_matcher_ranks_by_the_product_that_the_paper_prints(bank):
+    images, boxes = [scene(0)[0]], scene(0)[1][None]
+    pipeline = replace(bank.pipeline.with_term("hog", whitening="paper"), box_jitter=0.0)
+    matcher = ViewMatcher(bank, pipeline=pipeline)
+    query = matcher.query(images, boxes)
+    mean, covariance = terms.ledoit_wolf(bank.descriptors)
+    solved = torch.linalg.solve(covariance.double(), query.descriptors[0].T.double())
+    expected = ((bank.descriptors - mean).double() @ solved).T.float()
+    found = matcher(images, boxes).hog
+    torch.testing.assert_close(found, expected, atol=2e-3 * float(expected.abs().max()), rtol=0)
+    # Further views are compared by the bank's mean and covariance.
+    few = bank.views[10:14]
+    score = terms.Correlation(whitening="paper").log_score(expected[:, 10:14])
+    rep = matcher.pipeline.terms[1]
+    score = score + rep.log_score(matcher(images, boxes).repeatability[:, 10:14])
+    shape = next(term for term in matcher.pipeline.terms if term.name == "box")
+    score = (score + shape.log_score(matcher(images, boxes).terms["box"][:, 10:14]))[0]
+    difference = matcher.compare_views(query, few) - (score - score.max())
+    torch.testing.assert_close(difference - difference.mean(), torch.zeros(4), rtol=0, atol=0.05)
+
+
 @pytest.mark.parametrize("eps", [0.0, 1.0, 2.0, 2.5, 2.9, 3.0, 4.0])
 def test_dilate_points_uses_a_euclidean_disc(eps):
     points = torch.rand(3, 31, 40, generator=torch.Generator().manual_seed(0)) < 0.02

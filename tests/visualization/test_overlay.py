@@ -32,7 +32,9 @@ def test_contour_overlay_draws_the_object_although_the_box_is_wrong(camera, shif
     assert fraction_near(picture, mask, 2) > 0.95
     assert fraction_near(picture, mask[::-1], 2) < 0.5
     truth = replace(result.hypotheses[0], projection=(T, CAMERA))
-    assert fraction_near(contour_overlay(registrar, truth, image, box), mask, 1) == 1.0
+    assert (
+        fraction_near(contour_overlay(registrar, truth, image, box), mask, 1.5) == 1.0
+    )  # px: half a pixel in x and in y, twice
     if camera is None:  # the assumed camera, not a view that fills the box
         assert result.translation is None
         at = result.allocentric_rotation[None], torch.tensor([result.distance])

@@ -23,7 +23,7 @@ def test_thumbnail_draws_contours_on_the_object(scale):
     registrar = Registrar(truck_bank(), pipeline=unrefined(truck_bank()))
     result = registrar([photograph], [edges])[0]
     grey = torch.full_like(photograph, 100)
-    jpeg = sheet.thumbnail(registrar.describer.renderer, result.projection, grey, edges)
+    jpeg = sheet.thumbnail(registrar.describer, result.projection, grey, edges)
     pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
     y, x = np.nonzero(pixels[..., 1].astype(int) - pixels[..., 2] > 60)  # the outline's green
     assert len(x) > 50

@@ -1,0 +1,192 @@
+"""Text and array files as plain values: numbers, strings, lists of these, and dicts."""
+
+import json
+import re
+import struct
+import zipfile
+import zlib
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from ...errors import InvalidInputError
+
+EXPECTED = (
+    "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, camera.json of BOP, "
+    "cam_K.txt of 3 x 3 numbers"
+)
+MAX_DEPTH = 50  # of nested lists and keys
+MAX_ARRAY_BYTES = 1 << 16  # of an array in an .npz file; larger ones are points of the calibration, and left out
+MAX_ARRAYS = 1000  # of an .npz file
+_COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]", re.MULTILINE)
+_YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_COUNTS = (4, 9, 12, 16)  # numbers of fx, fy, cx, cy; of a matrix of 3 x 3, 3 x 4 and 4 x 4
+
+
+def read_document(file: Path) -> Any:
+    """The values in a file; numbers alone are ``{"K": numbers}``, a line of COLMAP is ``{"colmap": words}``.
+
+    Raises:
+        InvalidInputError: it is damaged, or of no such kind. The message quotes nothing of its content.
+    """
+    data = file.read_bytes()
+    if data.startswith((b"PK\3\4", b"\x93NUMPY")):
+        return _arrays(data)
+    text = _text(data)
+    if numbers := _numbers_alone(text):
+        return {"K": numbers}
+    try:
+        if text.lstrip().startswith(("{", "[")) and file.suffix.lower() not in (".yaml", ".yml"):
+            return json.loads(text)
+        if text.lstrip().startswith("<"):
+            return _xml(text)
+    except (ValueError, RecursionError, ElementTree.ParseError) as error:
+        raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
+    return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text)
+
+
+def _text(data: bytes) -> str:
+    encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError as error:
+        message = "not a text file, and pickle is not read; save it as JSON: json.dump({'camera_matrix': K.tolist(), "
+        raise InvalidInputError(f"{message}'dist_coeffs': D.tolist()}}, file); expected {EXPECTED}") from error
+
+
+def _numbers_alone(text: str) -> list[float]:
+    """The numbers of a text that holds nothing else, as ``numpy.savetxt`` writes them; [] of another text."""
+    words = re.sub(r"#.*|[\[\](),;]", " ", text[:5000]).split()
+    if len(text) > 5000 or len(words) not in _COUNTS:
+        return []
+    numbers = [number(word) for word in words]
+    return [value for value in numbers if isinstance(value, float)] if not any(map(_is_text, numbers)) else []
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def number(text: str) -> float | str:
+    """The number that a word stands for, or the word without its quotes."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip("\"'")
+
+
+def _arrays(data: bytes) -> dict[str, Any]:
+    """Small arrays of numbers in a file of ``numpy.savez`` or ``numpy.save``, by their names."""
+    try:
+        if not data.startswith(b"PK"):
+            return {"K": _array(data)}
+        with zipfile.ZipFile(BytesIO(data)) as archive:
+            members = archive.infolist()[:MAX_ARRAYS]
+            small = [member for member in members if member.file_size <= MAX_ARRAY_BYTES]
+            arrays = [member for member in small if member.filename.endswith(".npy")]
+            return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in arrays}
+    except InvalidInputError:
+        raise
+    except (ValueError, OSError, EOFError, MemoryError, KeyError, struct.error, zlib.error) as error:
+        raise InvalidInputError("a damaged .npz or .npy; save it again") from error
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:  # encrypted, or packed otherwise
+        raise InvalidInputError("a damaged .npz; save it again with numpy.savez") from error
+
+
+def _array(data: bytes) -> Any:
+    """The values of a file of ``numpy.save``, whose header is checked before memory is taken; None of objects."""
+    stream = BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = reader(stream)
+    if dtype.kind not in "fiu":
+        return None
+    if int(np.prod(shape, dtype=object)) * dtype.itemsize > MAX_ARRAY_BYTES:
+        raise InvalidInputError("an array larger than its file; save it again")
+    return np.load(BytesIO(data), allow_pickle=False).astype(np.float64).tolist()
+
+
+def _colmap(text: str) -> dict[str, Any]:
+    """The words of each line of ``cameras.txt``, by the camera's number."""
+    lines = enumerate((line.partition("#")[0].split() for line in text.splitlines()), start=1)
+    return {words[0]: {"colmap": words, "line": count} for count, words in lines if words}
+
+
+def _xml(text: str) -> Any:
+    """Elements by their tags; attributes count as elements."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise InvalidInputError("defines entities, which are not read; write it with cv2.FileStorage")
+
+    def value(element: ElementTree.Element) -> Any:
+        if not len(element) and (words := (element.text or "").split()):
+            numbers = [number(word) for word in words]
+            return numbers[0] if len(numbers) == 1 else numbers
+        values: dict[str, Any] = {name: number(text) for name, text in element.attrib.items()}
+        for child in element:
+            several = values.get(child.tag, [])
+            inside = value(child)
+            values[child.tag] = [*(several if isinstance(several, list) else [several]), inside] if several else inside
+        return values or []
+
+    root = ElementTree.fromstring(text)
+    return {root.tag: value(root)}
+
+
+def _yaml(text: str) -> Any:
+    """The first document with content. Tags say nothing here, and aliases, which can blow a file up, are refused."""
+    text = re.sub(r"(?m)^%.*", "", text)  # OpenCV's "%YAML:1.0" is none of YAML's directives
+    root: list[Any] = []
+    open_values: list[Any] = [root]  # lists, and dicts in which a key waits for its value
+    keys: list[str | None] = [None]
+    try:
+        for event in yaml.parse(text, Loader=_YAML_LOADER):
+            if isinstance(event, yaml.AliasEvent):
+                raise InvalidInputError("has aliases (*name), which are not read; write it without them")
+            if isinstance(event, yaml.CollectionEndEvent):
+                open_values.pop()
+                keys.pop()
+            elif isinstance(event, yaml.NodeEvent):
+                _put(open_values, keys, event)
+            elif isinstance(event, yaml.DocumentEndEvent) and root[-1:] != [None]:
+                break
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = "" if mark is None else f"line {mark.line + 1}: "
+        raise InvalidInputError(f"{place}expected 'key: value'; expected {EXPECTED}") from error
+    return root[-1] if root else None
+
+
+def _put(open_values: list[Any], keys: list[str | None], event: Any) -> None:
+    """Add the value of an event of YAML where it belongs; it becomes the innermost open one if it holds others."""
+    if len(open_values) > MAX_DEPTH:
+        raise InvalidInputError("nested too deeply; write it again")
+    inside = open_values[-1]
+    if isinstance(event, yaml.ScalarEvent):
+        value: Any = _scalar(event)
+        if isinstance(inside, dict) and keys[-1] is None:
+            keys[-1] = str(event.value)
+            return
+    else:
+        value = {} if isinstance(event, yaml.MappingStartEvent) else []
+    if isinstance(inside, list):
+        inside.append(value)
+    elif keys[-1] is None:
+        raise InvalidInputError("a list or mapping where a key is expected; write it again")
+    else:
+        inside[keys[-1]] = value
+        keys[-1] = None
+    if not isinstance(event, yaml.ScalarEvent):
+        open_values.append(value)
+        keys.append(None)
+
+
+def _scalar(event: Any) -> Any:
+    text = event.value
+    if event.style in ("'", '"'):
+        return text
+    known = {"": None, "~": None, "null": None, "true": True, "false": False}
+    return known.get(text.lower(), number(text))

@@ -1,0 +1,118 @@
+"""The keys and values of one camera in a calibration file, and which of them were read."""
+
+import re
+from collections.abc import Container, Iterator, Mapping, Sequence
+from typing import Any
+
+from ...errors import InvalidInputError
+from ...utils.files import finite_numbers
+from .documents import number
+
+Used = set[tuple[int, str]]
+"""Keys that were read, each with the identity of its dict."""
+
+_DISTORTION_KEY = re.compile(
+    r"([kp]\d|[bs][1-4]|d|kc|tau[xy])$"  # coefficients and vectors of them
+    r"|dist(?!ance|r)|radial|tangential|thinprism|affin"
+    r"|(?!undist).*(distort|coef|skew)"
+)
+"""Keys, without case and punctuation, whose numbers describe a lens."""
+
+
+def plain(key: str) -> str:
+    """A key without case and punctuation: "dist_coeffs" and "distCoeffs" are the same."""
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+class Record:
+    """A dict of a calibration, and those around it, which are asked for keys that it lacks.
+
+    Args:
+        values: the dict.
+        used: gets the keys that are read.
+        around: enclosing dicts, the innermost first.
+    """
+
+    def __init__(self, values: Mapping[str, Any], used: Used, around: Sequence[Mapping[str, Any]] = ()) -> None:
+        self.values, self.used, self.around = values, used, around
+
+    def has(self, *names: str) -> bool:
+        """Whether the dict itself has one of the keys."""
+        present = {plain(key) for key in self.values}
+        return any(plain(name) in present for name in names)
+
+    def get(self, *names: str) -> Any:
+        """The value of the first key that is one of the names; None without one."""
+        for values in (self.values, *self.around):
+            keys = {plain(key): key for key in values}
+            for name in names:
+                if (key := keys.get(plain(name))) is not None and values[key] is not None:
+                    self.used.add((id(values), key))
+                    return values[key]
+        return None
+
+    def numbers(self, *names: str) -> list[float]:
+        """The finite numbers of the first of some keys, of a matrix row by row; none without such a key."""
+        flat = flattened(self.get(*names))
+        found = finite_numbers(flat, len(flat))
+        if found is None:
+            raise InvalidInputError(f"{names[0]}: expected finite numbers, got {flat!r:.80}")
+        return list(found)
+
+    def number(self, *names: str) -> float | None:
+        """The number of the first of some keys, or None."""
+        found = self.numbers(*names)
+        return found[0] if len(found) == 1 else None
+
+    def words(self, *names: str) -> list[str]:
+        """The texts of those of the keys that have one."""
+        texts = [self.get(name) for name in names]
+        return [text for text in texts if isinstance(text, str)]
+
+    def inside(self, *names: str) -> "Record | None":
+        """The dict that is the value of one of the keys."""
+        values = self.get(*names)
+        return Record(values, self.used) if isinstance(values, dict) else None
+
+
+def flattened(value: Any) -> list[Any]:
+    """The scalars of nested lists, and of the ``data`` of a dict; texts that are numbers are these."""
+    while isinstance(value, dict):
+        value = value.get("data")
+    if isinstance(value, list):
+        return [scalar for item in value for scalar in flattened(item)]
+    if isinstance(value, str):
+        words = [number(word) for word in value.split()]
+        return words if words and not any(isinstance(word, str) for word in words) else [value]
+    return [] if value is None else [value]
+
+
+def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, str]]:
+    """The keys that look like distortion and have a number that is not zero, each with the identity of its dict.
+
+    Args:
+        value: a document, or a part of it.
+        others: identities of dicts that do not count.
+    """
+    if isinstance(value, list):
+        for item in value:
+            if isinstance(item, dict | list):
+                yield from distortion_keys(item, others)
+    if isinstance(value, dict) and id(value) not in others:
+        yield from distortion_keys_inside(value, others)
+
+
+def distortion_keys_inside(values: Mapping[str, Any], others: Container[int]) -> Iterator[tuple[int, str]]:
+    """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
+    for key, value in values.items():
+        if _DISTORTION_KEY.match(plain(key)) and _has_number(value):
+            yield id(values), key
+        yield from distortion_keys(value, others)
+
+
+def _has_number(value: Any) -> bool:
+    """Whether a value holds a number that is not zero."""
+    if isinstance(value, dict):
+        return any(map(_has_number, value.values()))
+    numbers = (scalar for scalar in flattened(value) if isinstance(scalar, int | float))
+    return any(scalar != 0 and not isinstance(scalar, bool) for scalar in numbers)

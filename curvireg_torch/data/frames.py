@@ -1,0 +1,78 @@
+"""Frames of a video by their number, without a copy of each on disk."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+from torch import Tensor
+
+from ..errors import ImageError
+from ..utils.threads import MAX_THREADS
+from .images import Video
+
+KEPT = MAX_THREADS + 1  # frames in memory: more than there are threads that ask for them
+
+
+class FrameReader:
+    """Frames of one video, for several threads that ask for numbers nearly in order: it is decoded once.
+
+    Args:
+        path: of the video, see :class:`Video`.
+        every: step between the frames that can be read, from 0.
+
+    Example:
+        >>> import tempfile
+        >>> import cv2, numpy as np
+        >>> file = Path(tempfile.mkdtemp(), "two.avi")
+        >>> writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+        >>> _ = [writer.write(np.zeros((48, 64, 3), np.uint8)) for _ in range(2)]
+        >>> writer.release()
+        >>> FrameReader(file).read(1).shape
+        torch.Size([3, 48, 64])
+    """
+
+    def __init__(self, path: Path, *, every: int = 1) -> None:
+        self.path = path
+        self.every = every
+        self._lock = Lock()
+        self._kept: dict[int, Tensor] = {}
+        self._frames: Iterator[tuple[int, Tensor]] = iter(())
+        self._next = 0
+        self._error: ImageError | None = None
+
+    def read(self, number: int) -> Tensor:
+        """(3, H, W) uint8 RGB of a frame; :class:`ImageError` if it cannot be decoded."""
+        with self._lock:
+            if number not in self._kept:
+                self._decode(number)
+            return self._kept[number]
+
+    def _decode(self, number: int) -> None:
+        if self._error is not None:  # what follows a damaged frame is not decoded again for each
+            raise self._error
+        if self._next == 0 or number < self._next:
+            self._frames = iter(Video(self.path, every=self.every))
+        try:
+            for decoded, image in self._frames:
+                self._kept[decoded] = image
+                self._next = decoded + 1
+                if len(self._kept) > KEPT:
+                    del self._kept[next(iter(self._kept))]
+                if decoded == number:
+                    return
+        except ImageError as error:
+            self._error = error
+            raise
+        raise ImageError(f"no frame {number}", subject=self.path)
+
+
+class VideoFrame(NamedTuple):
+    """One frame of a video."""
+
+    video: FrameReader
+    number: int
+
+    def read(self) -> Tensor:
+        """Its pixels, see :meth:`FrameReader.read`."""
+        return self.video.read(self.number)

@@ -1,0 +1,160 @@
+"""The one rule for files that commands write.
+
+No input is ever written or removed, and a command replaces only what it wrote itself: the file ``.curvireg.json`` in
+the folder of the results says which command wrote what. Anything else in the way of a result is an error that names it,
+before any work.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidInputError, OutputError
+from ..utils.files import check_writable, read_json, write_file
+from .store import is_one_of_several
+
+MARKER = ".curvireg.json"
+
+ONE_RESULT = ("result.json", "overlay.png", "pose.glb", "pose.yaml")
+ROWS = ("results.jsonl", "results.*-of-*.jsonl", "index.html", "thumbnails")
+FILES: dict[str, tuple[str, ...]] = {
+    "register": ONE_RESULT,
+    "demo": (*ONE_RESULT, "mesh.ply", "photo.png"),
+    "register several": (*ROWS, "results.csv"),
+    "evaluate": (*ROWS, "summary.json", "predictions.csv", "errors.csv"),
+    "follow": ("results.csv", "overlay.mp4"),
+}
+"""Names, or patterns of names, that each command may write into the folder of its results."""
+
+ELSEWHERE = "choose another --out"
+
+
+@contextmanager
+def output_folder(
+    folder: Path,
+    command: str,
+    *,
+    inputs: Iterable[Path] = (),
+    source: Sequence[str] = (),
+    more: Sequence[str] = (),
+) -> Iterator[None]:
+    """Context in which ``command`` may write its files into ``folder``, which is created.
+
+    Args:
+        folder: of the results.
+        command: a key of ``FILES``.
+        inputs: files that the command reads.
+        source: what the results are of, for results that several runs share: a later run must name all of it again,
+            since it keeps no other rows.
+        more: names of further files.
+
+    Raises:
+        InvalidInputError: a file in the way that is an input, or that this command did not write; or results of
+            another source.
+        OutputError: the folder cannot be written to.
+
+    Of several processes that share the results, the first one checks.
+    """
+    if is_one_of_several() and os.environ.get("RANK") != "0":
+        yield
+        return
+    names = (*FILES[command], *more)
+    written = _read(folder)
+    before = written.get(command, {})
+    in_the_way = _existing(folder, names)
+    _check_inputs(in_the_way, inputs)
+    for path in in_the_way:
+        _check_owner(path, command, written)
+    lost = [name for name in before.get("source", ()) if name not in source]
+    if lost and source and in_the_way:
+        raise InvalidInputError(f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}")
+    check_writable(folder, "--out")
+    kept = list(source or before.get("source", ()))
+    _mark(folder, command, names, kept)
+    try:
+        yield
+    finally:
+        with suppress(OutputError):  # an error of the command itself counts more
+            _mark(folder, command, [path.name for path in _existing(folder, names)], kept)
+
+
+def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> None:
+    """Refuse to write a file that is an input, or that exists without ``mark``, by which this program's own are known.
+
+    The folder is checked too, so that no work is lost.
+    """
+    if path.exists():
+        _check_inputs([path], inputs)
+        if not path.is_file() or mark not in path.read_bytes():
+            raise InvalidInputError(f"{path}: exists, and this command did not write it; {ELSEWHERE}")
+    check_writable(path.parent, "--out")
+
+
+def _existing(folder: Path, names: Iterable[str]) -> list[Path]:
+    """Files of these names or patterns, broken links included."""
+    if not folder.is_dir():
+        return []
+    present = sorted(path.name for path in folder.iterdir())
+    return [folder / name for name in present if any(fnmatch(name, pattern) for pattern in names)]
+
+
+def _check_inputs(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
+    """Refuse outputs that are inputs, under whatever name."""
+    identities = {_identity(path) for path in outputs}
+    if not identities:
+        return
+    for path in inputs:
+        if path.exists() and _identity(path) in identities:
+            raise InvalidInputError(f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}")
+
+
+def _identity(path: Path) -> object:
+    try:
+        status = path.stat()
+    except OSError:  # a link to nothing
+        return str(path)
+    return status.st_dev, status.st_ino
+
+
+def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
+    """Refuse a file that ``command`` did not write."""
+    owners = [name for name, run in written.items() if any(fnmatch(path.name, pattern) for pattern in run["files"])]
+    if command in owners:
+        return
+    if owners:
+        raise InvalidInputError(f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}")
+    raise InvalidInputError(f"{path}: not written by this command; move it away, or {ELSEWHERE}")
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    """What each command wrote into the folder."""
+    path = folder / MARKER
+    if not path.exists():
+        return {}
+    content = read_json(path, dict, "docs/results.md")
+    runs = content.get("commands")
+    if not isinstance(runs, dict) or not all(map(_is_run, runs.values())):
+        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}")
+    return runs
+
+
+def _is_run(run: object) -> bool:
+    if not isinstance(run, dict):
+        return False
+    texts = [run.get("files"), run.get("source", [])]
+    return all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in texts)
+
+
+def _mark(folder: Path, command: str, files: Sequence[str], source: Sequence[str]) -> None:
+    """Note that ``command`` wrote ``files``, or is about to; they are no other command's."""
+    before = _read(folder)
+    runs = {}
+    for name, run in before.items():
+        runs[name] = {**run, "files": [file for file in run["files"] if file not in files]}
+    runs[command] = {"files": list(files), "source": list(source)}
+    if runs != before:
+        write_file(folder / MARKER, (json.dumps({"schema": 1, "commands": runs}, indent=2) + "\n").encode())

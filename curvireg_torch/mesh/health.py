@@ -1,0 +1,102 @@
+"""What is wrong with a mesh that can be used: parts left over far away, and coordinates without digits."""
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from .source import MeshWarning
+
+SAMPLES = 20_000  # Points of the surface that say where it is
+# Parts that together hold less than this fraction of the surface, and lie farther from the rest than one to two cells
+# of this fraction of its size, are left over: a leftover of a scan, a marker of the origin
+STRAY_FRACTION, STRAY_GAP = 0.002, 0.1
+SPREAD = 1.15  # The box is looked at if it is so many times as large as that of almost all of the surface
+COARSE_STEP = 2e-4  # Steps between coordinates, as a fraction of the mesh's size, that show in its contours
+
+
+def stray_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
+    """(F,): which faces belong to parts of almost no area that lie apart from the rest and enlarge the mesh's box.
+
+    Space is divided into cells; what shares a cell, or lies in neighbouring ones, is one part.
+    """
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    none = np.zeros(len(faces), bool)
+    area = np.asarray(mesh.area_faces)
+    face = _random_faces(area)
+    points = _random_points(vertices[faces[face]])
+    low, high = np.quantile(points, [0.5 * STRAY_FRACTION, 1.0 - 0.5 * STRAY_FRACTION], axis=0)
+    size = float(np.linalg.norm(high - low))
+    if not size > 0.0 or float(np.linalg.norm(mesh.extents)) < SPREAD * size:
+        return none
+    everything = np.concatenate([points, vertices[faces].reshape(-1, 3)])
+    steps = np.floor((everything - low) / (STRAY_GAP * size))
+    part = _parts(np.clip(steps, -(2**18), 2**18).astype(np.int64), face, len(faces))
+    shares = np.bincount(part, area) / area.sum()
+    stray = (shares < STRAY_FRACTION)[part]
+    if float(area[stray].sum()) >= STRAY_FRACTION * float(area.sum()):
+        return none
+    rest = vertices[faces[~stray]].reshape(-1, 3)
+    inside = (vertices >= rest.min(axis=0)) & (vertices <= rest.max(axis=0))
+    part_inside = np.ones(len(shares), bool)
+    np.logical_and.at(part_inside, part, inside.all(axis=1)[faces].all(axis=1))
+    return np.asarray(stray & ~part_inside[part])
+
+
+def stray_warning(mesh: trimesh.Trimesh, stray: NDArray[np.bool_]) -> MeshWarning:
+    """What was left out of a mesh, and where it lies."""
+    count = int(stray.sum())
+    area = np.asarray(mesh.area_faces)
+    fraction = float(area[stray].sum() / area.sum())
+    centre = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[stray]].mean(axis=(0, 1))
+    place = ", ".join(f"{value:.4g}" for value in centre)
+    faces = f"{count:,} face{'s' * (count != 1)} of {len(stray):,}"
+    text = f"{faces} near ({place}) lie apart from the rest with {fraction:.2g} of the area: left out, as left over"
+    return MeshWarning("stray", text)
+
+
+def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:
+    """A warning where coordinates are so large, as those of maps, that single precision has rounded them."""
+    vertices = np.asarray(mesh.vertices)
+    largest = float(np.abs(vertices).max())
+    step = float(np.spacing(np.float32(largest)))
+    size = float(np.linalg.norm(mesh.extents))
+    is_single = bool((vertices.astype(np.float32) == vertices).all())
+    if step < COARSE_STEP * size or not is_single:
+        return None
+    text = f"its coordinates are rounded to steps of {step:.2g}: move the object near the origin, and export it again"
+    return MeshWarning("precision", text)
+
+
+def _random_faces(area: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(N,) faces, more often the larger ones; always the same."""
+    total = np.cumsum(area)
+    places = (np.arange(SAMPLES) + 0.5) / SAMPLES * total[-1]
+    return np.asarray(np.searchsorted(total, places).clip(max=len(area) - 1))
+
+
+def _random_points(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 3) points within N triangles."""
+    weights = np.random.default_rng(0).dirichlet(np.ones(3), len(corners))
+    return np.asarray(np.einsum("nk,nkj->nj", weights, corners))
+
+
+def _parts(cells: NDArray[np.int64], face: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+    """(F,) numbers of the parts that the faces belong to; ``cells`` are those of the samples, which are of ``face``,
+    and then of the three corners of each of the ``count`` faces."""
+    key = (cells + 2**19) @ np.array([2**40, 2**20, 1])
+    unique, place = np.unique(key, return_inverse=True)
+    links = []
+    shifts = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    for shift in shifts[:13]:  # the others are their opposites
+        wanted = unique + shift @ np.array([2**40, 2**20, 1])
+        found = np.searchsorted(unique, wanted).clip(max=len(unique) - 1)
+        near = (unique[found] == wanted).nonzero()[0]
+        links.append(np.column_stack([near, found[near]]))
+    corners = place[SAMPLES:].reshape(count, 3)
+    links += [corners[:, :2], corners[:, 1:], np.column_stack([place[:SAMPLES], corners[face, 0]])]
+    pairs = np.concatenate(links)
+    graph = coo_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(unique),) * 2)
+    _, label = connected_components(graph, directed=False)
+    return np.asarray(label[corners[:, 0]], np.int32)

@@ -1,0 +1,529 @@
+"""Calibration files as their tools write them, and damaged ones."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import load_camera
+from curvireg_torch.errors import MAX_CAMERA_BYTES, CurviregWarning, InvalidInputError
+from tests._support.doubling import check_linear
+
+K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
+D = np.array([[-0.31, 0.12, 0.001, -0.002, 0.03]])
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: head_camera
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [520.5, 0, 321.25, 0, 522, 238.5, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [-0.31, 0.12, 0.001, -0.002, 0.03]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [480, 0, 322, 0, 0, 500, 239, 0, 0, 0, 1, 0]
+"""
+ROS_MESSAGE = """header:
+  stamp: {sec: 12, nanosec: 3}
+  frame_id: "head"
+height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- -0.31
+- 0.12
+- 0.001
+- -0.002
+- 0.03
+k: [[520.5, 0.0, 321.25],
+  [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]]
+binning_x: 0
+roi:
+  x_offset: 0
+  do_rectify: false
+---
+height: 1
+"""
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.31, 0.12, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [520.5, 522.0, 321.25, 238.5]
+  resolution: [640, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.99, 0.0, 0.0, -0.1]
+  - [0.0, 0.99, 0.0, 0.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.02, -0.01, 0.003, -0.001]
+  distortion_model: equidistant
+  intrinsics: [519.0, 519.0, 320.0, 240.0]
+  resolution: [640, 480]
+  rostopic: /cam1/image_raw
+"""
+COLMAP = """#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+1 SIMPLE_PINHOLE 640 480 520.5 321.75 239
+2 PINHOLE 640 480 520.5 522 321.75 239
+3 SIMPLE_RADIAL 640 480 520.5 321.75 239 -0.31
+4 RADIAL 640 480 520.5 321.75 239 -0.31 0.12
+5 OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002
+6 OPENCV_FISHEYE 640 480 520.5 522 321.75 239 0.02 -0.01 0.003 -0.001
+"""
+
+
+def check(camera, distortion, *, fy=522.0, model="radial-tangential", size=(480, 640)):
+    expected = torch.from_numpy(K).clone()
+    expected[1, 1] = fy
+    torch.testing.assert_close(camera.matrix, expected)
+    assert (camera.distortion, camera.model, camera.size) == (distortion, model, size)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "yaml", "xml", "json"])
+def test_opencv(tmp_path, suffix):
+    file = tmp_path / f"camera.{suffix}"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage.write("calibration_time", "Thu 01 Jan 2026: [noon")
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    if suffix != "json":
+        storage.writeComment("flags: +zero_tangent_dist")
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", D)
+    storage.write("image_points", np.random.default_rng(0).random((40, 2)).astype(np.float32))
+    storage.release()
+    check(load_camera(file), tuple(D[0]))
+
+
+def test_opencv_with_other_keys_and_bop(tmp_path):
+    file = tmp_path / "fisheye.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"cameraMatrix": K, "distCoeffs": D[0, :4], "fisheye_model": 1}.items():
+        storage.write(name, value)
+    storage.release()
+    check(load_camera(file), tuple(D[0, :4]), model="fisheye", size=None)
+    file.write_text(file.read_text().replace("fisheye_model: 1", "fisheye_model: 0"))
+    check(load_camera(file), tuple(D[0, :4]), size=None)
+    file = tmp_path / "python.json"
+    file.write_text(json.dumps({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}))
+    check(load_camera(file), tuple(D[0]))
+    bop = {"cx": 321.25, "cy": 238.5, "depth_scale": 1.0, "fx": 520.5, "fy": 522.0, "height": 480, "width": 640}
+    file.write_text(json.dumps(bop))
+    check(load_camera(file), ())
+
+
+@pytest.mark.parametrize("text", [ROS, ROS_MESSAGE, ROS.replace("\n", "\r\n")], ids=["file", "message", "windows"])
+def test_ros_camera_info(tmp_path, text):
+    file = tmp_path / "camera_info.yaml"
+    file.write_bytes(text.encode())
+    check(load_camera(file), tuple(D[0]))
+
+
+def test_other_models_of_ros(tmp_path):
+    models = ("rational_polynomial", 8, "radial-tangential"), ("equidistant", 4, "fisheye")
+    for ros_model, count, model in models:
+        file, numbers = tmp_path / f"{ros_model}.yaml", tuple(0.01 * k for k in range(count))
+        file.write_text(ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers))))
+        check(load_camera(file), numbers, model=model)
+
+
+def test_kalibr(tmp_path):
+    file = tmp_path / "camchain.yaml"
+    file.write_text(KALIBR)
+    check(load_camera(f"{file}:cam0"), tuple(D[0, :4]))
+    camera = load_camera(f"{file}:cam1")
+    assert (camera.model, camera.distortion) == ("fisheye", (0.02, -0.01, 0.003, -0.001))
+
+
+def test_colmap_counts_from_the_corner_of_the_picture(tmp_path):
+    file = tmp_path / "cameras.txt"
+    file.write_text(COLMAP)
+    check(load_camera(f"{file}:1"), (), fy=520.5)
+    check(load_camera(f"{file}:2"), ())
+    check(load_camera(f"{file}:3"), (-0.31, 0.0, 0.0, 0.0), fy=520.5)
+    check(load_camera(f"{file}:4"), (-0.31, 0.12, 0.0, 0.0), fy=520.5)
+    check(load_camera(f"{file}:5"), tuple(D[0, :4]))
+    check(load_camera(f"{file}:6"), (0.02, -0.01, 0.003, -0.001), model="fisheye")
+
+
+def test_malicious_files_are_refused(tmp_path):
+    for name, content, words in (
+        ("a.yaml", ROS.replace("plumb_bob", "double_sphere"), "'double_sphere' is not supported; choose from none"),
+        ("a.json", '{"K": ' + "[" * 100_000 + "]" * 100_000 + "}", "damaged|nested too deeply"),
+        ("a.xml", "<a>" * 100_000 + "</a>" * 100_000, "damaged|nested too deeply"),
+        ("a.yaml", " " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
+    ):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(InvalidInputError, match=words) as error:
+            load_camera(tmp_path / name)
+        assert str(error.value).startswith(f"{tmp_path / name}: ")
+        assert "--camera exif" in str(error.value)
+
+
+FLAT = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5}
+FIVE = {"k1": -0.31, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": 0.03}
+FOUR = {key: value for key, value in FIVE.items() if key != "k3"}
+LENS, MATRIX = D[0].tolist(), K.tolist()
+TRANSPOSED = K.T.flatten().tolist()
+SIZE = {"width": 640, "height": 480}
+CORNER = {"fl_x": 520.5, "fl_y": 522.0, "cx": 321.75, "cy": 239.0, "w": 640, "h": 480}
+FRAME = {"file_path": "images/1.jpg", "transform_matrix": np.eye(4).tolist()}
+OWN = {"matrix": MATRIX, "distortion": LENS[:4], "model": "radial-tangential", "size": [480, 640]}
+
+JSON = {
+    "megapose": ({"K": MATRIX, "resolution": [480, 640]}, (), (480, 640)),
+    "width first": ({"K": MATRIX, "resolution": [640, 480]}, (), (480, 640)),
+    "open3d": ({**SIZE, "intrinsic_matrix": TRANSPOSED}, (), (480, 640)),
+    "single keys": ({**FLAT, **FIVE, **SIZE}, tuple(LENS), (480, 640)),
+    "single keys in a dict": ({**FLAT, "distortion_parameters": FIVE}, tuple(LENS), None),
+    "camera in a dict": ({"dist": LENS, "intrinsics": FLAT, **SIZE}, tuple(LENS), (480, 640)),
+    "radial and tangential": (
+        {"K": MATRIX, "RadialDistortion": [-0.31, 0.12, 0.03], "TangentialDistortion": [0.001, -0.002]},
+        tuple(LENS),
+        None,
+    ),
+    "radial alone": ({"K": MATRIX, "radial_distortion": [-0.31, 0.12]}, (-0.31, 0.12, 0.0, 0.0), None),
+    "realsense": (
+        {"ppx": 321.25, "ppy": 238.5, "fx": 520.5, "fy": 522.0, "coeffs": LENS, "model": "brown_conrady", **SIZE},
+        tuple(LENS),
+        (480, 640),
+    ),
+    "realsense without distortion": (
+        {**FLAT, "coeffs": [0.0] * 5, "model": "distortion.brown_conrady", "name": "D435", **SIZE},
+        (0.0,) * 5,
+        (480, 640),
+    ),
+    "nerfstudio": ({**CORNER, **FOUR, "camera_model": "OPENCV", "frames": [FRAME]}, tuple(LENS[:4]), (480, 640)),
+    "own camera": (OWN, tuple(LENS[:4]), (480, 640)),
+    "own result": (
+        {"rotation": [1], "model": 0, "camera": OWN, "inputs": {"camera": [1]}},
+        tuple(LENS[:4]),
+        (480, 640),
+    ),
+    "bouguet": ({"fc": [520.5, 522.0], "cc": [321.25, 238.5], "kc": LENS}, tuple(LENS), None),
+    "a camera's product name": ({**FLAT, "model": "Logitech C920", "distortion": None}, (), None),
+}
+
+
+@pytest.mark.parametrize(("content", "distortion", "size"), JSON.values(), ids=JSON)
+def test_json_of_other_tools(tmp_path, content, distortion, size):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(content))
+    check(load_camera(file), distortion, size=size)
+
+
+SINGULAR = (
+    "dist_coeff",
+    "dist_coef",
+    "coeffs",
+    "distortion_coefs",
+    "distortion_parameters",
+    "distCoeffs",
+    "lens_distortion",
+)
+
+
+@pytest.mark.parametrize("key", SINGULAR)
+def test_distortion_by_the_names_that_tools_give_it(tmp_path, key):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps({"camera_matrix": MATRIX, key: [LENS]}))
+    check(load_camera(file), tuple(LENS), size=None)
+
+
+REFUSED = {
+    "another name": ({"K": MATRIX, "my_distortion": LENS}, "'my_distortion': looks like distortion"),
+    "beside a nested camera": ({"a": {"K": MATRIX}, "b": {"radial_terms": [0.1]}}, "'radial_terms': looks like"),
+    "inside an unknown dict": ({"K": MATRIX, "lens": {"k1": -0.3}}, "'k1': looks like distortion"),
+    "a coefficient too much": ({**FLAT, "distortion": {**FOUR, "k9": 1}}, "'k9': looks like distortion"),
+    "two lists": ({"K": MATRIX, "dist": LENS, "distortion": [1.0, *LENS[1:]]}, "'dist': looks like distortion"),
+    "text": ({"K": MATRIX, "distortion_b": "-0.3 0.1"}, "'distortion_b': looks like distortion"),
+    "inverse model": ({**FLAT, "coeffs": LENS, "model": "inverse_brown_conrady"}, "'inverse_brown_conrady' is not"),
+    "projection": ({"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]}, "also moves the camera"),
+    "mei": ({"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}}, "'MEI' is not supported"),
+    "field of view": ({"camera_angle_x": 0.7, "frames": []}, "no fl_x; without it, give .* --fov DEG"),
+    "no centre": ({"fl_x": 520.5, "w": 640, "h": 480}, "no cx and cy"),
+    "a polynomial of nerfstudio": ({**CORNER, "k4": 0.1}, "k4 of nerfstudio"),
+    "fisheye with tangential": ({**FLAT, **FOUR, "is_fisheye": True}, "a fisheye has k1, k2, k3, k4 alone"),
+    "radial and tangential of a fisheye": (
+        {**FLAT, "camera_model": "fisheye", "radial": [0.1, 0.2], "tangential": [0.1, 0.0]},
+        "coefficients of the model 'fisheye'",
+    ),
+}
+
+
+@pytest.mark.parametrize(("content", "words"), REFUSED.values(), ids=REFUSED)
+def test_no_distortion_is_dropped_in_silence(tmp_path, content, words):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(InvalidInputError, match=words):
+        load_camera(file)
+
+
+def test_zero_distortion_and_distances_are_no_distortion(tmp_path):
+    file = tmp_path / "camera.json"
+    more = {
+        "my_distortion": [0.0, 0],
+        "distance": 3.0,
+        "distribution": [1],
+        "undistorted": 1,
+        "dist_b": "none",
+        "k7": True,
+    }
+    file.write_text(json.dumps({"K": MATRIX, **more}))
+    check(load_camera(file), (), size=None)
+
+
+def test_four_coefficients_without_a_model_are_noted(tmp_path):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps({"K": MATRIX, "D": [[0.02], [-0.01], [0.003], [-0.001]]}))
+    with pytest.warns(CurviregWarning, match="read as k1, k2, p1, p2; write distortion_model: fisheye"):
+        camera = load_camera(file)
+    check(camera, (0.02, -0.01, 0.003, -0.001), size=None)
+
+
+def test_numbers_alone_are_the_matrix(tmp_path):
+    file = tmp_path / "cam_K.txt"
+    homogeneous = np.eye(4)
+    homogeneous[:3, :3] = K
+    for matrix in (K, homogeneous, homogeneous[:3], K.T, homogeneous.T, np.array([[520.5, 522.0, 321.25, 238.5]])):
+        np.savetxt(file, matrix, header="camera matrix")
+        check(load_camera(file), (), size=None)
+    file.write_text(str(K.tolist()))
+    check(load_camera(file), (), size=None)
+    file.write_text("520.5 0 321.25 0 522")
+    with pytest.raises(InvalidInputError, match=r"line 1: expected 'key: value'|no camera matrix"):
+        load_camera(file)
+
+
+def test_yaml_of_pyyaml_and_of_other_tools(tmp_path):
+    yaml = pytest.importorskip("yaml")
+    file = tmp_path / "camera.yaml"
+    content = {"camera_matrix": MATRIX, "dist_coeff": D.tolist(), "image_width": 640, "image_height": 480}
+    for flow in (False, True, None):
+        file.write_text(yaml.dump(content, default_flow_style=flow))
+        check(load_camera(file), tuple(LENS))
+    file.write_text(
+        "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: 480\ndistortion_parameters:\n"
+        "   k1: -3.1e-01\n   k2: 0.12\n   p1: 1.0e-03\n   p2: -2e-3\nprojection_parameters:\n"
+        "   fx: 520.5\n   fy: 522.0\n   cx: 321.25\n   cy: 238.5\n"
+    )
+    check(load_camera(file), tuple(LENS[:4]))
+    fisheye = (
+        "   k2: 0.02\n   k3: -0.01\n   k4: 0.003\n   k5: -0.001\n   mu: 520.5\n   mv: 522\n   u0: 321.25\n   v0: 238.5"
+    )
+    file.write_text(
+        f"%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
+        f"projection_parameters:\n{fisheye}\n"
+    )
+    check(load_camera(file), (0.02, -0.01, 0.003, -0.001), model="fisheye")
+    file.write_text(
+        "T_BS:\n  cols: 4\n  data: [1, 0, 0, 0,\n         0, 1, 0, 0]\nresolution: [640, 480]\ncamera_model: pinhole\n"
+        "intrinsics: [520.5, 522.0, 321.25, 238.5] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.31, 0.12, 0.001, -0.002]\n"
+    )
+    check(load_camera(file), tuple(LENS[:4]))
+
+
+def test_arrays_of_numpy(tmp_path):
+    file = tmp_path / "B.npz"
+    np.savez(file, mtx=K, dist=D, rvecs=np.zeros((9, 3, 1)), objpoints=np.zeros((9, 9000)))
+    check(load_camera(file), tuple(LENS), size=None)
+    np.savez_compressed(file, K=K.astype(np.float32), D=D[0])
+    assert load_camera(file).distortion == tuple(LENS)
+    np.save(tmp_path / "K.npy", K)
+    check(load_camera(tmp_path / "K.npy"), (), size=None)
+
+
+def test_arrays_of_objects_and_damaged_ones_are_refused(tmp_path):
+    file = tmp_path / "B.npz"
+    np.savez(file, mtx=np.array([K.tolist(), "text"], dtype=object))
+    with pytest.raises(InvalidInputError, match="no camera matrix"):
+        load_camera(file)
+    np.save(tmp_path / "huge.npy", K)
+    data = (tmp_path / "huge.npy").read_bytes().replace(b"(3, 3), ", b"(3, 3000000000), ".ljust(8))
+    (tmp_path / "huge.npy").write_bytes(data)
+    for damaged in (tmp_path / "huge.npy", file):
+        damaged.write_bytes(damaged.read_bytes()[:150])
+        with pytest.raises(InvalidInputError, match=r"damaged|larger than its file"):
+            load_camera(damaged)
+    (tmp_path / "camera.pkl").write_bytes(b"\x80\x04\x95\xff\x00")
+    with pytest.raises(InvalidInputError, match=r"pickle is not read; save it as JSON: json\.dump"):
+        load_camera(tmp_path / "camera.pkl")
+
+
+def test_stereo_calibrations_name_two_cameras(tmp_path):
+    file = tmp_path / "intrinsics.yml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for name, value in {"M1": K, "D1": D, "M2": 2 * K - np.diag([0, 0, 1.0]), "D2": 2 * D}.items():
+        storage.write(name, value)
+    storage.release()
+    check(load_camera(f"{file}:1"), tuple(LENS), size=None)
+    second = load_camera(f"{file}:2")
+    assert second.distortion == tuple(2 * D[0])
+    assert second.matrix[0, 0] == 1041.0
+    with pytest.raises(InvalidInputError, match="several cameras; choose one as FILE:NAME from 1, 2"):
+        load_camera(file)
+    file = tmp_path / "stereo.json"
+    file.write_text(json.dumps({"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]}))
+    check(load_camera(f"{file}:left"), tuple(LENS), size=None)
+
+
+def test_bop_scene_cameras_are_named_by_image(tmp_path):
+    file = tmp_path / "scene_camera.json"
+    flat = K.flatten().tolist()
+    other = [600.0, *flat[1:]]
+    file.write_text(json.dumps({"3": {"cam_K": flat, "depth_scale": 1.0}, "12": {"cam_K": other}}))
+    for name in ("3", "000003"):
+        check(load_camera(f"{file}:{name}"), (), size=None)
+    with pytest.raises(InvalidInputError, match="several cameras; choose one as FILE:NAME from 3, 12"):
+        load_camera(file)
+    file.write_text(json.dumps({str(number): {"cam_K": flat} for number in range(9)}))
+    check(load_camera(file), (), size=None)  # all the same
+
+
+def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(tmp_path):
+    file = tmp_path / "calibration.xml"
+    lens = "<k1>-0.31</k1><k2>0.12</k2><k3>0.03</k3><p1>-0.002</p1><p2>0.001</p2>"
+    text = (
+        "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width><height>480</height>"
+        f"<f>522</f><cx>1.75</cx><cy>-1</cy><b1>-1.5</b1>{lens}<date>2026-01-01T00:00:00Z</date></calibration>"
+    )
+    file.write_text(text)
+    check(load_camera(file), tuple(LENS))
+    sensor = text.split("?>")[1].replace(
+        "<width>640</width><height>480</height>", '<resolution width="640" height="480"/>'
+    )
+    other = sensor.replace("<f>522", "<f>999")
+    file.write_text(f"<document><sensor label='a'>{sensor}</sensor><sensor label='b'>{other}</sensor></document>")
+    check(load_camera(f"{file}:0"), tuple(LENS))
+    for wrong in ("<b2>0.1</b2>", "<k4>0.1</k4>", "<p3>0.1</p3>"):
+        file.write_text(text.replace("<date>", f"{wrong}<date>"))
+        with pytest.raises(InvalidInputError, match="of Metashape have no counterpart in OpenCV"):
+            load_camera(file)
+    file.write_text(text.replace("frame", "fisheye").replace("<p1>-0.002</p1><p2>0.001</p2>", "<k4>-0.001</k4>"))
+    check(load_camera(file), (-0.31, 0.12, 0.03, -0.001), model="fisheye")
+
+
+def test_nerfstudio_fisheye(tmp_path):
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001}))
+    check(load_camera(file), (0.02, 0.0, 0.0, -0.001), model="fisheye")
+
+
+def test_more_models_of_colmap(tmp_path):
+    file = tmp_path / "cameras.txt"
+    file.write_text(
+        "7 FULL_OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002 0.03 0.5 0.6 0.7\n"
+        "8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01\n9 FOV 640 480 520.5 522 321.75 239 0.1\n"
+    )
+    check(load_camera(f"{file}:7"), (*LENS, 0.5, 0.6, 0.7))
+    check(load_camera(f"{file}:8"), (0.02, -0.01, 0.0, 0.0), fy=520.5, model="fisheye")
+    with pytest.raises(InvalidInputError, match=r"line 3: expected CAMERA_ID MODEL .* FULL_OPENCV \(12\)"):
+        load_camera(f"{file}:9")
+
+
+def test_ros_region_and_binning_are_applied(tmp_path):
+    file = tmp_path / "info.yaml"
+    file.write_text(ROS + "binning_x: 2\nbinning_y: 4\nroi: {x_offset: 100, y_offset: 40, width: 400, height: 200}\n")
+    camera = load_camera(file)
+    assert camera.size == (50, 200)
+    assert camera.distortion == tuple(LENS)
+    # The pixel (101, 40) of the sensor has its left edge at 100.5: the binned one at (0, 0) covers it from 99.5 on.
+    x, y = (321.25 - 99.5) / 2 - 0.5, (238.5 - 39.5) / 4 - 0.5
+    expected = torch.tensor([[260.25, 0, x], [0, 130.5, y], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(camera.matrix, expected)
+    file.write_text(ROS + "roi:\n  x_offset: 100\n  y_offset: 40\n")
+    assert load_camera(file).size == (440, 540)
+    file.write_text(ROS + "binning_x: 1\nroi: {x_offset: 0, y_offset: 0, width: 0, height: 0}\n")
+    check(load_camera(file), tuple(LENS))
+
+
+def test_ros_rectified_camera(tmp_path):
+    file = tmp_path / "info.yaml"
+    file.write_text(ROS)
+    camera = load_camera(f"{file}:P")
+    assert camera.matrix.tolist() == [[480, 0, 322], [0, 500, 239], [0, 0, 1]]
+    assert (camera.distortion, camera.size) == ((), (480, 640))
+    file.write_text(ROS.replace(", 0, 0, 0, 1, 0]", "]"))
+    with pytest.raises(InvalidInputError, match="projection matrix: expected 12 numbers, got 7"):
+        load_camera(f"{file}:P")
+
+
+def test_yaml_cannot_blow_up_or_run_code(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("a: &a [1, 1]\nb: [*a, *a]\nK: [1]")
+    with pytest.raises(InvalidInputError, match="has aliases"):
+        load_camera(file)
+    file.write_text("a: " + "[" * 1000 + "]" * 1000)
+    with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
+        load_camera(file)
+    file.write_text("- " * 2000 + "1")
+    with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
+        load_camera(file)
+    file.write_text(f"a: !!python/object/apply:os.mkdir [{tmp_path}/made]\nfx: 1\n")
+    with pytest.raises(InvalidInputError, match="expected 9 numbers, or fx, fy, cx, cy, got 1"):
+        load_camera(file)
+    assert not (tmp_path / "made").exists()
+
+
+def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
+    file = tmp_path / "secrets"
+    for text in ("TOKEN=abc123\nroot:x:0:0:root:/root\n", "abc123: [", '{"abc123": ', "<abc123>", "abc123\n"):
+        file.write_text(text)
+        with pytest.raises(InvalidInputError) as error:
+            load_camera(file)
+        assert "abc123" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("head", "part", "end"),
+    [
+        ("K: ", "[", ""),
+        ("K: ", "[1, ", ""),
+        ("K: [", "[1], ", ""),
+        ("K: [", "1, ", ""),
+        ("K: [", "1, ", "]"),
+        ("K: ", '"', ""),
+        ("K: ", "\t", "x"),
+        ("K: ", " #", ""),
+        ("", "a:\n", ""),
+        ("K:\n", "- 1\n", ""),
+        ("", "---\n", ""),
+        ("", "\n%", ""),
+        ("", "1", " PINHOLE "),
+        ("1 PINHOLE ", "1 ", ""),
+        ("K: !", "!", ""),
+        ("<a>", "<b/>", "</a>"),
+    ],
+)
+def test_calibrations_are_read_in_linear_time(tmp_path, head, part, end):
+    def make(count):
+        (tmp_path / "cam").write_text(head + part * count + end)
+
+    check_linear(lambda _: load_camera(tmp_path / "cam"), make, 5_000)
+
+
+def test_messages_do_not_quote_lines_of_a_file_that_is_no_calibration(tmp_path):
+    for content in (
+        "TOKEN-hunter2\n",
+        "[hunter2",
+        "K: [hunter2",
+        "x:\n  hunter2\n",
+        "{hunter2",
+        "<hunter2",
+        "- hunter2",
+    ):
+        (tmp_path / "env").write_text(content)
+        with pytest.raises(InvalidInputError) as error:
+            load_camera(tmp_path / "env")
+        assert "hunter2" not in str(error.value)

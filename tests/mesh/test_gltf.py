@@ -1,0 +1,224 @@
+"""glTF as scanners and modellers export it."""
+
+import base64
+import json
+import math
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.mesh import has_colours, mesh_symmetries, surface_colours
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+BOX = trimesh.creation.box((3.0, 2.0, 1.0))
+TYPES = {"f": 5126, "B": 5121, "H": 5123, "I": 5125, "b": 5120, "h": 5122}
+
+
+class Tree:
+    """A glTF file under construction: arrays become accessors of one buffer."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self.content: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}]}
+        self.content |= {"nodes": [{"mesh": 0}], "meshes": [{"primitives": []}], "accessors": [], "bufferViews": []}
+
+    def array(self, values: Any, dtype: str = "f", **more: Any) -> int:
+        x = np.asarray(values, dtype)
+        x = x[:, None] if x.ndim == 1 else x
+        kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[x.shape[1]]
+        self.data += bytes(-len(self.data) % 4)
+        self.content["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": x.nbytes})
+        self.data += x.tobytes()
+        accessor = {"bufferView": len(self.content["bufferViews"]) - 1, "componentType": TYPES[dtype]}
+        self.content["accessors"].append({**accessor, "count": len(x), "type": kind, **more})
+        return len(self.content["accessors"]) - 1
+
+    def part(self, indices: Any = None, positions: Any = BOX.vertices, **more: Any) -> dict[str, Any]:
+        part: dict[str, Any] = {"attributes": {"POSITION": self.array(positions)}, **more}
+        if indices is not None:
+            part["indices"] = self.array(np.ravel(indices), "I")
+        self.content["meshes"][0]["primitives"].append(part)
+        return part
+
+    def picture(self, pixels: np.ndarray) -> None:
+        file = BytesIO()
+        Image.fromarray(pixels).save(file, "PNG")
+        uri = "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+        self.content |= {"images": [{"uri": uri}], "textures": [{"source": 0}]}
+
+    def write(self, path: Path) -> Path:
+        uri = "data:;base64," + base64.b64encode(self.data).decode()
+        self.content["buffers"] = [{"byteLength": len(self.data), "uri": uri}]
+        path.write_text(json.dumps(self.content))
+        return path
+
+
+def test_strips_and_fans_have_all_their_faces(tmp_path: Path, load: Load) -> None:
+    square = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
+    angles = np.linspace(0, 2 * math.pi, 17)
+    disc = [[0, 0, 0], *([math.cos(a), math.sin(a), 0] for a in angles)]
+    for indices in (None, [0, 1, 2, 3]):
+        tree = Tree()
+        tree.part(indices, square, mode=5)
+        mesh, _ = load(tree.write(tmp_path / "a.gltf"))
+        assert (len(mesh.faces), mesh.area) == (2, 1.0)
+        assert (mesh.face_normals[:, 2] > 0.99).all(), "every second face of a strip is turned over"
+    tree = Tree()
+    tree.part(None, disc, mode=6)
+    tree.part(BOX.faces)
+    tree.part(None, disc, mode=1)  # lines
+    mesh, _ = load(tree.write(tmp_path / "a.gltf"))
+    assert len(mesh.faces) == 16 + 12
+    assert mesh.area == pytest.approx(22 + 16 * 0.5 * math.sin(math.pi / 8), rel=1e-6)
+
+
+@pytest.mark.parametrize(("dtype", "largest"), [("B", 255), ("H", 65535), ("f", 1)])
+@pytest.mark.parametrize("factor", [None, [1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 0.0, 1.0]])
+def test_vertex_colours_are_multiplied_by_the_material(
+    tmp_path: Path, load: Load, dtype: str, largest: int, factor: list[float] | None
+) -> None:
+    tree = Tree()
+    shades = np.linspace(0, 1, 8)
+    colours = np.stack([shades, 1 - shades, shades, np.ones(8)], axis=1)
+    part = tree.part(BOX.faces, material=0)
+    part["attributes"]["COLOR_0"] = tree.array(colours * largest, dtype, normalized=dtype != "f")
+    metallic = {"metallicFactor": 0, **({} if factor is None else {"baseColorFactor": factor})}
+    tree.content["materials"] = [{"pbrMetallicRoughness": metallic}]
+    mesh, texts = load(tree.write(tmp_path / "a.gltf"))
+    found = surface_colours(mesh)
+    assert found is not None
+    assert has_colours(mesh)
+    assert not texts
+    tint = np.array([1.0, 1.0, 1.0]) if factor is None or factor[0] == 1 else np.array([0.7354, 1.0, 0.0])  # sRGB
+    expected = 255 * colours[BOX.faces][..., :3] * tint
+    np.testing.assert_allclose(found.corners, expected, atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("transform", "expected"),
+    [
+        ({}, [(0, 0), (1, 0), (0, 0.5)]),
+        ({"offset": [0.5, 0.25]}, [(0.5, 0.25), (1.5, 0.25), (0.5, 0.75)]),
+        ({"scale": [2, 3]}, [(0, 0), (2, 0), (0, 1.5)]),
+        ({"rotation": math.pi / 2, "offset": [1, 0]}, [(1, 0), (1, -1), (1.5, 0)]),
+        ({"rotation": math.pi / 2, "scale": [2, 1]}, [(0, 0), (0, -2), (0.5, 0)]),
+    ],
+)
+@pytest.mark.parametrize("required", [True, False])
+def test_transforms_and_other_sets_of_texture_coordinates(
+    tmp_path: Path, load: Load, transform: dict[str, Any], expected: list[tuple[float, float]], required: bool
+) -> None:
+    """In the file (0, 0) is the top left; here it is the bottom left."""
+    pixels = np.random.default_rng(0).integers(0, 255, (4, 4, 3), np.uint8)
+    for number, info in (
+        (0, {"index": 0, "extensions": {"KHR_texture_transform": transform}}),
+        (1, {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": transform}}),
+        (1, {"index": 0, "texCoord": 0, "extensions": {"KHR_texture_transform": {**transform, "texCoord": 1}}}),
+    ):
+        tree = Tree()
+        tree.picture(pixels)
+        part = tree.part(None, [[0, 0, 0], [1, 0, 0], [0, 1, 0]], material=0)
+        part["attributes"]["TEXCOORD_0"] = tree.array(np.full((3, 2), 9.0))
+        part["attributes"][f"TEXCOORD_{number}"] = tree.array([[0, 0], [1, 0], [0, 0.5]])
+        tree.content["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
+        tree.content["extensionsRequired" if required else "extensionsUsed"] = ["KHR_texture_transform"]
+        mesh, texts = load(tree.write(tmp_path / "a.gltf"))
+        colours = surface_colours(mesh)
+        assert colours is not None
+        assert not texts
+        found = colours.uv[0].astype(float)
+        found[:, 1] = 1 - found[:, 1]
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_texture_without_coordinates_or_format_is_named(tmp_path: Path, load: Load) -> None:
+    tree = Tree()
+    tree.picture(np.zeros((4, 4, 3), np.uint8))
+    tree.part(BOX.faces, material=0)
+    tree.content["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 2}}}]
+    assert "lacks TEXCOORD_2" in load(tree.write(tmp_path / "a.gltf"))[1][0]
+    tree.content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+    assert "in a format that is not read" in load(tree.write(tmp_path / "a.gltf"))[1][0]
+
+
+def test_quantised_positions_and_places_of_nodes(tmp_path: Path, load: Load) -> None:
+    tree = Tree()
+    part = tree.part(BOX.faces)
+    part["attributes"]["POSITION"] = tree.array(np.round(BOX.vertices * 2 * 1000), "h", normalized=True)
+    tree.content["extensionsRequired"] = ["KHR_mesh_quantization"]
+    quarter = math.sqrt(0.5)
+    tree.content["nodes"] = [
+        {"children": [1], "translation": [10, 0, 0], "scale": [32.767 / 2] * 3},
+        {"mesh": 0, "rotation": [0, 0, quarter, quarter]},
+    ]
+    mesh, _ = load(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.bounds, [[9, -1.5, -0.5], [11, 1.5, 0.5]], atol=1e-5)
+
+
+def test_skinned_meshes_are_shown_as_their_joints_stand(tmp_path: Path, load: Load) -> None:
+    tree = Tree()
+    part = tree.part(BOX.faces)
+    upper = BOX.vertices[:, 0] > 0
+    part["attributes"]["JOINTS_0"] = tree.array([[int(u), 0, 0, 0] for u in upper], "B")
+    part["attributes"]["WEIGHTS_0"] = tree.array([[1, 0, 0, 0]] * 8)
+    inverse = np.tile(np.eye(4), (2, 1, 1))
+    inverse[1, 0, 3] = -1.0  # of a joint that stood at x = 1
+    tree.content["skins"] = [
+        {"joints": [1, 2], "inverseBindMatrices": tree.array(inverse.transpose(0, 2, 1).reshape(2, 16))}
+    ]
+    tree.content["nodes"] = [
+        {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},  # does not count
+        {"translation": [0, 5, 0], "children": [2]},
+        {"translation": [3, 0, 0]},
+    ]
+    tree.content["scenes"] = [{"nodes": [0, 1]}]
+    mesh, _ = load(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.bounds, [[-1.5, 4, -0.5], [3.5, 6, 0.5]], atol=1e-6)
+
+
+def test_a_plain_material_is_no_print(tmp_path: Path, load: Load) -> None:
+    can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
+    for factor in ([0.6, 0.6, 0.6, 1.0], [1.0, 1.0, 1.0, 1.0], [1.0, 0.0, 0.0, 1.0], None):
+        tree = Tree()
+        tree.part(can.faces, can.vertices, material=0)
+        metallic = {} if factor is None else {"baseColorFactor": factor}
+        tree.content["materials"] = [{"pbrMetallicRoughness": metallic}]
+        mesh, texts = load(tree.write(tmp_path / "a.gltf"), unit="mm")
+        assert not texts
+        assert not has_colours(mesh)
+        assert len(mesh_symmetries(mesh)) == 72
+
+
+def test_morph_targets_are_named(tmp_path: Path, load: Load) -> None:
+    tree = Tree()
+    tree.part(BOX.faces)
+    tree.content["meshes"][0]["weights"] = [0.5]
+    assert "morph targets are left out" in load(tree.write(tmp_path / "a.gltf"))[1][0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"skins": [{"joints": [7]}]},
+        {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 2]}}]},
+        {"materials": [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}]},
+        {"materials": []},
+        {"nodes": [{"mesh": 0, "rotation": [1, 0]}]},
+        {"nodes": [{"mesh": 3}]},
+    ],
+)
+def test_damaged_trees_are_refused(tmp_path: Path, change: dict[str, Any]) -> None:
+    tree = Tree()
+    part = tree.part(BOX.faces, material=0)
+    part["attributes"] |= {"JOINTS_0": tree.array([[9] * 4] * 8, "B"), "WEIGHTS_0": tree.array([[1, 0, 0, 0]] * 8)}
+    tree.content |= {"nodes": [{"mesh": 0, "skin": 0}], "materials": [{}], "skins": [{"joints": [0]}], **change}
+    with pytest.raises(MeshError, match="cannot be read as a mesh"):
+        cr.load_mesh(tree.write(tmp_path / "a.gltf"))

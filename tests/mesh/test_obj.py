@@ -1,0 +1,230 @@
+"""OBJ files as people have them."""
+
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.mesh import has_colours, surface_colours
+
+POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
+UV = "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
+HALVES = [
+    "f 1 3 4\nf 1 4 2\nf 5 6 8\nf 5 8 7\nf 1 2 6\nf 1 6 5\n",
+    "f 3 7 8\nf 3 8 4\nf 1 5 7\nf 1 7 3\nf 2 4 8\nf 2 8 6\n",
+]
+BOX = POINTS + "".join(HALVES)
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+
+
+def textured(faces: str) -> str:
+    """The faces with texture coordinates at their corners, one after the other."""
+    rows = [line.split()[1:] for line in faces.splitlines()]
+    return "".join(f"f {a}/1 {b}/2 {c}/3\n" for a, b, c in rows)
+
+
+def picture(path: Path, seed: int = 0) -> np.ndarray:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(0, 255, (8, 8, 3), np.uint8)
+    Image.fromarray(pixels).save(path)
+    return pixels
+
+
+def write(folder: Path, library: str, name: str = "a.mtl") -> Path:
+    """A box that is textured by material ``label``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(library)
+    path = folder / "box.obj"
+    path.write_text(f"mtllib {name}\n{POINTS}{UV}usemtl label\n{textured(''.join(HALVES))}")
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"])
+@pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
+def test_every_encoding_gives_the_same_mesh(tmp_path: Path, load: Load, encoding: str, first: str) -> None:
+    name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
+    text = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}[first] + BOX
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 0.8 0.1 0.1\n")
+    if encoding == "utf-16-le-mark":
+        data = b"\xff\xfe" + text.encode("utf-16-le")
+    elif encoding in ("cr", "crlf"):
+        data = text.replace("\n", "\r" if encoding == "cr" else "\r\n").encode()
+    else:
+        data = text.encode(encoding)
+    (tmp_path / "a.obj").write_bytes(data)
+    mesh, texts = load(tmp_path / "a.obj")
+    assert (len(mesh.faces), mesh.extents.tolist(), texts) == (12, [3.0, 2.0, 1.0], [])
+
+
+def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(tmp_path: Path, load: Load) -> None:
+    counted_back = "".join(
+        "f " + " ".join(str(int(i) - 9) for i in line.split()[1:]) + "\n" for line in "".join(HALVES).splitlines()
+    )
+    moved = [POINTS.replace("v 3", f"v {3 + shift}").replace("v 0", f"v {shift}") for shift in (0, 5, 10)]
+    parts = [f"o part{k}\nusemtl m{k % 2}\n{points}{counted_back}" for k, points in enumerate(moved)]
+    (tmp_path / "a.obj").write_text("".join(parts))
+    mesh, _ = load(tmp_path / "a.obj")
+    assert (len(mesh.vertices), len(mesh.faces), mesh.extents.tolist()) == (24, 36, [13.0, 2.0, 1.0])
+    assert mesh.volume == pytest.approx(18.0, rel=1e-9) or mesh.volume == pytest.approx(-18.0, rel=1e-9)
+
+
+def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\n")
+    (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\n")
+    body = f"{POINTS}usemtl red\n{HALVES[0]}usemtl blue\n{HALVES[1]}"
+    for head in ("mtllib a.mtl\nmtllib b.mtl\n", "mtllib a.mtl b.mtl\n", "mtllib a.mtl\nmtllib b c.mtl\n"):
+        (tmp_path / "a.obj").write_text(head + body)
+        mesh, texts = load(tmp_path / "a.obj")
+        colours = surface_colours(mesh)
+        assert colours is not None
+        assert not texts
+        assert (colours.corners[:6] == [255, 0, 0]).all()
+        assert (colours.corners[6:] == [0, 0, 255]).all()
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + body)
+    mesh, texts = load(tmp_path / "a.obj")
+    assert "lack the material blue" in texts[0]
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}")
+    colours = surface_colours(load(tmp_path / "a.obj")[0])
+    assert colours is not None
+    assert (colours.corners[6:] == 255).all(), "no name: no material"
+
+
+@pytest.mark.parametrize(
+    ("options", "scale", "offset"),
+    [
+        ("", (1, 1), (0, 0)),
+        ("-s 1.000000 1.000000 1.000000", (1, 1), (0, 0)),
+        ("-s 2 3 -o 0.25 0.5 0", (2, 3), (0.25, 0.5)),
+        ("-o .5 -bm 1.5 -clamp on", (1, 1), (0.5, 0)),
+        ("-blendu on -blendv off -mm 0 1 -texres 512 -imfchan l -t 1 1 1", (1, 1), (0, 0)),
+    ],
+)
+@pytest.mark.parametrize(
+    "name", ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"]
+)
+def test_options_of_a_texture_precede_its_name(
+    tmp_path: Path, load: Load, options: str, scale: tuple[float, float], offset: tuple[float, float], name: str
+) -> None:
+    folder = tmp_path / "maps" if "maps" in name else tmp_path
+    file = name.replace("maps\\", "").strip('"')
+    pixels = picture(folder / (file.lower() if name.isupper() else file))
+    path = write(tmp_path, f"newmtl label\nKd 1 1 1\nmap_Kd {options} {name}\n")
+    mesh, texts = load(path)
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert not texts
+    np.testing.assert_array_equal(colours.textures[0], pixels)
+    expected = np.array([[0, 0], [1, 0], [0, 1]]) * scale + offset
+    np.testing.assert_allclose(colours.uv, np.broadcast_to(expected, (12, 3, 2)), atol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "gbk"])
+def test_a_library_in_another_encoding_finds_its_texture(tmp_path: Path, load: Load, encoding: str) -> None:
+    name = "标签.png" if encoding == "gbk" else "Gehäuse.png"
+    picture(tmp_path / name)
+    path = write(tmp_path, "")
+    (tmp_path / "a.mtl").write_bytes(f"newmtl label\nmap_Kd {name}\n".encode(encoding))
+    mesh, texts = load(path)
+    assert has_colours(mesh)
+    assert not texts
+
+
+def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_is_given(
+    tmp_path: Path, load: Load
+) -> None:
+    picture(tmp_path / "images" / "label.png")
+    for name in ("../images/label.png", str(tmp_path / "images" / "label.png"), "C:\\art\\label.png"):
+        path = write(tmp_path / "models", f"newmtl label\nmap_Kd {name}\n")
+        mesh, texts = load(path)
+        assert not has_colours(mesh)
+        assert len(texts) == 1
+        assert "label.png" in texts[0]
+        assert [warning.kind for warning in cr.mesh.mesh_warnings(mesh)] == ["texture"]
+        mesh, texts = load(path, textures=tmp_path / "images")
+        assert has_colours(mesh)
+        assert not texts
+    path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
+    assert "lies outside of its folder" in load(path)[1][0]
+    assert has_colours(load(path, textures=tmp_path)[0])
+    path.write_text(path.read_text().replace("mtllib a.mtl", "mtllib ../a.mtl"))
+    (path.parent / "a.mtl").rename(tmp_path / "a.mtl")
+    assert "../a.mtl lies outside of its folder" in load(path)[1][0]
+    assert has_colours(load(path, textures=tmp_path)[0])
+
+
+def test_colours_behind_the_coordinates(tmp_path: Path, load: Load) -> None:
+    for scale in (1, 255):
+        points = "".join(f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines()))
+        (tmp_path / "a.obj").write_text(points + "".join(HALVES))
+        colours = surface_colours(load(tmp_path / "a.obj")[0])
+        assert colours is not None
+        assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {(0, 0, 255), (255, 0, 255)}
+
+
+def test_corners_of_several_forms_in_one_file(tmp_path: Path, load: Load) -> None:
+    faces = "".join(HALVES).replace("f 1 3 4\n", "f 1/1 3/2/1 4\n").replace("f 3 8 4\n", "f 3//1 8/ 4//\n")
+    (tmp_path / "a.obj").write_text(POINTS + UV + "vn 0 0 1\n" + faces)
+    np.testing.assert_array_equal(load(tmp_path / "a.obj")[0].faces, load_box(tmp_path).faces)
+
+
+def load_box(folder: Path) -> trimesh.Trimesh:
+    (folder / "plain.obj").write_text(BOX)
+    return cr.load_mesh(folder / "plain.obj")
+
+
+@pytest.mark.parametrize(
+    "line", ["v 1 2", "v 0,5 1,0 2,0", "v a b c", "f 1 2 99", "f 1 2 -99", "f 1 2 0", "f 1/9 2/9 3/9"]
+)
+def test_damaged_lines_are_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "a.obj").write_text(f"{BOX}vt 0 0\n{line}\n")
+    with pytest.raises(MeshError, match=r"a\.obj: cannot be read"):
+        cr.load_mesh(tmp_path / "a.obj")
+
+
+HOSTILE = {
+    "blanks": lambda n: BOX + "f" + " " * 20 * n + "\n",
+    "blanks behind": lambda n: BOX + "f 1 2 3" + " " * 20 * n + "x\n",
+    "slashes": lambda n: BOX + "f 1" + "/" * 20 * n + " 2 3\n",
+    "blank lines": lambda n: BOX + " \n" * 10 * n,
+    "materials": lambda n: BOX + "".join(f"usemtl m{k % 4000}\nf 1 2 3\n" for k in range(n)),
+    "groups": lambda n: BOX + "".join(f"g m{k % 4000}\nf 1 2 3\n" for k in range(n)),
+    "libraries": lambda n: BOX + "".join(f"mtllib m{k % 2000}.mtl\n" for k in range(n)),
+    "continued": lambda n: BOX + "f 1 2 3 \\\n" * n,
+    "comments": lambda n: BOX + "#" * 20 * n,
+    "minus": lambda n: BOX + "f " + "-" * 20 * n + "\n",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
+    """Of four times the size, at most nine times the time; quadratic readers take sixteen times as long."""
+
+    def seconds(n: int) -> float:
+        path = tmp_path / "a.obj"
+        path.write_text(HOSTILE[kind](n))
+        start = time.process_time()
+        with warnings.catch_warnings(), suppress(MeshError):
+            warnings.simplefilter("ignore")
+            cr.load_mesh(path)
+        return time.process_time() - start
+
+    seconds(100)
+    small = min(seconds(5_000) for _ in range(2))
+    assert seconds(20_000) < max(9.0 * small, 0.3)
+
+
+def test_an_obj_of_many_parts_is_refused(tmp_path: Path) -> None:
+    for key in ("o", "g", "usemtl", "mtllib"):
+        path = tmp_path / "a.obj"
+        path.write_text(POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
+        with pytest.raises(MeshError, match="more than 10,000 parts; join them"):
+            cr.load_mesh(path)

@@ -1,0 +1,111 @@
+"""STL files as people have them."""
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+BOX = trimesh.creation.box((3.0, 2.0, 1.0))
+
+
+def binary(header: bytes = b"exported", claimed: int = 12, tail: bytes = b"") -> bytes:
+    corners = np.asarray(BOX.triangles, "<f4")
+    records = b"".join(struct.pack("<12x") + one.tobytes() + b"\0\0" for one in corners)
+    return header.ljust(80) + struct.pack("<I", claimed) + records + tail
+
+
+def ascii_stl(name: str = "part", point: str = "  vertex {:.4f} {:.4f} {:.4f}\n") -> str:
+    facets = "".join(
+        "facet normal 0 0 0\n outer loop\n" + "".join(point.format(*corner) for corner in one) + " endloop\nendfacet\n"
+        for one in BOX.triangles
+    )
+    return f"solid {name}\n{facets}endsolid {name}\n"
+
+
+def check(mesh: trimesh.Trimesh) -> None:
+    assert (len(mesh.faces), mesh.extents.round(6).tolist()) == (12, [3.0, 2.0, 1.0])
+    assert mesh.volume == pytest.approx(6.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "header", [b"exported", b"solid Part1", b"solid facet vertex", "solid Gehäuse".encode("latin-1")]
+)
+@pytest.mark.parametrize("tail", [b"", b"\r\n"])
+def test_the_header_of_a_binary_file_says_nothing(tmp_path: Path, load: Load, header: bytes, tail: bytes) -> None:
+    (tmp_path / "a.stl").write_bytes(binary(header, tail=tail))
+    mesh, texts = load(tmp_path / "a.stl")
+    check(mesh)
+    assert not texts
+
+
+@pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
+def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
+    (tmp_path / "a.stl").write_bytes(binary()[:-cut])
+    with pytest.raises(MeshError, match=r"says 12 faces and holds .*cut while it was written"):
+        cr.load_mesh(tmp_path / "a.stl")
+    (tmp_path / "a.stl").write_bytes(binary(claimed=0))
+    with pytest.raises(MeshError, match="says 0 faces and holds 12"):
+        cr.load_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ascii_stl().encode(),
+        ascii_stl().upper().encode(),
+        ascii_stl(point="\t\tvertex\t{:.4f}\t{:.4f} {:e}\n").encode(),
+        ascii_stl("Gehäuse").encode("latin-1"),
+        ascii_stl("外壳").encode("gbk"),
+        ascii_stl("vertex_plate facet").encode(),
+        ascii_stl("vertex 1 2 3").encode("utf-8-sig"),
+        ascii_stl().encode("utf-16"),
+        ascii_stl().replace("\n", "\r\n").encode(),
+        ascii_stl().replace("\n", "\r").encode(),
+        ("\n \n" + ascii_stl()).encode(),
+    ],
+    ids=["plain", "upper", "tabs", "latin-1", "gbk", "named", "bom", "utf-16", "crlf", "cr", "blank"],
+)
+def test_ascii_files_of_every_encoding(tmp_path: Path, load: Load, content: bytes) -> None:
+    (tmp_path / "a.stl").write_bytes(content)
+    mesh, texts = load(tmp_path / "a.stl")
+    check(mesh)
+    assert not texts
+
+
+def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> None:
+    text = ascii_stl()
+    (tmp_path / "a.stl").write_text(text[: text.rindex("endsolid")])
+    mesh, texts = load(tmp_path / "a.stl")
+    check(mesh)
+    assert "may have been cut short" in texts[0]
+    for end in ("endfacet", "endloop", "vertex", "facet normal"):
+        (tmp_path / "a.stl").write_text(text[: text.rindex(end) + (4 if end == "facet normal" else 0)])
+        if end == "facet normal":
+            continue
+        with pytest.raises(MeshError, match="it was cut short, or is damaged"):
+            cr.load_mesh(tmp_path / "a.stl")
+
+
+@pytest.mark.parametrize(
+    ("content", "match"),
+    [
+        (ascii_stl().replace(".", ",").encode(), "decimal commas; export it with decimal points"),
+        (ascii_stl(point="  vertex {:.1f} {:.1f}\n").encode(), "does not have three coordinates"),
+        (ascii_stl(point="  vertex {:.1f} {:.1f} {:.1f} 4\n").encode(), "does not have three coordinates"),
+        (ascii_stl(point="  vertex {:.1f} {:.1f} x{:.1f}\n").encode(), "not a number"),
+        (b"solid", "got none"),
+        (b"", "too early"),
+        (b"nothing of the kind", "too early"),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path: Path, content: bytes, match: str) -> None:
+    (tmp_path / "a.stl").write_bytes(content)
+    with pytest.raises(MeshError, match=match):
+        cr.load_mesh(tmp_path / "a.stl")

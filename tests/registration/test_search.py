@@ -1,0 +1,183 @@
+"""The preset "paper": its stages, and its search between coherent views."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from curvireg_torch import Registrar, ViewBank
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import (
+    PosePrior,
+    paper_views,
+    rotation_error,
+    rotation_from_viewpoint,
+    sample_views,
+    viewpoint_from_rotation,
+)
+from curvireg_torch.mesh.mesh import principal_rotation
+from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
+from curvireg_torch.registration import poses, registrar, search
+from curvireg_torch.terms import Appearance
+from tests._support.scenes import CAMERA, scene, truck_bank
+
+
+def test_coherent_views_are_connected_with_the_best_by_neighbours():
+    angles = torch.tensor([[10.0, 20, 0], [30, 20, 0], [50, 60, 0], [90, 20, 0], [10, 20, 90]])
+    assert search.coherent_views(angles).tolist() == [True, True, True, False, False]
+    assert search.coherent_views(angles[[0, 2, 3]]).tolist() == [True, False, False]
+    assert search.coherent_views(angles, (5.0, 5.0, 5.0)).tolist() == [True, False, False, False, False]
+
+
+def test_angles_near_run_on_past_the_pole():
+    one = paper_views()[::6]
+    angles = torch.stack([one.azimuth, one.elevation, one.theta], dim=1).double()
+    same = search.angles_near(angles, angles[20])
+    before, after = (rotation_from_viewpoint(*x.unbind(1)) for x in (angles, same))
+    torch.testing.assert_close(before, after, rtol=0, atol=1e-6)
+    assert same[20].tolist() == angles[20].tolist()
+    past = 2 * 18 + 2  # elevation 100 degrees, above elevation 50 with the same azimuth
+    assert torch.allclose(same[past] - same[20], torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64), atol=1e-4)
+
+
+def test_divided_contains_both_ends():
+    assert search.divided(10.0, 30.0, 5.0).tolist() == [10, 15, 20, 25, 30]
+    assert search.divided(10.0, 12.0, 5.0).tolist() == [10, 12]
+    assert search.divided(10.0, 10.0, 5.0).tolist() == [10]
+
+
+def test_motion_is_the_frobenius_norm_of_the_relative_transform_in_radii():
+    R, S = rotation_from_viewpoint(torch.tensor([20.0, 50.0]).double(), 10.0, torch.tensor([0.0, 4.0]).double())
+    first, second = torch.eye(4).double(), torch.eye(4).double()
+    first[:3, :3], second[:3, :3] = R, S
+    first[2, 3], second[2, 3] = 5.0, 5.4
+    E = torch.linalg.matrix_norm(torch.linalg.inv(first) @ second - torch.eye(4).double())
+    assert search.motion((R, first[2, 3]), (S, second[2, 3])) == pytest.approx(float(E), rel=1e-9)
+
+
+class Peak:
+    """A matcher that knows the best view: the nearer a view is to it, in angle and distance, the better."""
+
+    def __init__(self, bank: Any, azimuth: float, elevation: float, distance: float) -> None:
+        self.bank, self.compared = bank, []
+        self.truth, self.distance = rotation_from_viewpoint(azimuth, elevation), distance
+
+    def scores(self, views: Any) -> Tensor:
+        angle = rotation_error(views.rotations, self.truth)
+        return -(angle.square()) / 100.0 - (views.distance - self.distance).square()
+
+    def compare_views(self, _: Any, views: Any) -> Tensor:
+        self.compared.append(views)
+        return self.scores(views)
+
+
+def searched(*truth: float, camera: str = "perspective") -> tuple[Tensor, Tensor, Any]:
+    """Rotation and distance that the search finds on a bank of neighbouring views, and the matcher."""
+    views = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
+    bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, image_size=32, camera=camera, progress=False)
+    matcher: Any = Peak(bank, *truth)
+    order = matcher.scores(views).argsort(descending=True, stable=True)[None]
+    ranking: Any = type("Ranking", (), {"order": order, "allowed": None})()
+    rotation, distance = search.search(matcher, None, ranking)
+    return rotation, distance / (0.5 * 14**0.5), matcher
+
+
+def test_search_looks_between_the_least_and_greatest_angles_and_distances():
+    rotation, distance, matcher = searched(207.0, 0.0, 3.7)
+    first = matcher.compared[0]
+    assert sorted(set(first.azimuth.round().tolist())) == [200, 205, 210, 215, 220]
+    assert sorted(set(first.distance.tolist())) == [3.0, 3.25, 3.5, 3.75, 4.0, 4.25, 4.5]
+    assert float(rotation_error(rotation, rotation_from_viewpoint(207.0, 0.0).double())) < 2.0
+    assert float(distance) == pytest.approx(3.7, abs=0.1)
+
+
+def test_search_stops_by_the_motion(monkeypatch):
+    rounds, errors = [], []
+    for stop in (1e9, 0.2, 0.05):
+        monkeypatch.setattr(search, "STOP_MOTION", stop)
+        rotation, distance, matcher = searched(207.0, 0.0, 3.7)
+        rounds.append(len(matcher.compared))
+        angle = float(rotation_error(rotation, rotation_from_viewpoint(207.0, 0.0).double()))
+        errors.append((angle, abs(float(distance) - 3.7)))
+    assert rounds == [1, 2, 4]
+    assert errors == [pytest.approx(e, abs=1e-4) for e in ((2.0, 0.05), (0.5, 0.05), (0.5, 0.0125))]
+
+
+def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
+    _, distance, matcher = searched(207.0, 20.0, 3.0, camera="orthographic")
+    assert set(matcher.compared[0].distance.tolist()) == {3.0}
+    assert sorted(set(matcher.compared[0].elevation.round().tolist()))[:3] == [0, 5, 10]  # three directions
+    assert float(distance) == pytest.approx(3.0)
+
+
+def paper_registrar(**changes: Any) -> Registrar:
+    return Registrar(truck_bank().mesh, pipeline=replace(PRESETS["paper"], **changes))
+
+
+def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
+    def refused(*_: Any, **__: Any) -> Any:
+        raise AssertionError("not a stage of the paper")
+
+    for name in ("fit_poses", "with_quick_fit", "with_edge_support", "fit_texture_of", "landmark_evidence"):
+        monkeypatch.setattr(registrar, name, refused)
+    monkeypatch.setattr(registrar, "EdgeCrops", refused)
+    monkeypatch.setattr(poses, "fit_to_edges", refused)
+    monkeypatch.setattr(Appearance, "build", refused)
+    monkeypatch.setattr(Registrar, "object_mask", refused)
+    stages: list[str] = []
+    bank = ViewBank.build(truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: stages.append(x[0]))
+    image, box, _ = scene(0)
+    result = Registrar(bank, progress=lambda *x: stages.append(x[0]))([image], box[None], CAMERA)[0]
+    assert list(dict.fromkeys(stages)) == ["bank", "ranking", "search"]
+    assert list(result.ranking.terms) == ["hog", "repeatability"]
+    assert len(result.hypotheses) == 1
+    assert result.confidence is None
+    assert result.hypotheses[0].edge_support is None
+    paper = bank.pipeline
+    assert (paper.field, paper.box_jitter, paper.search, paper.contours) == ("MFC", 0.0, True, False)
+    assert (len(bank), bank.settings.camera, bank.settings.formula) == (756, "orthographic", "paper")
+
+
+def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh():
+    """A rotated copy of the mesh has the same views, and its pose in the same photograph is rotated alike."""
+    turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
+    T = torch.eye(4).double()
+    T[:3, :3] = turn
+    copy = truck_bank().mesh.copy().apply_transform(T.numpy())
+    one, other = (ViewBank.build(m, pipeline=PRESETS["paper"], progress=False) for m in (truck_bank().mesh, copy))
+    torch.testing.assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
+    in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
+    torch.testing.assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
+    image, box, _ = scene(0)
+    first, second = (Registrar(bank)([image], box[None])[0].rotation for bank in (one, other))
+    assert float(rotation_error(second @ turn, first)) < 0.1
+
+
+def test_the_search_comes_nearer_than_its_views():
+    upright = ViewPolicy(pose="upright", azimuth_step=20.0)
+    settings = {"views": upright, "bank": BankSettings(), "field": "focus"}
+    errors: dict[bool, list[float]] = {}
+    for with_search in (True, False):
+        given = replace(PRESETS["classical"], box_jitter=0.0, contours=False, search=with_search, **settings)
+        one = Registrar(truck_bank().mesh, pipeline=given)
+        results = [(one([image], box[None])[0], T) for image, box, T in map(scene, range(4))]
+        errors[with_search] = [float(rotation_error(result.rotation, T[:3, :3])) for result, T in results]
+    assert sum(errors[True]) < sum(errors[False])
+
+
+def test_the_search_starts_from_allowed_views_and_ends_within_the_limits():
+    image, box, T = scene(0)
+    right = float(viewpoint_from_rotation(T[:3, :3])[0])
+    prior = PosePrior(azimuth=((right + 90.0) % 360.0, (right + 180.0) % 360.0))
+    result = paper_registrar(views=ViewPolicy(pose="upright"))([image], box[None], prior=prior)[0]
+    away = (result.viewpoint[0] - right) % 360.0
+    assert 90.0 - 1e-3 <= away <= 180.0 + 1e-3
+
+
+def test_search_and_contour_fit_exclude_each_other():
+    with pytest.raises(InvalidInputError, match="contours=False"):
+        Pipeline(search=True)
+    assert Pipeline(search=True, contours=False).search
