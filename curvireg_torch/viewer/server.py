@@ -84,25 +84,31 @@ def make_server(
         show_welcome_message=False,
     )
     # h11 refuses requests with two hosts.
-    bound, number = listener.getsockname()[:2]
     config = uvicorn.Config(
-        guarded(site, host, bound),
+        guarded(site, host, listener.getsockname()[0]),
         log_level="warning",
         server_header=False,
         ws="wsproto",
         http="h11",
         timeout_graceful_shutdown=SECONDS_TO_END,
     )
+    address = print_address(listener, host, prefix, printed_to)
+    if browser_folder is not None:
+        page = redirect_file(browser_folder, address)
+        threading.Timer(0.5, webbrowser.open, (page.as_uri(),)).start()
+    return uvicorn.Server(config)
+
+
+def print_address(listener: socket.socket, host: str, prefix: str, printed_to: TextIO | None = None) -> str:
+    """Print and return the address of the page, and say who may use it."""
+    bound, number = listener.getsockname()[:2]
     name = socket.gethostname() if _is_everyone(bound) else _plain_host(host)
     name = f"[{name}]" if ":" in name else name
     address = f"http://{name}:{number}{prefix}/"
     print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
     if not _is_loopback(bound):
         print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
-    if browser_folder is not None:
-        page = redirect_file(browser_folder, address)
-        threading.Timer(0.5, webbrowser.open, (page.as_uri(),)).start()
-    return uvicorn.Server(config)
+    return address
 
 
 def redirect_file(folder: Path, address: str) -> Path:

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, make_server
+from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, print_address
 
 
 async def page(scope, _, send):
@@ -20,7 +20,7 @@ async def page(scope, _, send):
         await send({"type": "http.response.body", "body": b"page"})
 
 
-def answer(site, kind="http", **headers):
+def answer(site, kind="http", also=None, **headers):
     """The first message that answers a request to a site for one host."""
     pairs = [(name.encode(), value.encode()) for name, value in {"host": "127.0.0.1:8080", **headers}.items()]
     scope = {"type": kind, "path": "/", "method": "GET", "headers": pairs}
@@ -33,7 +33,8 @@ def answer(site, kind="http", **headers):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guarded(page, site)(scope, receive, send))
+    hosts = [site] if also is None else [site, also]
+    asyncio.run(guarded(page, *hosts)(scope, receive, send))
     return sent[0]
 
 
@@ -85,24 +86,18 @@ def test_a_host_header_is_a_name_and_a_port_alone():
         ("::", socket.gethostname(), True),
     ],
 )
-def test_the_printed_address_names_the_host(tmp_path, capsys, host, shown, is_warned):
+def test_the_printed_address_names_the_host(capsys, host, shown, is_warned):
     with listen(host, 0) as listener:
         bound, port = listener.getsockname()[:2]
-        server = make_server(listener, host, browser_folder=None)
+        address = print_address(listener, host, "/secret")
+    assert address == f"http://{shown}:{port}/secret/"
     printed = capsys.readouterr()
-    assert re.match(rf"curvireg: http://{re.escape(shown)}:{port}/[\w-]{{20,}}/ ", printed.out)
+    assert printed.out == f"curvireg: {address}   (Ctrl-C ends it)\n"
     assert ("everyone who reaches this machine" in printed.err) is is_warned
-    assert not list(tmp_path.iterdir())
-    for header in (f"{shown}:{port}", f"[{bound}]:{port}" if ":" in bound else f"{bound}:{port}"):
-        pairs = [(b"host", header.encode())]
-        sent = []
-
-        async def send(message, sent=sent):
-            sent.append(message)
-
-        scope = {"type": "http", "path": "/none", "method": "GET", "headers": pairs, "query_string": b""}
-        asyncio.run(server.config.app(scope, None, send))
-        assert sent[0]["status"] == 404, header
+    own = f"[{bound}]" if ":" in bound else bound
+    for header in (f"{shown}:{port}", f"{own}:{port}"):
+        assert answer(host, also=bound, host=header)["status"] == 200, header
+    assert answer(host, also=bound, host="evil.example")["status"] == (200 if is_warned else 400)
 
 
 def test_every_answer_has_the_security_headers():
