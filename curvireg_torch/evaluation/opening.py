@@ -113,7 +113,11 @@ class RegisterOptions:
         "result then has no covariance",
         type=camera_option,
     )
-    mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
+    mask: Path | None = _option(
+        None,
+        "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of --box or beside it",
+        type=Path,
+    )
     guess: str | float | None = _option(
         None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
     )

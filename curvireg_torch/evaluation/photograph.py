@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
 from ..data.frames import VideoFrame
+from ..data.masks import mask_file
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
@@ -67,7 +68,7 @@ class Entry:
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
         given = [self.name, self.box, camera, self.instances, prior]
         views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
-        mask = [] if self.mask is None else [str(self.mask), file_digest(self.mask)]
+        mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
         return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
 
     def read(self) -> Photo:
@@ -79,7 +80,7 @@ class Entry:
     @property
     def files(self) -> tuple[Path, ...]:
         """The photographs, meshes and mask that are read."""
-        masks = [Path(self.mask)] if isinstance(self.mask, str | PathLike) else []
+        masks = [mask_file(self.mask)[0]] if isinstance(self.mask, str | PathLike) else []
         photos = [self.photo, *(view.photo for view in self.views)]
         return (*photos, *self.meshes, *masks)
 
@@ -156,7 +157,7 @@ def register(
         box: x0, y0, x1, y1 in px; without box and mask the object is searched for.
         camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a calibration file;
             "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.
-        mask: (H, W) of the object, white, or its path.
+        mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
         prior: limits on the pose.
         unit, up: of a mesh file, see :func:`load_mesh`.
         pipeline: the default is that of :class:`Registrar`.
@@ -197,7 +198,7 @@ def register(
 
 def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
     """The photograph and what is known about it; refuses what cannot be used, as before meshes are opened."""
-    if isinstance(entry.mask, str | PathLike) and not Path(entry.mask).is_file():
+    if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
     item = image_items([photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks)[0]

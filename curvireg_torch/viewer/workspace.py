@@ -164,7 +164,7 @@ class Workspace:
 
     async def _open_upload(self, path: Path) -> None:
         suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
-        kinds = (*IMAGES, ".heic", *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
+        kinds = (*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
         self.messages.pop("file", None)
         if suffix in kinds and self._before_sample is not None:
             await self.run("file", self._leave_sample, stop=True)
