@@ -140,8 +140,8 @@ def signals_handled(numbers: Iterable[int], handler: Callable[[int, Any], object
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, before in previous.items():
+            signal.signal(number, before)
 
 
 def hangup_signals() -> list[int]:

@@ -62,7 +62,7 @@ def test_uploads_find_their_place(workspace, scene):
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
     assert (names(workspace), sorted(stored(workspace))) == (["b.png"], ["b.png", "part.PLY"])
-    calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0]}
+    calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0, 0]}
     asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
     assert session.shot.photo.notes == ("undistorted",)
     asyncio.run(workspace.remove_photo())
