@@ -17,6 +17,9 @@ VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 
+START_CONVENTIONS = ("opencv", "opengl")
+"""Axes of the camera of a given pose: x right, y down, z forward; or x right, y up, z backward."""
+
 MESH_KINDS = ("exact", "similar")
 """Whether a mesh is that of the photographed object itself, or of another one of its kind."""
 
