@@ -34,6 +34,7 @@ from ..utils.checks import (
     check_tensor,
     type_and_shape,
 )
+from .framing import clipped
 
 MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
@@ -231,6 +232,8 @@ def image_item(
         box = around if box is None else box
     box = whole_image_box(pixels).cpu() if box is None else box
     item = ImageItem(pixels, box, camera, prior, mask)
+    # Of an object that the border cuts, only the visible part is known.
+    item = replace(item, box=clipped(box, item.size))
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
         notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
     return replace(item, notes=tuple(notes))

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 # Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank
 WIDE_ANGLES = (14.0, 22.0)
+COMPARED = 5  # Hypotheses of the registration that checks a refined pose, even if fewer are reported
 LOST_CONFIDENCE = 0.35  # Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
 
 
@@ -135,7 +136,7 @@ def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses
     projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
     query = registrar.matcher.query([item.image], boxes.float())
-    found = registrar.register(replace(item, box=boxes[0].float()), query)
+    found = registrar.with_hypotheses(COMPARED).register(replace(item, box=boxes[0].float()), query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
     near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact(with_camera=True)))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)

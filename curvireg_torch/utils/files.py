@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,17 +124,34 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping
     write_file(path, save(content, dict(metadata or {})))
 
 
+def terminable() -> AbstractContextManager[None]:
+    """Context in which SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: every ``finally``
+    runs, and no partial file remains."""
+    return signals_handled([signal.SIGTERM, *hangup_signals()], _exit_after)
+
+
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Context in which SIGTERM ends the process as Ctrl-C does: every ``finally`` runs, and no partial file remains."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+def signals_handled(numbers: Iterable[int], handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Context in which signals call ``handler``; in the main thread, as others cannot handle signals."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, before in previous.items():
+            signal.signal(number, before)
+
+
+def hangup_signals() -> list[int]:
+    """SIGHUP, where the system has it and nohup does not ignore it."""
+    hangup = getattr(signal, "SIGHUP", None)
+    return [] if hangup is None or signal.getsignal(hangup) is signal.SIG_IGN else [hangup]
+
+
+def _exit_after(number: int, _: object) -> None:
+    sys.exit(128 + number)
 
 
 def read_json(path: Path, kind: type[Any], readme: str) -> Any:

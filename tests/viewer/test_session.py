@@ -15,9 +15,9 @@ from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.data.pose_files import read_pose
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
-from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.evaluation.opening import WITHIN, RegisterOptions
 from curvireg_torch.evaluation.store import to_json
-from curvireg_torch.geometry import Camera, rotation_error, undistorted
+from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpoint, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
@@ -359,3 +359,15 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     assert seen(moved, K, right)[1] > seen(T, K, right)[1]
     with pytest.raises(InvalidInputError, match="touch the camera"):
         result.scaled(T, 1000.0)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 45.0, 90.0, 135.0, 180.0, 200.0, 315.0])
+@pytest.mark.parametrize("elevation", [-30.0, 0.0, 60.0])
+def test_a_hint_is_the_side_from_which_the_model_is_seen(azimuth, elevation):
+    """The camera of that viewpoint stands where the hint was taken, in the frame of limits."""
+    R = rotation_from_viewpoint(*(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation, 0.0)))
+    position = R.mT @ torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64)
+    session = Session(RegisterOptions(limits={"front": "x"}))
+    session.hint_direction(position.tolist())
+    assert session.options.limits["viewpoint"] == pytest.approx((azimuth, elevation, 0.0), abs=0.06)
+    assert (session.options.limits["within"], session.options.limits["front"]) == (WITHIN, "x")
