@@ -90,8 +90,9 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     """The files that a command's options name, and ``more``."""
     named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
     camera = getattr(arguments, "camera", None)
-    calibrations = [camera, camera.rpartition(":")[0]] if isinstance(camera, str) else []
-    return [*more, *(path for path in named if isinstance(path, Path)), *map(Path, filter(None, calibrations))]
+    paths = [*(str(path) for path in named if isinstance(path, Path)), *([camera] if isinstance(camera, str) else [])]
+    named_parts = [path.rpartition(":")[0] for path in paths]  # of FILE:NAME
+    return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
 
 
 _ALTERNATIVES = {

@@ -86,7 +86,7 @@ def add_register(commands: Any) -> None:
         "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
     )
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
-    add_options(parser, *PHOTOGRAPH, "start", "instances", "field", "top", "refine")
+    add_options(parser, *PHOTOGRAPH, "start", "start_convention", "instances", "field", "top", "refine")
     add_limits(parser)
     jobs = "processes for several photographs (default: 1)"
     add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
@@ -135,6 +135,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
         return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
+    if arguments.start_convention is not None and arguments.start is None:
+        return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
     if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
