@@ -82,15 +82,36 @@ def register_options(
         raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
-    return RegisterOptions(photos=tuple(photos), meshes=tuple(meshes), limits=limits, **given)
+    common: dict[str, Any] = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}
+    return RegisterOptions(**common, unit_is_given="unit" in given, **given)
 
 
 def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     """The files that a command's options name, and ``more``."""
     named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
     camera = getattr(arguments, "camera", None)
-    calibrations = [camera, camera.rpartition(":")[0]] if isinstance(camera, str) else []
-    return [*more, *(path for path in named if isinstance(path, Path)), *map(Path, filter(None, calibrations))]
+    paths = [*(str(path) for path in named if isinstance(path, Path)), *([camera] if isinstance(camera, str) else [])]
+    named_parts = [path.rpartition(":")[0] for path in paths]  # of FILE:NAME
+    return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
+
+
+_ALTERNATIVES = {
+    ("preset", "pipeline"): "expected one of --preset and --pipeline",
+    ("camera", "guess"): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
+    ("box", "start"): "--start is the pose, so that no box is needed; leave --box out",
+}
+"""Options of which one would be ignored, and what is said about them."""
+
+
+def ignored_option(arguments: argparse.Namespace) -> str | None:
+    """What is wrong with options of any command that would be ignored beside others; None if none would."""
+    for names, message in _ALTERNATIVES.items():
+        if all(getattr(arguments, name, None) is not None for name in names):
+            return message
+    given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
+    if given == ["front"] and getattr(arguments, "list", None) is None:
+        return "--front limits nothing by itself; give --azimuth, for instance"
+    return None
 
 
 def check_viewer(command: str) -> None:

@@ -1,6 +1,8 @@
 """``curvireg register PHOTO... MESH``."""
 
 import argparse
+import json
+import os
 import sys
 import tempfile
 import time
@@ -12,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
 from ..evaluation.opening import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
-from ..utils.choices import check_given, is_one_photograph
+from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .options import (
     PHOTOGRAPH,
     add_command,
@@ -84,7 +86,7 @@ def add_register(commands: Any) -> None:
         "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
     )
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
-    add_options(parser, *PHOTOGRAPH, "start", "instances", "field", "top", "refine")
+    add_options(parser, *PHOTOGRAPH, "start", "start_convention", "instances", "field", "top", "refine")
     add_limits(parser)
     jobs = "processes for several photographs (default: 1)"
     add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
@@ -116,20 +118,27 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
         return f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
-    if arguments.camera is not None and arguments.guess is not None:
-        return "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG"
     if (arguments.box or arguments.mask) and arguments.instances is not None:
         return "--instances applies only without a box; leave --box and --mask out"
+    if arguments.instances is not None and (arguments.start or rig is not None):
+        return "--start and --views are of one object; leave --instances out"
+    if arguments.top is not None and arguments.start:
+        return "--start refines one pose; leave --top out"
+    alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
+    if alone and arguments.jobs > 1:
+        return "--jobs: several processes share several photographs; leave it out for one result"
+    if arguments.every > 1 and not any(photo.suffix.lower() in VIDEOS for photo in arguments.photos):
+        return "--every applies to the frames of videos; leave it out"
     if arguments.start is not None and (arguments.box or arguments.mask or listed or len(arguments.meshes) > 1):
         return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
         return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
+    if arguments.start_convention is not None and arguments.start is None:
+        return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
-    if limits == ["front"] and not listed:
-        return "--front limits nothing by itself; give --azimuth, for instance"
     if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
         return f"--distance: needs a camera; give {CAMERA_OPTIONS}"
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
@@ -144,7 +153,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.store import run_processes
+    from ..evaluation.store import STARTED, run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
@@ -155,7 +164,7 @@ def run(arguments: argparse.Namespace) -> int:
             reliable = register(options, arguments)
         return NONE_RELIABLE if arguments.strict and not reliable else 0
     if run_processes(arguments.jobs, arguments.argv):
-        return 0
+        return _strict_code(*_counted(arguments.out)) if arguments.strict else 0
     with one_torch_thread(), _output(arguments) as out:
         counts = _register_several(options, arguments, out)
         if counts is None:  # another process writes the tables
@@ -172,9 +181,24 @@ def run(arguments: argparse.Namespace) -> int:
     if not counts.ok:
         message = "no photograph could be registered; the message of each gives the reason"
         raise InvalidInputError(message, subject=arguments.list or "")
-    if not arguments.strict:
+    if not arguments.strict or STARTED in os.environ:  # the process that started this one reports
         return 0
-    return NONE_RELIABLE if not counts.reliable else SOME_FAILED if counts.failures else 0
+    return _strict_code(counts.reliable, len(counts.failures))
+
+
+def _strict_code(reliable: int, failed: int) -> int:
+    """The exit code of ``--strict`` for numbers of photographs."""
+    if not reliable:
+        return NONE_RELIABLE
+    return SOME_FAILED if failed else 0
+
+
+def _counted(out: Path) -> tuple[int, int]:
+    """Numbers of reliable and of failed photographs among results that other processes wrote."""
+    lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    rows = [json.loads(line) for line in lines]
+    reliable = sum(bool(row.get("reliable")) for row in rows)
+    return reliable, sum(row["status"] != "ok" for row in rows)
 
 
 @contextmanager

@@ -14,10 +14,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
-from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
-from ..utils.files import finite_numbers, read_json
+from ..utils.choices import (
+    DEFAULT,
+    MESH_KINDS,
+    PRESET_NAMES,
+    RENDERER_NAMES,
+    SIDE_NAMES,
+    START_CONVENTIONS,
+    UNITS,
+    UP_AXES,
+)
 
 if TYPE_CHECKING:
+    from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
@@ -113,12 +122,24 @@ class RegisterOptions:
         "result then has no covariance",
         type=camera_option,
     )
-    mask: Path | None = _option(None, "picture in which the object is white, instead of --box or beside it", type=Path)
+    mask: Path | None = _option(
+        None,
+        "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of --box or beside it",
+        type=Path,
+    )
     guess: str | float | None = _option(
         None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
     )
     start: Path | None = _option(
-        None, "result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path
+        None,
+        "refine this pose; needs no box: result.json, or JSON with rotation and translation or T_cam_from_model, 4 x 4 "
+        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the format has none",
+        type=Path,
+    )
+    start_convention: str | None = _option(
+        None,
+        "axes of the camera of --start: opencv, x right, y down, z forward (default); opengl, x right, y up, z back",
+        choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
     unit: str | None = _option(
@@ -131,6 +152,7 @@ class RegisterOptions:
     textures: Path | None = _option(
         None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
     )
+    unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
         None,
         "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
@@ -186,6 +208,15 @@ class RegisterOptions:
 
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
+    def read_start(self) -> "PoseFile | None":
+        """The pose of the file ``start``, or None."""
+        if self.start is None:
+            return None
+        from ..data.pose_files import read_pose
+
+        mesh = self.meshes[0].stem if self.meshes else ""
+        return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)
+
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
         from ..geometry import Camera, camera_matrix
@@ -193,9 +224,9 @@ class RegisterOptions:
 
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
-        start, confidence = (None, None) if self.start is None else read_start(self.start)
+        start = self.read_start()
         same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
-        same |= {"start": start, "start_confidence": confidence, "prior": prior_from_limits(self.limits or {})}
+        same |= {"start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
@@ -248,25 +279,12 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
         raise InvalidInputError(f"--{error}") from error
 
 
-def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
-    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does,
-    and its ``confidence``, if the file has one.
-    """
-    from ..geometry.cameras import transform
-    from ..utils.checks import check_numbers, check_pose
-
-    content = read_json(path, dict, "docs/guides/known-pose.md")
-    if "rotation" in content and content.get("translation", ...) is None:
-        message = "a result without a translation, as of a photograph without a camera; register with --camera first"
-        raise InvalidInputError(message, subject=path)
-    try:
-        numbers = [check_numbers(content.get(name), name, n) for name, n in (("rotation", 9), ("translation", 3))]
-        T = transform(numbers[0].view(3, 3), numbers[1])
-        check_pose(T, "rotation, translation")
-    except InvalidInputError as error:
-        raise error.with_subject(path) from error
-    confidence = finite_numbers([content.get("confidence")], 1)
-    return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
+def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
+    T = start.T.clone()
+    if start.unit is not None:
+        T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
+    return tuple(map(tuple, T.tolist()))
 
 
 def open_registrar(
@@ -303,8 +321,25 @@ def _open_bank(
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
+    _check_bank(options, bank, mesh)
+    return bank
+
+
+def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
+    """Refuse options that are about the mesh and that the bank was not built with."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    unit = mesh_unit(bank.mesh)
+    up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if options.unit_is_given and options.unit != unit:
+        kind = f"with --unit {unit}" if unit else "without a unit"
+        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
+        raise BankError(message, subject=path)
+    if options.up not in (None, up):
+        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
+        raise BankError(message, subject=path)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
-    return bank
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)

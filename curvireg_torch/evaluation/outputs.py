@@ -15,6 +15,7 @@ from typing import Any
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import check_writable, read_json, write_file
+from .store import is_one_of_several
 
 MARKER = ".curvireg.json"
 
@@ -24,7 +25,7 @@ FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,
     "demo": (*ONE_RESULT, "mesh.ply", "photo.png"),
     "register several": (*ROWS, "results.csv"),
-    "evaluate": (*ROWS, "summary.json", "predictions.csv", "errors.csv"),
+    "evaluate": (*ROWS, "summary.json", "predictions.csv", "errors.csv", "curvireg-*_*-*.csv"),
     "follow": ("results.csv", "overlay.mp4"),
 }
 """Names, or patterns of names, that each command may write into the folder of its results."""
@@ -58,7 +59,7 @@ def output_folder(
 
     Of several processes that share the results, the first one checks.
     """
-    if os.environ.get("TORCHELASTIC_RUN_ID") and os.environ.get("RANK") != "0":
+    if is_one_of_several() and os.environ.get("RANK") != "0":
         yield
         return
     names = (*FILES[command], *more)

@@ -1,5 +1,6 @@
 """Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
 
+import math
 import os
 import re
 import time
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ..data.bop import bop_box, entry_at
 from ..data.calibrations import Calibrations
 from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera, camera_matrix
+from ..geometry import Camera
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.result import result_document
@@ -86,15 +87,25 @@ def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any
 def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
     header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
+    if twice := sorted({name for name in names if name and names.count(name) > 1}):
+        raise InvalidInputError(f"two columns {', '.join(twice)}; keep one of each", subject="header")
     calibrations = Calibrations()
     for number, values in enumerate(rows, start=1):
         row = dict(zip(names, map(str.strip, values), strict=False))
         name = f"row {number}: {row.get('photo', '')}"
         if not row.get("photo"):
             raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
+        if beyond := [cell for cell in values[len(names) :] if cell.strip()]:
+            raise InvalidInputError(
+                f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas", subject=name
+            )
         try:
             box, camera = numbers_of(row, BOX), camera_of(row, find, calibrations)
-            rotation = numbers_of(row, ROTATION) or numbers_of(row, QUATERNION)
+            matrix = numbers_of(row, ROTATION)
+            quaternion = numbers_of(row, QUATERNION)
+            if matrix and quaternion:
+                raise InvalidInputError("r11 to r33 and qw to qz; give one of them")
+            rotation = matrix or quaternion
             translation = numbers_of(row, TRANSLATION)
         except CurviregError as error:
             raise error.with_subject(": ".join(filter(None, (name, error.subject)))) from error
@@ -102,18 +113,14 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
 
 
 def _colmap(folder: Path, find: FindFile) -> Iterator[View]:
-    """Photographs of ``images.txt``, in which every second line lists points, that lie in the folder, in ``images`` in
-    it, or beside it."""
+    """Photographs of ``images.txt`` that lie in the folder, in ``images`` in it, or beside it."""
     check_table_size(folder / "images.txt")
     try:
         lines = (folder / "images.txt").read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"not text ({error})", subject="images.txt") from error
-    lines = [line for line in lines if not line.startswith("#")]
     calibrations = Calibrations()
-    for line in lines[::2]:
-        if not line.strip():
-            continue
+    for line in _without_points([line for line in lines if not line.startswith("#")]):
         words = line.split(maxsplit=9)
         try:
             pose = list(map(float, words[1:8]))
@@ -128,6 +135,27 @@ def _colmap(folder: Path, find: FindFile) -> Iterator[View]:
         photo = next(filter(os.path.isfile, places), places[0])
         camera = calibrations.load(f"{folder / 'cameras.txt'}:{words[8]}")
         yield _view(f"image {name}", photo, None, camera, pose[:4], pose[4:])
+
+
+def _without_points(lines: Sequence[str]) -> Iterator[str]:
+    """The lines of ``images.txt`` that name images: COLMAP writes a line of points X Y POINT3D_ID ..., often empty,
+    behind each; other programs leave it out."""
+    may_be_points = False
+    for line in lines:
+        if not line.strip() or (may_be_points and _are_points(line)):
+            may_be_points = False
+        else:
+            may_be_points = True
+            yield line
+
+
+def _are_points(line: str) -> bool:
+    words = line.split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:  # a name
+        return False
+    return len(numbers) % 3 == 0 and all(number == int(number) for number in numbers[2::3] if math.isfinite(number))
 
 
 def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
@@ -145,11 +173,16 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
         K = finite_numbers(values.get("cam_K"), 9)
         if K is None:
             raise InvalidInputError("no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}")
-        objects = truths.get(key) if isinstance(truths.get(key), list) else []
+        objects = truths.get(key, [])
+        if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
+            raise InvalidInputError("expected a list of objects in scene_gt.json", subject=f"image {key}")
         mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
-        camera_of_image = Camera(camera_matrix(K[0], K[4], K[2], K[5]))
+        try:
+            camera_of_image = Camera(torch.tensor(K, dtype=torch.float64).view(3, 3))
+        except InvalidInputError as error:  # skew, for instance
+            raise error.with_subject(f"image {key}: cam_K in scene_camera.json") from error
         yield _view(f"image {key}", photo, box, camera_of_image, *pose)
 
 

@@ -53,12 +53,27 @@ def workers() -> Iterator[Workers]:
         dist.destroy_process_group()
 
 
+STARTED = "CURVIREG_JOBS"  # environment variable of the processes that :func:`run_processes` starts
+
+
+def is_one_of_several() -> bool:
+    """Whether this is one of the processes that ``torchrun`` started."""
+    return "TORCHELASTIC_RUN_ID" in os.environ
+
+
 def run_processes(count: int, words: Sequence[str]) -> bool:
     """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes."""
-    if count <= 1 or "TORCHELASTIC_RUN_ID" in os.environ:
+    if count <= 1 or is_one_of_several():
         return False
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
-    environment = {"OMP_NUM_THREADS": "1", **os.environ}
+    torchrun = [
+        sys.executable,
+        "-m",
+        "curvireg_torch.evaluation.launch",
+        "--standalone",
+        "--nproc-per-node",
+        str(count),
+    ]
+    environment = {"OMP_NUM_THREADS": "1", **os.environ, STARTED: str(count)}
     done = subprocess.run([*torchrun, "-m", "curvireg_torch", *words], env=environment, check=False)
     if done.returncode:
         raise InvalidInputError(f"--jobs: a process ended with {done.returncode}; its message is above")

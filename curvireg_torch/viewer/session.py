@@ -1,6 +1,7 @@
 """Photographs, mesh, rig and options, what is registered with them, and how. It needs no page and no NiceGUI."""
 
 import math
+import re
 import shlex
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +32,7 @@ from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[View]]
+UNPACKED = "parts"  # the folder of what was in an archive
 _OPTIONS = ("unit", "link", "textures", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
@@ -77,6 +79,14 @@ class Session:
     def name(self, path: str | Path) -> str:
         """What the user calls a file."""
         return Path(path).name if {self.folder, STATIC} & {*Path(path).parents} else str(path)
+
+    def without_folders(self, text: str) -> str:
+        """A text in which uploaded files, and those unpacked from an archive, have their names alone."""
+        if self.folder is None:
+            return text
+        folders = {str(self.folder), str(self.folder.resolve())}
+        places = "|".join(map(re.escape, sorted(folders, key=len, reverse=True)))
+        return re.sub(rf"(?:{places})[/\\](?:upload-\w+[/\\]?)?(?:{UNPACKED}[/\\])?", "", text)
 
     def usable_name(self, path: Path) -> str:
         """:meth:`name`, in commands and programs; the sample has no other place than its own."""

@@ -217,7 +217,8 @@ def main() -> int:
             name = list(DAMAGED)[k % len(DAMAGED)]
             damaged = folder / f"damaged{k}{Path(name).suffix}"
             damaged.write_bytes(damage((folder / name).read_bytes(), rng))
-            lines.append(DAMAGED[name].format(damaged.name))
+            line = DAMAGED[name].format(damaged.name)
+            lines.append(line.replace("--out out", f"--out out{k}"))  # lists do not share a folder
         answers += pool.map(lambda line: answer(line, folder, None), lines)
     failures = [found for found in answers if "failure" in found]
     record = {"date": today(), "commit": commit(), "cases": len(wrong), "damaged": len(lines)}

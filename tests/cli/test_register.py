@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
-from curvireg_torch.cli import main
+from curvireg_torch.cli import main, parse
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import CAMERA, box_of, check_pose
-from tests._support.scenes import scene
+from tests._support.scenes import scene, truck_bank
 
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
@@ -106,6 +106,94 @@ def test_register_limits_the_pose(register_one, document):
     assert result["prior"] == {"azimuth": [low, high], "elevation": [-90, 90], "contradiction": "better outside"}
     for pose in result["top"]:
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
+
+
+def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(folder, register_one, document, refused):
+    mesh = example_mesh()
+    mesh.units = "mm"
+    views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
+    ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
+    bank = {"mesh": "mm.safetensors"}
+    refused(
+        register_one("--unit", "m", "--no-refine", **bank), "mm.safetensors: built with --unit mm, not with --unit m"
+    )
+    refused(register_one("--up=-x", "--no-refine", **bank), "mm.safetensors: built with --up=z, not with --up=-x")
+    words = ["--unit", "mm", "--up", "z", "--no-refine"]
+    assert register_one(*words, **bank) == 0
+    assert document()["unit"] == "mm"
+    assert register_one("--no-refine", **bank) == 0
+    mesh.units = None
+    ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
+    refused(register_one("--unit", "mm", "--no-refine", **bank), "mm.safetensors: built without a unit")
+
+
+IGNORED = [
+    # words of register; part of the message
+    ("a.png m.ply --preset fast --pipeline p.json", "expected one of --preset and --pipeline"),
+    ("a.png m.ply --start s.json --camera exif --instances 2", "leave --instances out"),
+    ("a.png m.ply --start s.json --camera exif --top 2", "leave --top out"),
+    ("--views rig.csv m.ply --instances 2", "leave --instances out"),
+    ("a.png m.ply --jobs 2", "--jobs: several processes share several photographs"),
+    ("--views rig.csv m.ply --jobs 2", "--jobs: several processes share several photographs"),
+    ("a.png m.ply --every 2", "--every applies to the frames of videos"),
+    ("a.png b.png m.ply --every 2", "--every applies to the frames of videos"),
+    ("--list l.csv m.ply --every 2", "--every applies to the frames of videos"),
+    ("a.png m.ply --front x", "--front limits nothing"),
+]
+OF_OTHERS = [
+    *(f"{command} --camera 1 1 1 1 --fov 50" for command in ("plot overlay a.png m.ply", "follow v.mp4 m.ply", "view")),
+    *(
+        f"{command} --preset fast --pipeline p.json"
+        for command in ("plot overlay a.png m.ply", "view", "demo", "bank m.ply")
+    ),
+    *(f"evaluate {name} . --preset fast --pipeline p.json" for name in ("bop", "web", "pascal3d")),
+    *("follow v.mp4 m.ply --box 1 2 3 4 --start s.json", "plot overlay a.png m.ply --front x", "view --front x"),
+]
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [*((f"register {words}", message) for words, message in IGNORED), *((line, "") for line in OF_OTHERS)],
+)
+def test_options_that_would_be_ignored_are_refused(line, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        parse([*line.split(), *([] if line.startswith("view") else ["--out", "out"])])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_options_of_videos_and_processes_are_taken():
+    for words in ("a.png v.mp4 m.ply --every 2", "shots/* m.ply --jobs 2", "a.png m.ply --every 1 --jobs 1"):
+        assert parse(["register", *words.split(), "--out", "out"]).every in (1, 2)
+    words = ["--list", "l.csv", "m.ply", "--front", "x", "--out", "out"]
+    assert parse(["register", *words]).front == "x", "of the limits in its rows"
+
+
+def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refused):
+    pose = {"frame": "world", "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], "translation": [0, 0, 3]}
+    (folder / "rig.json").write_text(json.dumps(pose))
+    words = "--start", str(folder / "rig.json"), "--camera", *CAMERA
+    refused(register_one(*words, box=()), "rig.json: a result of several photographs, whose pose is in the world")
+
+
+def test_starts_of_other_tools_have_their_convention_and_unit(folder, register_one, refused, document):
+    T = scene(0)[2].double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    path = folder / "gl.json"
+    words = "--start", str(path), "--camera", *CAMERA
+    path.write_text(json.dumps({"T_cam_from_model": (flip @ T).tolist()}))
+    refused(
+        register_one(*words, box=()),
+        "behind the camera: a pose of OpenGL's camera? Then give --start-convention opengl",
+    )
+    assert register_one(*words, "--start-convention", "opengl", box=()) == 0
+    assert float(rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3])) < 3.0
+    entry = {"cam_R_m2c": T[:3, :3].flatten().tolist(), "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(), "obj_id": 1}
+    path.write_text(json.dumps({"4": [entry]}))  # mm, of a mesh in m
+    assert register_one("--start", f"{path}:4", "--camera", *CAMERA, box=()) == 0
+    torch.testing.assert_close(torch.tensor(document()["translation"]).double(), T[:3, 3], rtol=0.1, atol=0.05)
+    with pytest.raises(SystemExit):
+        register_one("--start-convention", "opengl")
 
 
 def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, register_one, document, capsys):

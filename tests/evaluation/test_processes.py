@@ -84,3 +84,15 @@ def test_torchrun_gives_the_same_results(case, expected, tmp_path):
     assert read(out) == expected
     assert done.stdout.count(f"see {out}") == 1, "one process reports"
     assert not list(out.glob("results.*-of-*")), "the files of the processes are merged"
+
+
+@pytest.mark.parametrize(("photos", "code"), [(["0.png", "1.png"], 3), (["none.png", "missing.png"], 2)])
+def test_strict_ends_with_its_code_for_several_processes_too(tmp_path, photos, code):
+    """Nothing is calibrated here, so that no result is reliable."""
+    write_files(tmp_path)
+    files = [tmp_path / "photos" / name for name in photos]
+    done = run(
+        ["register", *files, tmp_path / "truck.safetensors", "--strict", "--jobs", "2", "--out", tmp_path / "out"]
+    )
+    assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
+    assert (tmp_path / "out" / "results.csv").is_file()

@@ -3,8 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import Protocol
-from curvireg_torch.evaluation.benchmarks import hint_of_truth, perturbed_box
+from curvireg_torch.evaluation.protocol import hint_of_truth, perturbed_box
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 
@@ -44,6 +45,13 @@ def test_hint_of_truth_holds_the_truth_and_is_off_centre(hint):
     assert float(missed.max()) > -0.25 * degrees, "offsets fill the range"
     assert hint_of_truth(R[0], frame, protocol, "a") == hint_of_truth(R[0], frame, protocol, "a")
     assert hint_of_truth(R[0], frame, protocol, "a") != hint_of_truth(R[0], frame, replace(protocol, seed=1), "a")
+
+
+def test_a_seed_that_draws_nothing_is_refused():
+    with pytest.raises(InvalidInputError, match="protocol: seed: nothing is drawn"):
+        Protocol.parse(["seed=3"])
+    for word in ("box=0.1", "hint=pose:5", "views=2"):
+        assert Protocol.parse([word, "seed=3"]).seed == 3
 
 
 def test_hint_of_truth_is_none_without_truth_or_hint():

@@ -1,6 +1,7 @@
 """What reading a rig or a list costs; tests/cli/test_views.py checks what is read."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -100,3 +101,69 @@ def test_names_that_no_file_can_have_are_missing_files(tmp_path, name):
     for find in (None, only_in(tmp_path)):
         with pytest.raises(MissingFileError, match="no such file"):
             read_rig(rig, find=find)
+
+
+IMAGE = "{0} 1 0 0 0 0 0 1 1 {0}.png"
+LAYOUTS = {
+    "no points": [IMAGE.format(k) for k in (1, 2, 3)],
+    "empty points": [line for k in (1, 2, 3) for line in (IMAGE.format(k), "")],
+    "points": [line for k in (1, 2, 3) for line in (IMAGE.format(k), "1.5 2 -1 3 4 17")],
+    "points of some": [IMAGE.format(1), "1 2 3", IMAGE.format(2), IMAGE.format(3), "", "# the end"],
+    "blank lines": ["", IMAGE.format(1), "", "", IMAGE.format(2), "1.5 2 -1", "", IMAGE.format(3)],
+    "points like an image": [IMAGE.format(1), "1 1 0 0 0 0 0 1 1 2 3 4", IMAGE.format(2), IMAGE.format(3)],
+}
+
+
+@pytest.mark.parametrize("lines", LAYOUTS.values(), ids=LAYOUTS)
+def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(tmp_path, lines):
+    (tmp_path / "cameras.txt").write_text(LINE)
+    (tmp_path / "images.txt").write_text("\n".join(lines))
+    assert [view.name for view in read_rig(tmp_path)] == [f"image {k}.png" for k in (1, 2, 3)]
+    (tmp_path / "images.txt").write_text("\n".join([IMAGE.format(1), "1 2 3.5", IMAGE.format(2)]))
+    with pytest.raises(InvalidInputError, match="expected IMAGE_ID"):
+        read_rig(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "message"),
+    [
+        (f"{COLUMNS},photo", ["a.png", "cameras.txt", *POSE, "b.png"], "header: two columns photo"),
+        (COLUMNS, ["a.png", "cameras.txt", *POSE, "5"], r"row 1: a\.png: '5' is beyond the last column"),
+        (
+            f"{COLUMNS},qw,qx,qy,qz",
+            ["a.png", "cameras.txt", *POSE, 1, 0, 0, 0],
+            r"row 1: a\.png: r11 to r33 and qw to qz",
+        ),
+    ],
+)
+def test_rows_of_a_rig_with_too_much_are_refused(tmp_path, header, row, message):
+    (tmp_path / "cameras.txt").write_text(LINE)
+    path = written(tmp_path / "rig.csv", header, row)
+    with pytest.raises(InvalidInputError, match=message):
+        read_rig(path)
+
+
+def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(tmp_path):
+    (tmp_path / "cameras.txt").write_text(LINE)
+    path = written(tmp_path / "rig.csv", f"{COLUMNS},,", ["a.png", "cameras.txt", *POSE, "", " ", ""])
+    assert len(read_rig(path)) == 1
+
+
+@pytest.mark.parametrize("truth", [{"0": {"obj_id": 5}}, {"0": [5]}, {"0": ["obj_id"]}, {"0": "obj_id"}])
+def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
+    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+    camera = {"cam_K": K, "cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}
+    (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
+    (tmp_path / "scene_gt.json").write_text(json.dumps(truth))
+    with pytest.raises(InvalidInputError, match=r"image 0: expected a list of objects in scene_gt\.json"):
+        read_rig(tmp_path, Path("obj_000005.ply"))
+
+
+@pytest.mark.parametrize("place", [1, 3, 6])
+def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
+    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+    K[place] = 2.0
+    camera = {"cam_K": K, "cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}
+    (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
+    with pytest.raises(InvalidInputError, match=r"image 0: cam_K in scene_camera\.json"):
+        read_rig(tmp_path)

@@ -37,18 +37,17 @@ def roof(degrees: float) -> trimesh.Trimesh:
 
 
 def test_outline_of_a_square_has_no_gap_and_nothing_inside():
-    layer = drawn(trimesh.creation.box((2.0, 2.0, 2.0)), placed(6.0))  # its front face: 59.5 +- 200 / 5
+    half_side = 38.3  # px of its front face, so that its edges lie at 21.2 and 97.8
+    layer = drawn(trimesh.creation.box((2.0, 2.0, 2.0)), placed(1.0 + FOCAL / half_side))
     outline = colour(layer, GREEN)
     rows, columns = np.nonzero(outline)
-    for line in (rows, columns):  # 19.5 to 99.5
-        assert line.min() in (19, 20)
-        assert line.max() in (99, 100)
-    for line in (outline[20, 22:98], outline[99, 22:98], outline[22:98, 20], outline[22:98, 99]):
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (21, 98, 21, 98)
+    for line in (outline[21, 23:97], outline[98, 23:97], outline[23:97, 21], outline[23:97, 98]):
         assert line.all(), "without a gap"
     assert not layer[30:90, 30:90].any(), "nothing inside a plane"
     alpha = layer[60, :, 3]
     assert ((alpha > 0) & (alpha < 255)).any(), "anti-aliased"
-    rim = layer[60, 17]
+    rim = layer[60, 19]
     assert rim[3] > 60
     assert rim[:3].max() < 200, "darker than the line"
     assert not layer[:12].any()
@@ -89,3 +88,12 @@ def test_object_outside_the_picture_or_around_the_camera_draws_nothing_wrong():
     assert not drawn(box, beside).any()
     assert not drawn(box, placed(-5.0)).any(), "behind the camera"
     assert drawn(trimesh.creation.box((9.0, 9.0, 9.0)), placed(1.0)).shape == (SIZE, SIZE, 4)
+
+
+def test_the_outline_is_drawn_over_the_creases_that_end_at_it():
+    layer = drawn(roof(50), placed(5.0))
+    columns = slice(58, 62)  # of the crease
+    assert colour(layer, ORANGE)[40:80, columns].any(axis=1).all()
+    for rows in (slice(18, 22), slice(98, 102)):
+        assert colour(layer, GREEN)[rows, columns].any(axis=0).all(), "without a gap where the crease ends"
+        assert not colour(layer, ORANGE)[rows, columns][:2].all()
