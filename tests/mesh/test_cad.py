@@ -330,7 +330,8 @@ ROBOT = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></mate
 scale="0.01 0.01 0.01"/></geometry></visual></link>
 <link name="ball"><visual><geometry><sphere radius="0.25"/></geometry></visual></link>
 <joint name="j" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="1 0 0"
-rpy="0 1.5707963267948966 0"/></joint><joint name="k" type="fixed"><parent link="tip"/><child link="ball"/><origin xyz="0 0 2"/></joint></robot>
+rpy="0 1.5707963267948966 0"/></joint>
+<joint name="k" type="fixed"><parent link="tip"/><child link="ball"/><origin xyz="0 0 2"/></joint></robot>
 """
 
 
