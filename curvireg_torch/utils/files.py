@@ -169,6 +169,17 @@ def read_json(path: Path, kind: type[Any], readme: str) -> Any:
     return content
 
 
+def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
+    """The file and the name of ``FILE:NAME``; a file that exists has no name."""
+    file = Path(path)
+    text = str(path)
+    while not os.path.isfile(file) and ":" in str(file):  # unlike Path.is_file, whatever the name is
+        file = Path(str(file).rpartition(":")[0])
+    if not os.path.isfile(file):
+        return Path(path), ""
+    return file, text[len(str(file)) + 1 :]
+
+
 def read_csv(path: Path) -> list[list[str]]:
     """The rows of a CSV file in UTF-8 that are not blank."""
     check_table_size(path)
