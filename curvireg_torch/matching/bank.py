@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from tqdm import tqdm
 
-from ..errors import BankError, InvalidInputError, MissingFileError
+from ..errors import BankError, CurviregError, InvalidInputError, MissingFileError
 from ..geometry.viewpoint import ViewSphere, up_rotation
 from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
 from ..mesh.colours import SurfaceColours, surface_colours
