@@ -20,7 +20,7 @@ from ..evaluation.opening import (
 FIELDS = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
 DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
-MESH = ("unit", "pose", "up")
+MESH = ("unit", "link", "textures", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 
@@ -50,7 +50,7 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
         if isinstance(kind, Numbers):
             how["metavar"] = re.sub(r"[][]", "", kind.names)
         elif kind is Path:
-            how["metavar"] = "FILE"
+            how.setdefault("metavar", "FILE")
         parser.add_argument(flag, dest=name, **how)
 
 
@@ -90,8 +90,9 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     """The files that a command's options name, and ``more``."""
     named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
     camera = getattr(arguments, "camera", None)
-    calibrations = [camera, camera.rpartition(":")[0]] if isinstance(camera, str) else []
-    return [*more, *(path for path in named if isinstance(path, Path)), *map(Path, filter(None, calibrations))]
+    paths = [*(str(path) for path in named if isinstance(path, Path)), *([camera] if isinstance(camera, str) else [])]
+    named_parts = [path.rpartition(":")[0] for path in paths]  # of FILE:NAME
+    return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
 
 
 _ALTERNATIVES = {

@@ -66,7 +66,7 @@ class BOPDataset(ObjectDataset):
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
-        self.models_info = _models_info(self.root / "models" / "models_info.json")
+        self.models_info = read_models_info(self.root / "models" / "models_info.json")
         self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
@@ -173,7 +173,7 @@ def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
     return ((math.nan,) * 4,) * 4
 
 
-def _models_info(path: Path) -> dict[int, dict[str, Any]]:
+def read_models_info(path: Path) -> dict[int, dict[str, Any]]:
     """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
     entries = {}
     for key, entry in read_json(path, dict, _README).items():

@@ -14,10 +14,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
-from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
-from ..utils.files import finite_numbers, read_json
+from ..utils.choices import (
+    DEFAULT,
+    MESH_KINDS,
+    PRESET_NAMES,
+    RENDERER_NAMES,
+    SIDE_NAMES,
+    START_CONVENTIONS,
+    UNITS,
+    UP_AXES,
+)
 
 if TYPE_CHECKING:
+    from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
@@ -122,11 +131,26 @@ class RegisterOptions:
         None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
     )
     start: Path | None = _option(
-        None, "result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path
+        None,
+        "refine this pose; needs no box: result.json, or JSON with rotation and translation or T_cam_from_model, 4 x 4 "
+        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the format has none",
+        type=Path,
+    )
+    start_convention: str | None = _option(
+        None,
+        "axes of the camera of --start: opencv, x right, y down, z forward (default); opengl, x right, y up, z back",
+        choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
-    unit: str = _option(
-        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    unit: str | None = _option(
+        None,
+        "of the mesh file, and of lengths in and out (default: that which the file states, as STEP, IGES, 3MF, Collada "
+        "and URDF do; else m; for a BOP scene mm)",
+        choices=sorted(UNITS),
+    )
+    link: str | None = _option(None, "link of a URDF whose mesh is registered (default: all, joints at zero)")
+    textures: Path | None = _option(
+        None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
     )
     unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
@@ -164,6 +188,12 @@ class RegisterOptions:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
 
+    def load_mesh(self, path: Path) -> Any:
+        """The mesh of a file, with the options that say how it is read."""
+        from ..mesh import load_mesh
+
+        return load_mesh(path, unit=self.unit, up=self.up, link=self.link, textures=self.textures)
+
     def open_pipeline(self) -> "Pipeline":
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
         from ..pipeline import Pipeline, preset_named
@@ -178,6 +208,15 @@ class RegisterOptions:
 
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
+    def read_start(self) -> "PoseFile | None":
+        """The pose of the file ``start``, or None."""
+        if self.start is None:
+            return None
+        from ..data.pose_files import read_pose
+
+        mesh = self.meshes[0].stem if self.meshes else ""
+        return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)
+
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
         from ..geometry import Camera, camera_matrix
@@ -185,9 +224,9 @@ class RegisterOptions:
 
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
-        start, confidence = (None, None) if self.start is None else read_start(self.start)
+        start = self.read_start()
         same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
-        same |= {"start": start, "start_confidence": confidence, "prior": prior_from_limits(self.limits or {})}
+        same |= {"start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
@@ -240,28 +279,12 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
         raise InvalidInputError(f"--{error}") from error
 
 
-def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
-    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does,
-    and its ``confidence``, if the file has one.
-    """
-    from ..geometry.cameras import transform
-    from ..utils.checks import check_numbers, check_pose
-
-    content = read_json(path, dict, "docs/guides/known-pose.md")
-    if content.get("frame") == "world":
-        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
-        raise InvalidInputError(message, subject=path)
-    if "rotation" in content and content.get("translation", ...) is None:
-        message = "a result without a translation, as of a photograph without a camera; register with --camera first"
-        raise InvalidInputError(message, subject=path)
-    try:
-        numbers = [check_numbers(content.get(name), name, n) for name, n in (("rotation", 9), ("translation", 3))]
-        T = transform(numbers[0].view(3, 3), numbers[1])
-        check_pose(T, "rotation, translation")
-    except InvalidInputError as error:
-        raise error.with_subject(path) from error
-    confidence = finite_numbers([content.get("confidence")], 1)
-    return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
+def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
+    T = start.T.clone()
+    if start.unit is not None:
+        T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
+    return tuple(map(tuple, T.tolist()))
 
 
 def open_registrar(
@@ -293,10 +316,9 @@ def _open_bank(
     options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
 ) -> "ViewBank":
     from ..matching import ViewBank, cached_bank
-    from ..mesh import load_mesh
 
     if mesh.suffix != ".safetensors":
-        loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     _check_bank(options, bank, mesh)

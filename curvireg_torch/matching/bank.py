@@ -22,7 +22,7 @@ from ..mesh.colours import SurfaceColours, surface_colours
 from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
-from ..terms import Whitening, ledoit_wolf
+from ..terms import Precision, Whitening, ledoit_wolf
 from ..utils.checks import check_symmetries, check_tensor
 from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
@@ -85,8 +85,13 @@ class ViewBank:
 
     @cached_property
     def whitening(self) -> Whitening:
-        """Mean and shrunk covariance of the views' descriptors, for :class:`Correlation`."""
+        """By mean and shrunk covariance of the views' descriptors, for ``Correlation(whitening="bank")``."""
         return Whitening(*ledoit_wolf(self.descriptors))
+
+    @cached_property
+    def precision(self) -> Precision:
+        """Inverse of the shrunk covariance of the views' descriptors, for ``Correlation(whitening="paper")``."""
+        return Precision(self.descriptors)
 
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""

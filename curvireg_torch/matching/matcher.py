@@ -279,8 +279,9 @@ class ViewMatcher(nn.Module):
         described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
         tensors = {name: torch.cat([part[name] for part in described]) for name in described[0]}
         few = ViewBank(self.bank.mesh, views, self.bank.pipeline, tensors)
-        if any(getattr(term, "whitening", "none") != "none" for term, _ in self._terms):
-            few.whitening = self.bank.whitening
+        for whitening, name in (("bank", "whitening"), ("paper", "precision")):
+            if any(getattr(term, "whitening", "none") == whitening for term, _ in self._terms):
+                setattr(few, name, getattr(self.bank, name))
         scores = [term.weight * term.log_score(term.build(few)(query)) for term, _ in self._terms]
         log = torch.stack(scores).sum(dim=0)[0]
         return log - log.max()

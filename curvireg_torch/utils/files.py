@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,17 +124,34 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping
     write_file(path, save(content, dict(metadata or {})))
 
 
+def terminable() -> AbstractContextManager[None]:
+    """Context in which SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: every ``finally``
+    runs, and no partial file remains."""
+    return signals_handled([signal.SIGTERM, *hangup_signals()], _exit_after)
+
+
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Context in which SIGTERM ends the process as Ctrl-C does: every ``finally`` runs, and no partial file remains."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+def signals_handled(numbers: Iterable[int], handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Context in which signals call ``handler``; in the main thread, as others cannot handle signals."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, before in previous.items():
+            signal.signal(number, before)
+
+
+def hangup_signals() -> list[int]:
+    """SIGHUP, where the system has it and nohup does not ignore it."""
+    hangup = getattr(signal, "SIGHUP", None)
+    return [] if hangup is None or signal.getsignal(hangup) is signal.SIG_IGN else [hangup]
+
+
+def _exit_after(number: int, _: object) -> None:
+    sys.exit(128 + number)
 
 
 def read_json(path: Path, kind: type[Any], readme: str) -> Any:
@@ -150,6 +167,17 @@ def read_json(path: Path, kind: type[Any], readme: str) -> Any:
         expected = "an object" if kind is dict else "a list"
         raise InvalidInputError(f"expected {expected} of JSON; {readme} shows the layout", subject=path)
     return content
+
+
+def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
+    """The file and the name of ``FILE:NAME``; a file that exists has no name."""
+    file = Path(path)
+    text = str(path)
+    while not os.path.isfile(file) and ":" in str(file):  # unlike Path.is_file, whatever the name is
+        file = Path(str(file).rpartition(":")[0])
+    if not os.path.isfile(file):
+        return Path(path), ""
+    return file, text[len(str(file)) + 1 :]
 
 
 def read_csv(path: Path) -> list[list[str]]:
