@@ -20,7 +20,7 @@ from ..evaluation.opening import (
 FIELDS = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
 DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
-MESH = ("unit", "pose", "up")
+MESH = ("unit", "link", "textures", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 
@@ -50,7 +50,7 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
         if isinstance(kind, Numbers):
             how["metavar"] = re.sub(r"[][]", "", kind.names)
         elif kind is Path:
-            how["metavar"] = "FILE"
+            how.setdefault("metavar", "FILE")
         parser.add_argument(flag, dest=name, **how)
 
 

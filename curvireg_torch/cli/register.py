@@ -318,10 +318,11 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
         source = [str(arguments.list.resolve())]
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
+    names = ("bank_decides", "pose", "mesh_is", "unit", "link", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if options.network is None else field_digest(options.network),
+        "textures": None if options.textures is None else str(options.textures),
         **{name: getattr(options, name) for name in names},
     }
     how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}

@@ -157,8 +157,15 @@ class RegisterOptions:
         choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
-    unit: str = _option(
-        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    unit: str | None = _option(
+        None,
+        "of the mesh file, and of lengths in and out (default: that which the file states, as STEP, IGES, 3MF, Collada "
+        "and URDF do; else m; for a BOP scene mm)",
+        choices=sorted(UNITS),
+    )
+    link: str | None = _option(None, "link of a URDF whose mesh is registered (default: all, joints at zero)")
+    textures: Path | None = _option(
+        None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
     )
     unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
@@ -195,6 +202,12 @@ class RegisterOptions:
     def bank_decides(self) -> bool:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
+
+    def load_mesh(self, path: Path) -> Any:
+        """The mesh of a file, with the options that say how it is read."""
+        from ..mesh import load_mesh
+
+        return load_mesh(path, unit=self.unit, up=self.up, link=self.link, textures=self.textures)
 
     def open_pipeline(self) -> "Pipeline":
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
@@ -337,10 +350,9 @@ def _open_bank(
     options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
 ) -> "ViewBank":
     from ..matching import ViewBank, cached_bank
-    from ..mesh import load_mesh
 
     if mesh.suffix != ".safetensors":
-        loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     _check_bank(options, bank, mesh)

@@ -145,7 +145,7 @@ def register(
     camera: Any = None,
     mask: Any = None,
     prior: PosePrior | None = None,
-    unit: str = "m",
+    unit: str | None = None,
     up: str | None = None,
     pipeline: Pipeline | None = None,
     progress: bool = True,
