@@ -66,12 +66,11 @@ def build_bank(arguments: argparse.Namespace) -> None:
 
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     from ..matching import ViewBank
-    from ..mesh import load_mesh
     from ..utils.threads import one_torch_thread
 
     start, options = time.perf_counter(), register_options(arguments)
     pipeline = options.open_pipeline()
-    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    mesh = options.load_mesh(arguments.mesh)
     settings: dict[str, Any] = {"renderer": options.renderer, "progress": options.progress, "device": options.device}
     with one_torch_thread():
         bank = ViewBank.build(mesh, pipeline=pipeline, **settings)

@@ -2,10 +2,12 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import symmetry_transforms
@@ -25,6 +27,7 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
             most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
+        transform, target_transform: see :class:`ObjectDataset`.
 
     Attributes:
         models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
@@ -49,9 +52,17 @@ class BOPDataset(ObjectDataset):
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
-    def __init__(self, root: str | os.PathLike[str], split: str = "test", *, targets: bool | None = None) -> None:
-        super().__init__()
-        self.root, self.split = existing_root(root, _README), split
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str = "test",
+        *,
+        targets: bool | None = None,
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
+    ) -> None:
+        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
+        self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
 from ..utils.choices import (
+    BOX_FORMATS,
     DEFAULT,
     MESH_KINDS,
     PRESET_NAMES,
@@ -23,9 +24,11 @@ from ..utils.choices import (
     START_CONVENTIONS,
     UNITS,
     UP_AXES,
+    VIDEOS,
 )
 
 if TYPE_CHECKING:
+    from ..data.box_files import Box, BoxFile
     from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
@@ -115,6 +118,18 @@ class RegisterOptions:
     box: tuple[float, float, float, float] | None = _option(
         None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
     )
+    box_format: str | None = _option(
+        None,
+        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, height in px; fractions: "
+        "corners; yolo: centre, width, height in fractions of the picture",
+        choices=BOX_FORMATS,
+    )
+    boxes: Path | None = _option(
+        None,
+        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file of YOLO, or a folder "
+        "of these; PATH:LABEL takes one label",
+        type=Path,
+    )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
         "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
@@ -142,8 +157,15 @@ class RegisterOptions:
         choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
-    unit: str = _option(
-        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    unit: str | None = _option(
+        None,
+        "of the mesh file, and of lengths in and out (default: that which the file states, as STEP, IGES, 3MF, Collada "
+        "and URDF do; else m; for a BOP scene mm)",
+        choices=sorted(UNITS),
+    )
+    link: str | None = _option(None, "link of a URDF whose mesh is registered (default: all, joints at zero)")
+    textures: Path | None = _option(
+        None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
     )
     unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
@@ -181,6 +203,12 @@ class RegisterOptions:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
 
+    def load_mesh(self, path: Path) -> Any:
+        """The mesh of a file, with the options that say how it is read."""
+        from ..mesh import load_mesh
+
+        return load_mesh(path, unit=self.unit, up=self.up, link=self.link, textures=self.textures)
+
     def open_pipeline(self) -> "Pipeline":
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
         from ..pipeline import Pipeline, preset_named
@@ -194,6 +222,24 @@ class RegisterOptions:
         from ..features import LearnedCurvilinearSaliency
 
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
+
+    @cached_property
+    def _box_file(self) -> "BoxFile | None":
+        from ..data.box_files import BoxFile
+
+        return None if self.boxes is None else BoxFile(self.boxes)
+
+    def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Box | None":
+        """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that of a detector."""
+        from ..data.box_files import pixel_box
+        from ..data.images import photo_size
+
+        numbers = self.box if numbers is None else numbers
+        if numbers is None:
+            return None if self._box_file is None else self._box_file.box(photo)
+        kind = self.box_format or "xyxy"
+        is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
+        return pixel_box(numbers, kind, photo_size(photo) if is_relative else None)
 
     def read_start(self) -> "PoseFile | None":
         """The pose of the file ``start``, or None."""
@@ -212,8 +258,9 @@ class RegisterOptions:
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
         start = self.read_start()
-        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
-        same |= {"start": start, "prior": prior_from_limits(self.limits or {})}
+        box = self.box_of(photo)
+        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "mask", "instances")}
+        same |= {"box": box, "start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
@@ -303,10 +350,9 @@ def _open_bank(
     options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
 ) -> "ViewBank":
     from ..matching import ViewBank, cached_bank
-    from ..mesh import load_mesh
 
     if mesh.suffix != ".safetensors":
-        loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
     check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
