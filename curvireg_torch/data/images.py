@@ -3,11 +3,11 @@
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -15,16 +15,30 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, ImageError, MissingFileError
+from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, CurviregError, ImageError, MissingFileError
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
-from ..utils.pictures import check_pixels, damaged_picture, open_picture
+from ..utils.pictures import check_pixels, damaged_picture
+from .heif import open_photograph
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
+T = TypeVar("T")
+
+_WIDTH, _HEIGHT, _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = (
+    256,
+    257,
+    262,
+    258,
+    254,
+    0x0112,
+    0x8769,
+    0xA405,
+)
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
+
+USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
@@ -67,7 +81,9 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
     """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, BMP, PBM, PGM or PPM with up to 16 bits per channel, which are rounded to 8.
+        path: JPEG, PNG, TIFF, WebP, BMP, PBM, PGM or PPM with up to 16 bits per channel, which are rounded to 8; HEIC
+            with the extra ``[heic]``, AVIF with a Pillow that has it. Of 16 bits of which a camera has used 8 to 14,
+            these are stretched, with a note.
         as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
@@ -87,7 +103,7 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
     orientation = 1 if as_stored else orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
-    pixels = torch.from_numpy(np.array(_oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
+    pixels = torch.from_numpy(np.array(oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
     return Photo(pixels, orientation, focal, notes)
 
 
@@ -99,25 +115,57 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
+def photo_size(path: Path) -> tuple[int, int]:
+    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the same."""
+
+    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
+        tags = getattr(image, "tag_v2", {})  # of a TIFF, whose size Pillow turns or not, by its version
+        return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
+
+    (width, height), orientation = decoded(path, stored_size)
+    return (width, height) if orientation > 4 else (height, width)
+
+
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
     """(H, W, 3) RGB pixels as stored, EXIF orientation and focal length, and notes."""
+
+    def read(image: "Image", orientation: int, data: bytes) -> tuple[NDArray[np.uint8], float | None, tuple[str, ...]]:
+        notes = _notes(image)
+        focal = _exif(image)[1]
+        rgb, stretched = _rgb_pixels(image, data)
+        return as_in_file(rgb, image, orientation), focal, (*notes, *stretched)
+
+    (rgb, focal, notes), orientation = decoded(path, read)
+    return rgb, orientation, focal, notes
+
+
+def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, int]:
+    """What ``read`` makes of the open picture of a file, its EXIF orientation and its bytes; and this orientation.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        CurviregError: it cannot be decoded, or a decoder is missing.
+    """
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the photograph", subject=path)
     if path.stat().st_size > MAX_IMAGE_BYTES:
         raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
     try:
-        with open_picture(path.read_bytes()) as image:
+        data = path.read_bytes()
+        with open_photograph(data) as image:
             _seek_full_image(image)
             check_pixels(image)
-            notes, (orientation, focal) = _notes(image), _exif(image)
-            rgb = _rgb_pixels(image)
-            if image.format == "TIFF":  # Pillow has applied the orientation: take it back
-                rgb = _oriented(rgb, {6: 8, 8: 6}.get(orientation, orientation))
-            return rgb, orientation, focal, notes
-    except ImageError as error:
-        raise error.with_subject(path) from None
+            orientation = _exif(image)[0]
+            return read(image, orientation, data), orientation
+    except CurviregError as error:
+        raise error.with_subject(path) from error.__cause__
     except Exception as error:  # Pillow raises errors of any kind for damaged files
         raise damaged_picture(error).with_subject(path) from error
+
+
+def as_in_file(pixels: NDArray[Any], image: "Image", orientation: int) -> NDArray[Any]:
+    """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which is taken back."""
+    return oriented(pixels, {6: 8, 8: 6}.get(orientation, orientation)) if image.format == "TIFF" else pixels
 
 
 def _seek_full_image(image: "Image") -> None:
@@ -142,18 +190,57 @@ def _exif(image: "Image") -> tuple[int, float | None]:
     return orientation if valid else 1, focal if 0 < focal < math.inf else None
 
 
-def _rgb_pixels(image: "Image") -> NDArray[np.uint8]:
-    """(H, W, 3); the largest value that the file's format can hold becomes 255."""
+def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+    """(H, W, 3), and notes; the largest value that the file's format can hold becomes 255, but of 16 bits of which the
+    upper ones are empty, as cameras of 10 and 12 bits write them, the largest of the used bits."""
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
         tags = getattr(image, "tag_v2", {})
-        largest = 2 ** tags.get(_BITS, (16,))[0] - 1
+        bits = tags.get(_BITS, (16,))[0]
         grey = np.asarray(image).astype(np.uint32)
-        grey = largest - grey if tags.get(_PHOTOMETRIC) == 0 else grey  # Pillow inverts 8 bits only
-        return np.repeat(((grey * 255 + largest // 2) // largest).astype(np.uint8)[..., None], 3, axis=2)
+        grey = 2**bits - 1 - grey if tags.get(_PHOTOMETRIC) == 0 else grey  # Pillow inverts 8 bits only
+        used = _used_bits(grey, bits) if image.format != "PPM" else bits  # PGM names its largest value
+        return np.repeat(_eight_bits(grey, used)[..., None], 3, axis=2), _stretched(used, bits)
     if image.mode in ("I", "F", "LAB", "HSV"):
         kind = {"I": "32 bits", "F": "floating values"}.get(image.mode, f"CIE{image.mode}")
         raise ImageError(f"expected RGB or grey of 8 or 16 bits per channel, got {kind}; save it as PNG")
-    return np.asarray(image.convert("RGB"))
+    rgb = np.asarray(image.convert("RGB"))
+    upper_bits = USED_BITS[-1] - 8
+    if not _is_deep(image, data) or int(rgb.max(initial=0)) >= 2**upper_bits:
+        return rgb, ()
+    if image.format != "PNG":
+        note = f"16 bits, of which the lower ones are used: {len(np.unique(rgb))} levels remain; save it as PNG"
+        return rgb, (note,)
+    # Pillow drops the lower 8 bits of colours.
+    how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    deep = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), how))
+    used = _used_bits(deep, 16)
+    return _eight_bits(deep[..., ::-1], used), _stretched(used, 16)
+
+
+def _is_deep(image: "Image", data: bytes) -> bool:
+    """Whether a colour picture has 16 bits for each channel, of which Pillow keeps the upper 8."""
+    if image.format == "PNG":
+        return data[24:25] == b"\x10"  # of its first chunk
+    tags = getattr(image, "tag_v2", {})
+    return bool(tags.get(_BITS, (8,))[0] == 16)
+
+
+def _used_bits(values: NDArray[Any], bits: int) -> int:
+    """The bits that hold all values, 8, 10, 12 or 14; ``bits`` of a black picture, and where more are needed."""
+    largest = int(values.max(initial=0))
+    fewer = [used for used in USED_BITS if used < bits and largest < 2**used]
+    return fewer[0] if fewer and largest else bits
+
+
+def _eight_bits(values: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Values of ``bits`` bits, rounded to 8."""
+    largest = 2**bits - 1
+    rounded: NDArray[np.uint8] = ((values.astype(np.uint32) * 255 + largest // 2) // largest).astype(np.uint8)
+    return rounded
+
+
+def _stretched(used: int, bits: int) -> tuple[str, ...]:
+    return (f"{bits} bits, of which the lower {used} are used: stretched",) if used < bits else ()
 
 
 def _notes(image: "Image") -> tuple[str, ...]:
@@ -166,7 +253,7 @@ def _notes(image: "Image") -> tuple[str, ...]:
     return tuple(text for text, applies in notes.items() if applies)
 
 
-def _oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+def oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
     """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
     x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
     return x.swapaxes(0, 1) if orientation > 4 else x

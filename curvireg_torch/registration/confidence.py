@@ -15,10 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
-# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``none``, see
-# :func:`hypothesis_probabilities`
+# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``resolution``, see
+# :func:`shares`
 CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
 # Factor of the least-squares covariance, which ignores edges that do not belong to the object: with it, nine in ten
 # true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs
@@ -27,7 +28,9 @@ COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
 # generated shelves 84 of 88. It is less where other objects have a similar print
 MIN_LANDMARKS, LANDMARK_PROBABILITY = 8, 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
-CONFIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
+EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")  # the more, the better
+DOUBT_FEATURES = ("undetermined", "outside", "border")  # the more, the worse
+CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
 RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals
@@ -75,8 +78,8 @@ def is_calibrated(pipeline: Pipeline) -> bool:
     return usual and compared(pipeline) == compared(default)
 
 
-def registration_confidence(features: Features, *, exact: bool) -> float:
-    """Probability that a fitted pose is within 30 degrees of the truth, from :func:`confidence_features`."""
+def probability_of_any(features: Features, *, exact: bool) -> float:
+    """Probability that one of the hypotheses is within 30 degrees of the truth, from :func:`confidence_features`."""
     return LogisticModel.named(model_name(exact=exact))(features)
 
 
@@ -133,7 +136,24 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
     return None if bool(near.all()) else float((weights * near).sum() / weights.sum().clamp(min=1e-300))
 
 
-def confidence_features(evidence: Tensor, scores: Tensor, share: float | None) -> dict[str, float | None]:
+def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> float:
+    """How many axes of rotation a fit leaves undetermined, in [0, 3]: the sum of the standard deviations in radians
+    about the three axes, each at most 1. 3 without a covariance (6, 6): one that is NaN. The axis of a body of
+    revolution, whose ``symmetries`` (S, 4, 4) are many, need not be determined.
+
+    Example:
+        >>> round(undetermined_axes(torch.diag(torch.tensor([0.01, 0.04, 9.0, 1.0, 1.0, 1.0]))), 3)
+        1.3
+    """
+    deviations = covariance.diagonal()[:3].clamp(min=0.0).sqrt()
+    undetermined = float(deviations.clamp(max=1.0).nan_to_num(1.0).sum())
+    is_round = symmetries is not None and len(symmetries) >= ROUND
+    return max(undetermined - 1.0, 0.0) if is_round else undetermined
+
+
+def confidence_features(
+    evidence: Tensor, scores: Tensor, share: float | None, *, undetermined: float, outside: float, border: float
+) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
     similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest of its rivals,
@@ -143,31 +163,48 @@ def confidence_features(evidence: Tensor, scores: Tensor, share: float | None) -
         evidence: (H, 5) :data:`POSE_FEATURES` of the hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
+        undetermined: :func:`undetermined_axes` of the best hypothesis.
+        outside: fraction of the object that lies outside the photograph.
+        border: number of the box's sides that lie on the border of the photograph.
     """
     _, similarity, edge_support, _, landmarks = evidence[0].tolist()
     rivals = scores[1:]
     margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
-    values = similarity, margin, edge_support, share, landmarks
+    values = similarity, margin, edge_support, share, landmarks, undetermined, outside, border
     return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
 
 
-def hypothesis_probabilities(confidence: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:
-    r"""Probability of each hypothesis of one photograph to be within 30 degrees of the truth.
+def resolution(*, exact: bool) -> float:
+    """Difference of two scores up to which a photograph does not tell which of two poses is right."""
+    return float(CALIBRATION[model_name(exact=exact)]["resolution"])
 
-    If the first is wrong, rival :math:`k` is right with a probability in proportion to :math:`e^{a (s_k - s_1)}`, s_1
-    being the score of the best rival, and none of them in proportion to :math:`e^b`.
+
+def shares(scores: Tensor, *, exact: bool) -> Tensor:
+    r"""(H,) probability of each hypothesis to be the right one, if one of them is, from their scores (H,).
+
+    In proportion to :math:`e^{-a \max(0, s - s_k - r)}` with the best score s and the slope a: scores that differ by
+    less than the resolution r, as the fits of two equally good poses do, are a tie, whose members have equal shares.
 
     Args:
-        confidence: probability of the first hypothesis.
-        scores: (H,) by which hypotheses are ordered, the first hypothesis first.
+        scores: by which hypotheses are ordered.
         exact: see :func:`model_name`.
 
     Example:
-        >>> [round(p, 2) for p in hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 1.0]), exact=True)]
-        [0.6, 0.09, 0.09]
+        >>> shares(torch.tensor([3.0, 3.0]), exact=True).tolist()
+        [0.5, 0.5]
     """
     constants = CALIBRATION[model_name(exact=exact)]
-    rivals = scores[1:].double()
-    rivals = constants["slope"] * (rivals - rivals.max()) if len(rivals) else rivals
-    logits = torch.cat([rivals, torch.tensor([constants["none"]], dtype=torch.float64)])
-    return confidence, *((1.0 - confidence) * logits.softmax(dim=0))[:-1].tolist()
+    behind = scores.double().max() - scores.double() - constants["resolution"]
+    logits: Tensor = -constants["slope"] * behind.clamp(min=0.0)
+    return logits.softmax(dim=0)
+
+
+def hypothesis_probabilities(any_right: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:
+    """Probability of each hypothesis of one photograph to be within 30 degrees of the truth: the probability that any
+    of them is, times their :func:`shares`. Of two poses that fit equally well, neither has more than one half.
+
+    Example:
+        >>> hypothesis_probabilities(0.9, torch.tensor([3.0, 3.0]), exact=True)
+        (0.45, 0.45)
+    """
+    return tuple((any_right * shares(scores, exact=exact)).tolist())

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..data.images import read_photo
+from ..data.masks import mask_of_values, read_mask
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.calibration import Camera, undistorted
 from ..geometry.crops import box_iou, check_boxes, crop_squares, square_boxes, whole_image_box
@@ -33,8 +34,11 @@ from ..utils.checks import (
     check_tensor,
     type_and_shape,
 )
+from .framing import clipped
 
 MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
+MAX_FRACTION = 1.5  # largest coordinate of a box that is probably meant in fractions of the picture
+FRACTIONS = "box: in px, not fractions of the photograph; multiply them, or give --box-format fractions, or yolo"
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
@@ -134,6 +138,8 @@ def image_items(
         try:
             item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
+                if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
+                    raise InvalidInputError(FRACTIONS)
                 small = min(item.size) < MIN_BOX_SIDE
                 where = "the photograph has" if small else "the part of the photograph in the box has"
                 message = f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"
@@ -230,6 +236,8 @@ def image_item(
         box = around if box is None else box
     box = whole_image_box(pixels).cpu() if box is None else box
     item = ImageItem(pixels, box, camera, prior, mask)
+    # Of an object that the border cuts, only the visible part is known.
+    item = replace(item, box=clipped(box, item.size))
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
         notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
     return replace(item, notes=tuple(notes))
@@ -238,14 +246,15 @@ def image_item(
 def _object_mask(mask: Any, image: Tensor) -> Tensor:
     """A mask of a photograph in any form as (H, W) float32 in [0, 1] on the CPU."""
     if isinstance(mask, str | PathLike):
-        mask = read_photo(mask).image.amax(dim=0)
+        mask = read_mask(mask)
     x = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else None
     if x is None or not (x.dtype in (torch.bool, torch.uint8) or x.is_floating_point()):
         raise InvalidInputError(f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}")
     if x.shape != image.shape[-2:]:
         (H, W), shape = image.shape[-2:], tuple(x.shape)
         raise InvalidInputError(f"mask: expected shape ({H}, {W}), that of the photograph, got {shape}")
-    x = x.detach().cpu().float() / (255.0 if x.dtype == torch.uint8 and int(x.max()) > 1 else 1.0)
+    x = x.detach().cpu()
+    x = torch.from_numpy(mask_of_values(x.numpy(), 255)) if x.dtype == torch.uint8 else x.float()
     check_finite(x, "mask")
     if float(x.min()) < 0 or float(x.max()) > 1:
         raise InvalidInputError("mask: expected values from 0 to 1, the object white; divide by the largest")

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..terms import Appearance, QueryFeatures
+from .confidence import are_near
 from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges, quick_fit
 from .edges import EdgeCrops
 from .result import Hypothesis
@@ -25,6 +26,7 @@ __all__ = [
     "SCORE_WEIGHTS",
     "Poses",
     "best_views",
+    "close_rivals",
     "common_score",
     "compare_with_photograph",
     "distinct_poses",
@@ -48,6 +50,9 @@ SAME_POSE_ANGLE = 15.0
 FINISHED_FITS = 2
 """Hypotheses of a photograph whose contours are fitted at full size."""
 
+CLOSE_SCORE, CLOSE_RIVALS = 2.5, 2
+"""Score by which rivals may be behind to be fitted as thoroughly as the best pose, and how many of them are."""
+
 POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks")
 """Features of a pose: log S of the view it started from, minus that of the best view; normalised correlation of the
 pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
@@ -57,8 +62,9 @@ colours, camera or contour fit, with a similar mesh, and where a given pose is r
 CHANCE_LANDMARKS = 2
 """Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses have no more."""
 
-SCORE_WEIGHTS, RANK_ALONE = (1.0, 10.0, 10.0, 2.5, 6.0), (1.0, 0.0, 0.0, 0.0, 0.0)
-"""Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md)."""
+SCORE_WEIGHTS, RANK_ALONE = (0.0, 10.0, 10.0, 2.5, 6.0), (1.0, 0.0, 0.0, 0.0, 0.0)
+"""Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md). The
+rank does not count where poses are fitted: how near a view of the bank was to one is a matter of sampling."""
 
 
 @dataclass(frozen=True)
@@ -253,6 +259,15 @@ def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None
     R, best_first = poses.rotation[order].float(), torch.arange(len(order))
     chosen = distinct_views(best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries)
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
+
+
+def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
+    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, at most ``CLOSE_RIVALS``."""
+    best = int(scores.argmax())
+    same = are_near(poses.rotation, poses.rotation[best], symmetries)
+    close = ~same & (scores > scores[best] - CLOSE_SCORE)
+    order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
+    return order[: min(CLOSE_RIVALS, int(close.sum()))]
 
 
 def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -> Tensor:

@@ -25,6 +25,7 @@ from .poses import (
     similarities,
 )
 from .result import FailedRegistration, Registration
+from .starts import why_outside
 from .tracker import OUTSIDE, boxes_at
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 # Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank
 WIDE_ANGLES = (14.0, 22.0)
+COMPARED = 5  # Hypotheses of the registration that checks a refined pose, even if fewer are reported
 LOST_CONFIDENCE = 0.35  # Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
 
 
@@ -83,10 +85,12 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     describer, K = registrar.describer, item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
-        raise LostObjectError(OUTSIDE)
+        raise LostObjectError(why_outside(describer.hull, T[0], K, item.size))
     T, boxes = T[visible], boxes[visible]
     if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
-        raise LostObjectError(f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance")
+        problem = why_outside(describer.hull, T[0], K, item.size)
+        tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
+        raise LostObjectError(tiny if problem == OUTSIDE else problem)
     images, each = [item.image] * len(T), torch.arange(len(T))
     query = registrar.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
@@ -132,7 +136,7 @@ def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses
     projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
     query = registrar.matcher.query([item.image], boxes.float())
-    found = registrar.register(replace(item, box=boxes[0].float()), query)
+    found = registrar.with_hypotheses(COMPARED).register(replace(item, box=boxes[0].float()), query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
     near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact(with_camera=True)))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)

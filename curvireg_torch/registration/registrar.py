@@ -3,8 +3,9 @@
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from copy import copy
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -14,40 +15,32 @@ from torch import Tensor, nn
 from ..errors import CurviregError, InvalidInputError
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
-from ..matching import Ranking, ViewBank, ViewDescriber, ViewMatcher, cached_bank
+from ..matching import ViewBank, ViewDescriber, ViewMatcher, cached_bank
 from ..mesh import has_colours, mesh_symmetries, mesh_warnings
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
 from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
-from .confidence import (
-    MIN_LANDMARKS,
-    are_near,
-    concentration,
-    confidence_features,
-    hypothesis_probabilities,
-    is_calibrated,
-    registration_confidence,
-)
+from .confidence import MIN_LANDMARKS, are_near
 from .contour_fit import measure_contours
 from .detection import Detector, detect
 from .edges import EdgeCrops
 from .inputs import ImageItem, check_crop, image_items
+from .judging import Work, better_of, flat_mesh_warnings, judged
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
-    SCORE_WEIGHTS,
     Poses,
     best_views,
+    close_rivals,
     common_score,
     compare_with_photograph,
     distinct_poses,
     fit_poses,
     fit_texture_of,
-    hypothesis_of,
     landmark_evidence,
-    named_features,
     pose_features,
     pose_scores,
     projected_box,
@@ -59,6 +52,7 @@ from .refinement import nearest_view, refine
 from .result import FailedRegistration, Registration
 from .search import search
 from .several import register_views
+from .siblings import Siblings, telling_symmetries
 
 __all__ = ["Registrar"]
 
@@ -72,30 +66,9 @@ they reach, beside log S, in the choice of those that become hypotheses."""
 
 KEPT_LANDMARKS = 0.5  # Fraction of the landmarks that agree with a start, which must agree with its fit as well
 
-OUTSIDE_MARGIN = 1.0
-"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
-
-FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
-
 Results = list[Registration | FailedRegistration]
 
 _SHAPE_LOCK = threading.Lock()
-
-
-@dataclass(frozen=True)
-class _Work:
-    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
-    fits, and ``landmarks`` in the box, if there are any."""
-
-    item: ImageItem
-    query: QueryFeatures
-    ranking: Ranking
-    descriptor: Tensor
-    limits: Limits | None
-    exact: bool
-    symmetries: Tensor | None
-    crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
 
 
 class Registrar:
@@ -192,6 +165,7 @@ class Registrar:
         self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
     @torch.no_grad()
+    @in_full_precision
     def __call__(
         self,
         images: Tensor | Sequence[Any],
@@ -229,13 +203,15 @@ class Registrar:
             results = self.map_items(items, lambda item, _: self.register_item(item))
         for model, other in enumerate(self.others, 1):
             rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
-            results = [_better(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
+            results = [better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
+    @in_full_precision
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
+    @in_full_precision
     def register_views(
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:
@@ -250,7 +226,7 @@ class Registrar:
             result = FailedRegistration(error)
         for model, other in enumerate(self.others, 1):
             with suppress(CurviregError):  # that of the first mesh is raised if all fail
-                result = _better(result, other.register_views(*given), model)
+                result = better_of(result, other.register_views(*given), model)
         if isinstance(result, FailedRegistration):
             raise result.error
         return result
@@ -258,6 +234,18 @@ class Registrar:
     def of_model(self, model: int) -> "Registrar":
         """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
         return self.others[model - 1] if model else self
+
+    def with_hypotheses(self, count: int) -> "Registrar":
+        """The same registrar with at least ``count`` hypotheses, of which a joint result needs more than it reports.
+
+        :meta private:
+        """
+        if self.pipeline.hypotheses >= count:
+            return self
+        _ = self.describer  # shared
+        other = copy(self)
+        other.pipeline = replace(self.pipeline, hypotheses=count)
+        return other
 
     def is_exact(self, *, with_camera: bool) -> bool:
         """Whether the mesh counts as that of this very object."""
@@ -305,13 +293,18 @@ class Registrar:
         return Landmarks(self.describer)
 
     @cached_property
+    def _telling_symmetries(self) -> Tensor:
+        """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity alone if they are
+        given, and trusted."""
+        symmetries = self.symmetries_of(exact=True)
+        if self.symmetries is not None or symmetries is None:
+            return torch.eye(4, dtype=torch.float64)[None]
+        return telling_symmetries(self.bank.mesh, symmetries)
+
+    @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:
         """What makes every pose of this mesh questionable, in words."""
-        vertices = torch.from_numpy(self.bank.mesh.vertices.copy()).double()
-        thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
-        if has_colours(self.bank.mesh) or thickness > FLAT_EXTENT * self.describer.radius:
-            return ()
-        return ("the mesh is flat and has no colours: front and back look alike",)
+        return flat_mesh_warnings(self.bank.mesh)
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
@@ -343,6 +336,7 @@ class Registrar:
         whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
+        _ = self.is_exact(with_camera=True) and self._telling_symmetries
 
         def run(index: int) -> Any:
             item = items[index]
@@ -393,8 +387,10 @@ class Registrar:
                 poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
             poses = self._fitted(work, work.crops, poses, quick=poses.quick)
         features = self._features(work, poses)
+        sibling: tuple[Poses, Tensor] | None = None
         if work.crops is not None and work.exact:
             poses, features = self._fitted_again(work, work.crops, poses, features, outside)
+            poses, features, sibling = self._with_siblings(work, work.crops, poses, features, outside)
             poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
@@ -412,9 +408,12 @@ class Registrar:
                 restored = with_edge_support(self.describer, work.crops, restored)
             poses = poses.replaced(back, restored)
             features = features.index_copy(0, back, self._features(work, restored))
-        return self._result(work, poses, features, distinct, outside)
+        if sibling is not None:
+            poses, features = Poses.cat([poses, sibling[0]]), torch.cat([features, sibling[1]])
+            distinct, outside = F.pad(distinct, (0, 1), value=True), F.pad(outside, (0, 1))
+        return judged(self, work, poses, features, distinct, outside)
 
-    def _rank(self, item: ImageItem, query: QueryFeatures) -> _Work:
+    def _rank(self, item: ImageItem, query: QueryFeatures) -> Work:
         self.report_progress("ranking")
         limits = None if item.prior is None else Limits(item, self.bank)
         ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
@@ -426,9 +425,9 @@ class Registrar:
             crops = EdgeCrops.cut([item.image], item.box[None], self.bank.settings.margin, mask)
         landmarks = self.landmark_matches(item, item.box) if self.uses_landmarks else None
         descriptor = self.describer.descriptor(query.field)
-        return _Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
+        return Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
 
-    def _starts(self, work: _Work) -> tuple[Poses, Tensor, Tensor]:
+    def _starts(self, work: Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
         most, and which landmarks agree on, in place of the views near it.
 
@@ -460,7 +459,7 @@ class Registrar:
         other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
         return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(by_landmarks, (0, 1))
 
-    def _searched(self, work: _Work) -> Registration:
+    def _searched(self, work: Work) -> Registration:
         """The result of the paper's search, and further distinct views of the ranking, in its order."""
         self.report_progress("search")
         view, rank = best_views(work.ranking, self.bank, count=self.pipeline.hypotheses, symmetries=work.symmetries)
@@ -471,7 +470,7 @@ class Registrar:
             poses = work.limits.moved_inside(poses)
         distinct = torch.ones(len(poses), dtype=torch.bool)
         by_rank = replace(work, exact=False)
-        return self._result(by_rank, poses, self._features(work, poses), distinct, ~distinct)
+        return judged(self, by_rank, poses, self._features(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
@@ -479,10 +478,10 @@ class Registrar:
         score = poses.rank + SCREENING_WEIGHT * support
         return poses[score.argsort(descending=True, stable=True)[:count]]
 
-    def _of_views(self, work: _Work, view: Tensor, rank: Tensor) -> Poses:
+    def _of_views(self, work: Work, view: Tensor, rank: Tensor) -> Poses:
         return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)
 
-    def _in_box(self, work: _Work, *poses: Tensor) -> Poses:
+    def _in_box(self, work: Work, *poses: Tensor) -> Poses:
         return Poses.in_box(self.describer, work.item.box, work.item.camera_matrix, *poses)
 
     def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
@@ -497,14 +496,14 @@ class Registrar:
             return None
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
-    def _features(self, work: _Work, poses: Poses) -> Tensor:
+    def _features(self, work: Work, poses: Poses) -> Tensor:
         """(H, 5) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
         return pose_features(poses, similarity, appearance, landmarks)
 
-    def _fitted(self, work: _Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
+    def _fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
         poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
@@ -517,20 +516,62 @@ class Registrar:
         return poses
 
     def _fitted_again(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
-        """Fit the best pose again from where it is, and keep the result if it has a higher score."""
+        """Fit the best pose again from where it is, then its close rivals: fits that differ in effort cannot be
+        compared. Results with a higher score are kept."""
         best = _best_inside(features, outside)
-        fitted = self._fitted(work, crops, poses[best], again=True)
-        if bool((poses.T[best] == fitted.T).all()):
+        poses, features = self._refitted(work, crops, poses, features, best)
+        scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
+        rivals = close_rivals(poses, scores, work.symmetries)
+        return self._refitted(work, crops, poses, features, rivals) if len(rivals) else (poses, features)
+
+    def _refitted(
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
+    ) -> tuple[Poses, Tensor]:
+        """Fit poses again, and keep the results that have a higher score."""
+        fitted = self._fitted(work, crops, poses[index], again=True)
+        moved = (poses.T[index] != fitted.T).flatten(1).any(dim=1)
+        if not bool(moved.any()):
             return poses, features
         new = self._features(work, fitted)
-        if bool(pose_scores(new, exact=True) <= pose_scores(features[best], exact=True)):
-            return poses, features
-        return self._replaced(work, poses, features, best, fitted, new)
+        better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
+        for k in better.nonzero()[:, 0].tolist():
+            one = torch.tensor([k])
+            poses, features = self._replaced(work, poses, features, index[one], fitted[one], new[one])
+        return poses, features
+
+    def _with_siblings(
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    ) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
+        """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
+        strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
+        symmetries = self._telling_symmetries
+        if len(symmetries) == 1:
+            return poses, features, None
+        best = _best_inside(features, outside)
+        measure = partial(self._measured, work, crops)
+        siblings = Siblings.of(poses[best], symmetries, self.describer, measure)
+        kept = siblings.best()
+        if kept:
+            fitted = self._fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
+            new = self._features(work, fitted)
+            better = bool(pose_scores(new, exact=True) > pose_scores(features[best], exact=True))
+            if better:
+                poses, features = self._replaced(work, poses, features, best, fitted, new)
+            else:
+                kept = 0
+        rival = siblings.rival(kept, features[best])
+        if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
+            rival = None
+        return poses, features, rival
+
+    def _measured(self, work: Work, crops: EdgeCrops, poses: Poses) -> Tensor:
+        """(H, 5) :data:`POSE_FEATURES` of poses that are not fitted."""
+        return self._features(work, with_edge_support(self.describer, crops, poses))
 
     def _with_texture(
-        self, work: _Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose to the mesh's colours as well."""
         best = _best_inside(features, outside)
@@ -540,14 +581,14 @@ class Registrar:
         return self._replaced(work, poses, features, best, fitted, self._features(work, fitted))
 
     def _replaced(
-        self, work: _Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
+        self, work: Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
     ) -> tuple[Poses, Tensor]:
         """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds the limits."""
         if work.limits is not None and not bool(work.limits.keeps(fitted)):
             return poses, features
         return poses.replaced(index, fitted), features.index_copy(0, index, new)
 
-    def _kept(self, work: _Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
+    def _kept(self, work: Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
         """(H,) bool: poses that do not return to their views."""
         kept = distinct
         if self.pipeline.contours and not work.exact:
@@ -555,56 +596,7 @@ class Registrar:
             kept = kept & poses.fit.trustworthy
         return kept if work.limits is None else kept & (work.limits.keeps(poses) | outside)
 
-    def _result(self, work: _Work, poses: Poses, features: Tensor, distinct: Tensor, outside: Tensor) -> Registration:
-        """Hypotheses, best first, those that merged last, and their probabilities."""
-        scores = pose_scores(features, exact=work.exact)
-        order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
-        own, rivals = order[~outside[order]], order[outside[order]]
-        best, reported = own[:1], own[: self.pipeline.hypotheses].tolist()
-        with_camera = work.item.camera_matrix is not None
-        R, ranking = self.bank.rotations, work.ranking
-        near = are_near(R, R[ranking.order[0, 0]], work.symmetries)
-        measured = confidence_features(features[own], scores[own], concentration(ranking.scores[0], near))
-        gain = None
-        if len(rivals):  # without the rank, which views outside the limits do not have
-            gain = float((features[rivals, 1:] - features[best, 1:]) @ torch.tensor(SCORE_WEIGHTS[1:]).to(features))
-            if len(own) == 1:  # limits that leave no rival do not make a pose uncertain
-                share = measured["concentration"] or 1.0
-                measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
-        probabilities: tuple[float, ...] = ()
-        if is_calibrated(self.pipeline):
-            confidence = registration_confidence(measured, exact=work.exact)
-            probabilities = hypothesis_probabilities(confidence, scores[own], exact=work.exact)[: len(reported)]
-        contradiction = None
-        if work.limits is not None:
-            one = poses[best]
-            filling = self._in_box(work, one.rotation, one.distance, one.view, one.rank)
-            better = gain is not None and gain > OUTSIDE_MARGIN
-            contradiction = work.limits.contradiction(one, filling, better_outside=better)
-        return Registration(
-            tuple(hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported),
-            probabilities,
-            ranking,
-            measured,
-            prior=work.item.prior,
-            prior_contradiction=contradiction,
-            warnings=work.item.warnings + self.mesh_warnings,
-            notes=self.mesh_notes,
-        )
-
 
 def _best_inside(features: Tensor, outside: Tensor) -> Tensor:
     """(1,) index of the best pose that is not outside the limits."""
     return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-
-
-def _better(
-    one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
-) -> Registration | FailedRegistration:
-    """The registration with more confidence, or with a higher score where there is none; ``model`` is the rival's."""
-    if not isinstance(rival, Registration):
-        return one
-    if not isinstance(one, Registration):
-        return replace(rival, model=model)
-    ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
-    return replace(rival, model=model) if ahead else one

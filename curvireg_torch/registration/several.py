@@ -14,16 +14,20 @@ from .confidence import (
     confidence_features,
     hypothesis_probabilities,
     is_calibrated,
-    registration_confidence,
+    probability_of_any,
+    undetermined_axes,
 )
 from .detection import detect
+from .framing import border_sides, outside_fraction
 from .inputs import ImageItem, OnDemand, image_items, is_missing, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
-from .rig import ELSEWHERE, Found, Rig, RigPhotograph
+from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .tracker import boxes_at
 
 if TYPE_CHECKING:
     from .registrar import Registrar
+
+JOINT_HYPOTHESES = 5  # Hypotheses of each photograph that are compared in all, even if fewer are reported
 
 
 @torch.no_grad()
@@ -67,6 +71,8 @@ def register_views(
     """
     if camera_matrices is None:
         raise InvalidInputError("register_views: needs the camera matrix of each photograph")
+    count = registrar.pipeline.hypotheses
+    registrar = registrar.with_hypotheses(JOINT_HYPOTHESES)
     items = image_items(images, boxes, camera_matrices)
     cameras = rig_cameras(T_cam_from_world, items)
     given = [] if boxes is None else [i for i, box in enumerate(boxes) if not is_missing(box)]
@@ -86,7 +92,7 @@ def register_views(
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)
-    return _registration(registrar, found, cameras)
+    return _registration(registrar, found, cameras, count)
 
 
 def _registered(
@@ -111,8 +117,8 @@ def _registered(
     return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
 
 
-def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Registration:
-    """The joint result of photographs, without those that failed or do not show the best pose."""
+def _registration(registrar: "Registrar", found: Found, cameras: Tensor, count: int) -> Registration:
+    """The joint result of photographs, without those that failed or do not show the best pose; ``count`` hypotheses."""
     reasons = {i: one.message for i, one in found.items() if isinstance(one, CurviregError)}
     rig = every = Rig.of(registrar, found)
     answer = rig.answer()
@@ -124,25 +130,23 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
         compared |= dict(zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True))
     first, weights = rig.photographs[0], rig.weights(answer.T[0])
     total, mean = weights @ answer.scores, torch.einsum("v,vmk->mk", weights / weights.sum(), answer.evidence)
-    shares = [p.result.confidence_features["concentration"] for p in rig.photographs]
-    known = torch.tensor([torch.nan if share is None else share for share in shares]).double()
-    features = confidence_features(mean, total, float(known.nanmean()))
+    features = _joint_features(rig, mean, total, weights, answer)
     if len(total) == 1 and len(rig.photographs) > 1:  # the hypotheses of all photographs led to the same pose
         features["margin"] = MAX_MARGIN
-    count, probabilities = registrar.pipeline.hypotheses, first.result.probabilities
+    probabilities = first.result.probabilities
     if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
-        confidence = probabilities[0]
         if len(rig.photographs) > 1:
             found_in = [p.result.detection for p in every.photographs]
             scores = [detection.score for detection in found_in if detection is not None] or [1.0]
-            confidence = max(scores) * registration_confidence(features, exact=rig.exact)
-        odds = confidence / max(1.0 - confidence, 1e-9)
+            any_right = max(scores) * probability_of_any(features, exact=rig.exact)
+            probabilities = hypothesis_probabilities(any_right, total, exact=rig.exact)
+        odds = probabilities[0] / max(1.0 - probabilities[0], 1e-9)
         for p in every.photographs:  # those that were left out, and are confident of another pose
             if p.index in lost and rig.angles(p.poses[:1], answer.T[:1]) > RIVAL_ANGLE:
                 other = p.result.confidence or 0.0
                 odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
-        confidence = odds / (1.0 + odds)
-        probabilities = hypothesis_probabilities(confidence, total, exact=rig.exact)[:count]
+        factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)
+        probabilities = tuple(factor * probability for probability in probabilities)
     margins = weights * (answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN)
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
     views = []
@@ -154,10 +158,27 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor) -> Regi
         views.append(view)
     return Registration(
         hypotheses=tuple(rig.hypothesis(answer, m, mean[m]) for m in range(min(count, len(total)))),
-        probabilities=probabilities,
+        probabilities=probabilities[:count],
         ranking=first.result.ranking,
         confidence_features=features,
         warnings=tuple(sorted(set.intersection(*(set(p.result.warnings) for p in rig.photographs)))),
         notes=first.result.notes,
         views=tuple(views),
+    )
+
+
+def _joint_features(rig: Rig, mean: Tensor, total: Tensor, weights: Tensor, answer: Answer) -> dict[str, float | None]:
+    """:func:`.confidence_features` of the joint pose: ``mean`` (M, F) evidence, ``total`` (M,) scores."""
+    measured = [p.result.confidence_features for p in rig.photographs]
+    known = [features["concentration"] for features in measured if features["concentration"] is not None]
+    outside = [outside_fraction(rig.describer.hull, p.camera @ answer.T[0], p.K, p.size) for p in rig.photographs]
+    border = [float(border_sides(p.box, p.size)) for p in rig.photographs]
+    weights = weights / weights.sum()
+    return confidence_features(
+        mean,
+        total,
+        sum(known) / len(known) if known else None,
+        undetermined=undetermined_axes(answer.covariance[0], rig.symmetries),
+        outside=float(weights @ torch.tensor(outside).to(weights)),
+        border=float(weights @ torch.tensor(border).to(weights)),
     )

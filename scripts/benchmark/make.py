@@ -4,12 +4,14 @@
     python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out /data/shelf
     python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count 300 --out /data/chairs
 
---kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``shelf``,
+--kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``shapes``, the
+procedural families of scripts/scenes; ``tied`` ones, of which several poses look the same from most sides; ``shelf``,
 several printed packages side by side, all annotated. A scene has one photograph, or one for each of --cameras, or
---frames of a moving camera. --cad similar annotates furniture as another object of its kind, --cad wrong as any other
-object (to calibrate confidence). Scene i depends only on the seed and i; an interrupted run can be resumed. Boxes are
-exact: ``bbox_obj`` of the whole silhouette, ``bbox_visib`` of its visible part. OUT/benchmark.json holds the options,
-and group and form of each object for scripts/calibration.
+--frames of a moving camera. --cut puts a fraction of the object outside the photograph. To calibrate confidence, --cad
+annotates an object as another one: similar, of its kind; wrong, any other; print, a package of the same shape with
+another print; mirrored, a tied shape's mirror image. Scene i depends only on the seed and i; an interrupted run can be
+resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture, ``bbox_visib`` of its visible part.
+OUT/benchmark.json holds the options, and the group of each object for scripts/calibration.
 """
 
 import argparse
@@ -26,16 +28,25 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+import trimesh
+from scipy.spatial import cKDTree
 from tqdm import tqdm
 
+from curvireg_torch.mesh import mesh_symmetries
 from scripts._shared import write_json
+from scripts.scenes.families import FAMILIES, random_shape
 from scripts.scenes.materials import random_colour, random_texture
 from scripts.scenes.packages import package
-from scripts.scenes.scene import Scene, camera_path, shelf, simulate_camera, single
+from scripts.scenes.scene import Scene, camera_path, cut, shelf, simulate_camera, single
 from scripts.scenes.surfaces import Array, Rng
 from scripts.scenes.textured import Texture, TexturedMesh
+from scripts.scenes.tied import FAMILIES as TIED_FAMILIES
+from scripts.scenes.tied import tied_shape
 
-KINDS = ("printed", "shelf", "furniture")
+KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
+CADS = ("exact", "similar", "wrong", "print", "mirrored")
+SAME_LOOK = 0.97  # fraction of the surface that has the same material after a symmetry of the appearance
+TWIN = 100_000  # added to the number of an object with another print, or of its mirror image
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
 MAX_PROPORTION = 1.6  # factor between the proportions of similar objects; if none is within it, the closest is taken
 FULL_TURN = 12  # symmetries about z of a body of revolution, whose azimuth is undefined: it is excluded
@@ -48,6 +59,7 @@ class Packages:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.seed, self.ids = options.seed, list(range(1, options.models + 1))
+        self.written = self.ids  # those with a mesh file
 
     @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
     def mesh(self, obj_id: int) -> TexturedMesh:
@@ -75,6 +87,76 @@ class Packages:
         return np.asarray((picture / 255.0).astype(np.float32) ** 2.2)
 
 
+class Twins(Packages):
+    """Packages, annotated as others of the same shape with another print."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__(options)
+        self.written = [k + TWIN for k in self.ids]
+
+    @lru_cache(maxsize=100)  # noqa: B019
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        other = np.random.default_rng((self.seed, 2, obj_id)) if obj_id >= TWIN else None
+        return package(np.random.default_rng((self.seed, 0, obj_id % TWIN)), other)
+
+
+class Shapes(Packages):
+    """Procedural shapes of several materials; object k is of family k modulo their number, and half are uniform."""
+
+    families: Sequence[str] = tuple(FAMILIES)
+
+    @lru_cache(maxsize=100)  # noqa: B019
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        rng = np.random.default_rng((self.seed, 3, obj_id))
+        vertices, faces, materials = random_shape(rng, self.group(obj_id))
+        paints = [Texture(random_colour(rng)[None, None].astype(np.float32)) for _ in range(int(materials.max()) + 1)]
+        size = np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
+        mesh = TexturedMesh.from_arrays(size * vertices, faces, paints, paint=materials)
+        return mesh.recoloured(paints[0]) if rng.random() < 0.5 else mesh
+
+    @lru_cache(maxsize=1000)  # noqa: B019
+    def symmetries(self, obj_id: int) -> Array:
+        """Those of shape and materials."""
+        mesh = self.mesh(obj_id)
+        solid = trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3))
+        points, faces = trimesh.sample.sample_surface(solid, 4000, seed=0)
+        tree, paint = cKDTree(points), mesh.paint[faces]
+        kept = []
+        for S in mesh_symmetries(solid).numpy():
+            _, nearest = tree.query(points @ S[:3, :3].T + S[:3, 3])
+            if (paint[nearest] == paint).mean() > SAME_LOOK:
+                kept.append(S[:3, :3])
+        return np.stack(kept)
+
+    def group(self, obj_id: int) -> str:
+        return self.families[obj_id % len(self.families)]
+
+    def similar(self, obj_id: int, rng: Rng) -> int:
+        others = [k for k in self.ids if k != obj_id and self.group(k) == self.group(obj_id)]
+        return int(rng.choice(others))
+
+
+class Tied(Shapes):
+    """Shapes of one colour that are nearly symmetric; all poses but one are wrong."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__(options)
+        self.families = ("handed",) if options.cad == "mirrored" else tuple(TIED_FAMILIES)
+        self.written = [k + TWIN for k in self.ids] if options.cad == "mirrored" else self.ids
+
+    @lru_cache(maxsize=100)  # noqa: B019
+    def mesh(self, obj_id: int) -> TexturedMesh:
+        rng = np.random.default_rng((self.seed, 4, obj_id % TWIN))
+        vertices, faces = tied_shape(rng, self.group(obj_id % TWIN))
+        if obj_id >= TWIN:
+            vertices, faces = vertices * (-1.0, 1.0, 1.0), faces[:, ::-1]
+        paint = Texture(random_colour(rng)[None, None].astype(np.float32))
+        return TexturedMesh.from_arrays(rng.uniform(0.03, 0.3) * vertices, faces, [paint])
+
+    def symmetries(self, obj_id: int) -> Array:
+        return np.eye(3)[None]
+
+
 class Furniture(Packages):
     """The meshes that meshes.py has catalogued."""
 
@@ -87,9 +169,10 @@ class Furniture(Packages):
         good = [m for m in good if len(set(m["look_symmetries"]) & about_z) < FULL_TURN]
         self.surroundings = [m for m in rows if m["faces"] < 6000]
         self.rows: dict[int, dict[str, Any]] = dict(enumerate(good, 1))
-        self.ids = list(self.rows)
+        self.seed, self.ids = options.seed, list(self.rows)
         if options.cad == "similar":
             self.ids = [k for k in self.rows if self._siblings(k)]
+        self.written = list(self.rows)
         textures = sorted(p for m in rows for p in (self.folder / m["path"]).parent.glob("*.jpg"))
         self.photographs = [p for p in textures if p.stat().st_size > 8000]
         self.names = "shape_symmetries" if options.cad == "similar" else "look_symmetries"
@@ -132,7 +215,7 @@ def write_models(objects: Packages, folder: Path) -> None:
     """Write BOP's ``models`` folder: PLY files in mm with one texture each, and ``models_info.json``."""
     folder.mkdir(parents=True, exist_ok=True)
     info = {}
-    for obj_id in tqdm(objects.ids, desc="models"):
+    for obj_id in tqdm(objects.written, desc="models"):
         mesh, path = objects.mesh(obj_id), folder / f"obj_{obj_id:06d}.ply"
         if not path.exists():
             mesh.save_ply(path)
@@ -171,10 +254,16 @@ def compose(objects: Packages, options: argparse.Namespace, index: int, attempt:
         named = shown
         if options.cad == "similar":
             named = objects.similar(shown, rng)
+        elif options.cad in ("print", "mirrored"):
+            named = shown + TWIN
         elif options.cad == "wrong":
             others = [k for k in ids if objects.group(k) != objects.group(shown)]
             named = int(rng.choice(others))
         annotated = {shown: (named, objects.mesh(named))}
+        if options.cut:
+            fraction = float(rng.uniform(*options.cut))
+            hull = scene.shapes[0].hull
+            scene = replace(scene, views=[cut(view, hull, size, fraction, rng) for view in scene.views])
     if options.frames > 1:
         points = np.concatenate([shape.hull for shape in scene.shapes if shape.obj_id is not None])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -258,7 +347,9 @@ _state: list[Any] = []
 def _start(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _state[:] = [(Furniture if options.kind == "furniture" else Packages)(options), options]
+    kinds = {"furniture": Furniture, "shapes": Shapes, "tied": Tied}
+    packages = Twins if options.cad == "print" else Packages
+    _state[:] = [kinds.get(options.kind, packages)(options), options]
 
 
 def _one(index: int) -> list[list[float]]:
@@ -275,11 +366,12 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--models", type=int, default=60, help="printed packages to choose from")
     parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
     parser.add_argument("--half", choices=("held-out", "train"), default="held-out", help="of the furniture")
-    parser.add_argument("--cad", choices=("exact", "similar", "wrong"), default="exact")
+    parser.add_argument("--cad", choices=CADS, default="exact")
     parser.add_argument("--pose", choices=("upright", "free", "mixed"), default="mixed")
     parser.add_argument("--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour")
     parser.add_argument("--objects", type=int, nargs=2, default=(8, 20), metavar=("LOW", "HIGH"), help="on a shelf")
     parser.add_argument("--occlusion", type=float, default=0.6, help="largest hidden fraction of a target")
+    parser.add_argument("--cut", type=float, nargs=2, metavar=("LOW", "HIGH"), help="fraction outside the photograph")
     parser.add_argument("--cameras", type=int, default=1, help="photographs of each scene, from different sides")
     parser.add_argument("--frames", type=int, default=1, help="photographs of each scene by one moving camera")
     parser.add_argument("--jobs", type=int, default=1)
@@ -295,7 +387,7 @@ def main() -> None:
     with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
         list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
     kept = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items() if k not in ("out", "jobs")}
-    groups = {obj_id: objects.group(obj_id) for obj_id in objects.ids}
+    groups = {obj_id: objects.group(obj_id % TWIN) for obj_id in objects.written}
     write_json(options.out / "benchmark.json", kept | {"groups": groups})
     print(f"{write_targets(options)} targets in {options.count} scenes in {options.out}")
 

@@ -1,19 +1,21 @@
-"""Fit the constants of confidence, rivals, covariance, detection, refinement and following on generated photographs.
+"""Fit the constants of confidence, covariance, detection, refinement and following on generated photographs.
 
-    python scripts/calibration/calibrate.py WORK --meshes FURNITURE [--count 400] [--models instance] [--write]
+    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--models instance] [--write]
 
-FURNITURE is the folder of scripts/benchmark/meshes.py. The script renders the sets that WORK lacks (make.py: the
-object's own mesh, a similar one, a wrong one, and sequences), registers, refines, follows and detects their objects
-into WORK/*.jsonl, of which finished rows are kept, and fits. Folds are by kind of object, so every measure is of kinds
-that the fit has not seen. --write stores the constants in curvireg_torch/registration/calibration.json and their
-quality in scripts/results/calibration.json.
+The script renders the sets that WORK lacks (make.py: the object's own mesh, also cut by the border, half hidden, grey,
+or with several poses that look alike; a similar one; a wrong one, or one with another print; and sequences), registers,
+refines, follows and detects their objects into WORK/*.jsonl, of which finished rows are kept, and fits. Everything
+depends on the seeds in SETS alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
+scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object, so every measure is
+of kinds that the fit has not seen. --write stores the constants in curvireg_torch/registration/calibration.json and
+their quality in scripts/results/calibration.json.
 """
 
 import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from itertools import groupby
 from multiprocessing import get_context
@@ -22,10 +24,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
-from scipy.special import logsumexp
+import trimesh
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import expit, logsumexp
 from scipy.stats import chi2
-from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 from tqdm import tqdm
@@ -36,7 +38,12 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
-from curvireg_torch.registration.confidence import RELIABLE, LogisticModel
+from curvireg_torch.registration.confidence import (
+    DOUBT_FEATURES,
+    EVIDENCE_FEATURES,
+    RELIABLE,
+    LogisticModel,
+)
 from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
 from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
@@ -44,15 +51,34 @@ from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 Row: TypeAlias = dict[str, Any]
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
-FURNITURE = ["--kind", "furniture", "--cad"]
-SETS: dict[str, tuple[float, list[str]]] = {
-    "exact": (1.0, [*FURNITURE, "exact", "--bare", "0.2"]),
-    "similar": (1.0, [*FURNITURE, "similar", "--bare", "0.2"]),
-    "wrong": (0.25, [*FURNITURE, "wrong"]),
-    "sequences": (0.1, [*FURNITURE, "exact", "--frames", "30"]),
-    "shelves": (0.2, ["--kind", "shelf", "--objects", "8", "20", "--seed", "7"]),
+FURNITURE = ("--kind", "furniture", "--bare", "0.2")
+SHAPES, PRINTED, TIED = ("--kind", "shapes"), ("--kind", "printed"), ("--kind", "tied")
+CUT = ("--cut", "0.1", "0.6")
+SETS: dict[str, tuple[float, tuple[str, ...]]] = {
+    "furniture": (1.0, (*FURNITURE, "--cad", "exact")),
+    "shapes": (1.0, (*SHAPES, "--seed", "101")),
+    "packages": (0.5, (*PRINTED, "--seed", "102")),
+    "shelves": (0.1, ("--kind", "shelf", "--objects", "6", "14", "--seed", "103")),
+    "tied": (0.6, (*TIED, "--seed", "104")),
+    "cut": (0.5, (*SHAPES, *CUT, "--seed", "105")),
+    "cut_packages": (0.25, (*PRINTED, *CUT, "--seed", "106")),
+    "print": (0.5, (*PRINTED, "--cad", "print", "--seed", "107")),
+    "mirrored": (0.2, (*TIED, "--cad", "mirrored", "--seed", "108")),
+    "wrong": (0.25, (*SHAPES, "--cad", "wrong", "--seed", "109")),
+    "furniture_similar": (1.0, (*FURNITURE, "--cad", "similar")),
+    "similar": (1.0, (*SHAPES, "--cad", "similar", "--bare", "0.2", "--seed", "110")),
+    "sequences": (0.1, (*SHAPES, "--frames", "30", "--seed", "111")),
 }
 """Of each set: scenes, as a fraction of --count, and options of make.py."""
+
+SCENES_PER_MESH = 2.0
+
+SHARES = {"tied": 0.1, "cut": 0.1, "cut_packages": 0.05, "print": 0.05, "mirrored": 0.02, "wrong": 0.08}
+"""Assumed shares of the photographs that users have; those of the other sets have the rest, each the same weight."""
+
+ABSENT = ("print", "mirrored", "wrong")  # sets whose photographs do not show the mesh: no pose is right
+UPRIGHT = ("furniture", "shapes", "furniture_similar", "similar", "sequences")  # sets of which half stand upright
+GREY = ("shapes", "packages", "shelves", "cut", "cut_packages")  # sets in which every third mesh loses its colours
 
 RIGHT = 30.0  # degrees within which a registration is right
 FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within which a refined or tracked pose is right
@@ -60,15 +86,14 @@ FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within 
 STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
 """Degrees and fraction of the distance by which the starts of refinements are off."""
 
-WRONG_FRACTION = 0.1  # weight of the wrong meshes in the fit, as if one photograph in ten came with a wrong mesh
-
 FOLDS = 5
+RESOLUTIONS = np.arange(0.0, 1.55, 0.1).round(2).tolist()  # that are tried
 MODELS = {
-    "instance": ("exact", "shelves", "wrong"),
-    "category": ("similar",),
-    "refinement": ("exact",),
+    "instance": ("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages", *ABSENT),
+    "category": ("furniture_similar", "similar"),
+    "refinement": ("shapes",),
     "tracking": ("sequences",),
-    "detection": ("exact",),
+    "detection": ("shapes",),
 }
 """Of each model: the sets that it is fitted on."""
 
@@ -76,20 +101,39 @@ KINDS = {"refinement": "refined", "tracking": "sequences", "detection": "detecte
 """Of each model that is not of registrations: what is measured."""
 
 
-def render_sets(work: Path, meshes: Path, count: int, jobs: int, models: Sequence[str]) -> None:
+def sets_of(models: Sequence[str], meshes: Path | None) -> list[str]:
+    """Sets of the models, without those of furniture where there is none."""
+    names = dict.fromkeys(name for model in models for name in MODELS[model])
+    return [name for name in names if meshes is not None or "furniture" not in SETS[name][1]]
+
+
+def render_sets(work: Path, meshes: Path | None, count: int, jobs: int, models: Sequence[str]) -> None:
     """Render the sets of ``models`` that ``work`` lacks; finished scenes are kept."""
-    for name in dict.fromkeys(name for model in models for name in MODELS[model]):
+    for name in sets_of(models, meshes):
         fraction, options = SETS[name]
-        words = ["--out", work / name, "--count", round(fraction * count), "--jobs", jobs, *options]
+        scenes = max(1, round(fraction * count))
+        words: list[Any] = ["--out", work / name, "--count", scenes, "--jobs", jobs, *options]
         words += ["--meshes", meshes] if "furniture" in options else []
+        words += ["--models", max(16, round(scenes / SCENES_PER_MESH))]
         command = [sys.executable, REPOSITORY / "scripts" / "benchmark" / "make.py", *words]
         subprocess.run([str(word) for word in command], check=True)
 
 
-def errors_of(R: Tensor, sample: Row) -> Tensor:
-    """(N,) degrees between rotations (N, 3, 3) and the truth, up to the object's symmetries."""
+def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
+    """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those that an exact mesh
+    without colours has for the registrar."""
     listed = sample["model_info"].get("symmetries_discrete", [])
-    S = torch.stack([torch.eye(4), *(torch.tensor(values).view(4, 4) for values in listed)])[:, :3, :3].double()
+    known = [
+        torch.eye(3).double()[None],
+        *(torch.tensor(values).view(1, 4, 4)[:, :3, :3].double() for values in listed),
+    ]
+    found = None if registrar is None else registrar.symmetries_of(exact=True)
+    return torch.cat(known if found is None else [*known, found[:, :3, :3].double()])
+
+
+def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
+    """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
+    S = symmetries_of(sample) if S is None else S
     return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(dim=1)
 
 
@@ -118,7 +162,8 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]).double()
     weights = torch.tensor(RANK_ALONE if K is None else SCORE_WEIGHTS, dtype=torch.float64)
     row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
-    row |= {"errors": errors_of(R, sample).tolist()}
+    S = symmetries_of(sample, None if K is None else registrar)
+    row |= {"errors": errors_of(R, sample, S).tolist(), "evidence": evidence.tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
@@ -180,7 +225,10 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     data = BOPDataset(folder)
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
-    registrar = cr.Registrar(cr.load_mesh(samples[0]["model_path"], unit="mm"), pipeline=pipeline)
+    mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
+    if kind in GREY and samples[0]["obj_id"] % 3 == 0:
+        mesh.visual = trimesh.visual.ColorVisuals()
+    registrar = cr.Registrar(mesh, pipeline=pipeline)
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
     else:
@@ -188,15 +236,16 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
             "refined": lambda s: refined(registrar, s, other),
             "detected": lambda s: detected(registrar, s, other),
         }
-        method = methods.get(kind, lambda s: registered(registrar, s, with_camera=kind != "similar"))
+        method = methods.get(kind, lambda s: registered(registrar, s, with_camera="similar" not in kind))
         found = [(s, row) for s in samples for row in method(s)]
     groups = json.loads((folder / "benchmark.json").read_text())["groups"]
-    return [{"scene": s["scene_id"], "group": groups[str(s["obj_id"])], **row} for s, row in found]
+    more = {"set": kind, "object": samples[0]["obj_id"]}
+    return [{"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row} for s, row in found]
 
 
 def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
-    """Rows of a set, or of refinements and detections in the set "exact"; finished meshes are read from the file."""
-    folder, out = work / (kind if kind in SETS else "exact"), work / f"{kind}.jsonl"
+    """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read from the file."""
+    folder, out = work / (kind if kind in SETS else "shapes"), work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
@@ -204,7 +253,8 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     known = {tuple(row["task"]) for row in done}
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
-        return entry[1], entry[0] % 2 or kind == "shelves"  # of furniture, make.py alternates upright and any pose
+        upright = kind in UPRIGHT and entry[0] % 2 == 0  # of these, make.py alternates upright and any pose
+        return entry[1], int(not upright)
 
     tasks = []
     for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
@@ -232,88 +282,137 @@ def folds_of(rows: Sequence[Row]) -> np.ndarray:
     return np.array([fold[row["group"]] for row in rows])
 
 
-def fit_logistic(rows: Sequence[Row], weight: np.ndarray | None = None) -> tuple[Row, Row]:
-    """Weights and bias of the probability that a row is ``right``, and their quality on held-out folds.
+def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, float]) -> Row:
+    """Weights and bias of the probability that a row is ``right``.
 
-    The standardised weights have a unit Gaussian prior.
+    The standardised weights have a unit Gaussian prior, and the sign in ``signs``, if there is one.
     """
     names = list(rows[0]["features"])
     X = np.array([[row["features"][n] or 0.0 for n in names] for row in rows])
-    y, fold = np.array([row["right"] for row in rows]), folds_of(rows)
-    weight = np.ones(len(y)) if weight is None else weight
+    y = np.array([row["right"] for row in rows])
+    mean, spread = X.mean(axis=0), X.std(axis=0)
+    spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
+    Z = (X - mean) / spread
 
-    def fit(train: np.ndarray) -> tuple[np.ndarray, float]:
-        mean, spread = X[train].mean(axis=0), X[train].std(axis=0)
-        spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
-        model = LogisticRegression(max_iter=2000).fit((X[train] - mean) / spread, y[train], sample_weight=weight[train])
-        w = model.coef_[0] / spread
-        return w, float(model.intercept_[0] - w @ mean)
+    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
+        logit = Z @ p[:-1] + p[-1]
+        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + 0.5 * float(p[:-1] @ p[:-1])
+        slope = weight * (expit(logit) - y)
+        return value, np.append(Z.T @ slope + p[:-1], slope.sum())
 
-    p = np.zeros(len(y))
-    for k in range(FOLDS):
-        if len(set(y[fold != k])) == 2:
-            w, bias = fit(fold != k)
-            p[fold == k] = 1.0 / (1.0 + np.exp(-(X[fold == k] @ w + bias)))
-    w, bias = fit(np.full(len(y), True))
-    quality = {"n": len(y), "right": float(y.mean()), "said": float(np.average(p, weights=weight))}
-    quality |= {"auc": float(roc_auc_score(y, p)), "reliable": float((p >= 0.9).mean())}
-    quality["right if reliable"] = float(y[p >= 0.9].mean()) if (p >= 0.9).any() else None
-    return {"weights": dict(zip(names, w.round(4).tolist(), strict=True)), "bias": round(bias, 4), "n": len(y)}, quality
+    ranges = {1.0: (0.0, None), -1.0: (None, 0.0)}
+    bounds = [*(ranges.get(signs.get(name, 0.0), (None, None)) for name in names), (None, None)]
+    found = minimize(loss, np.zeros(len(names) + 1), jac=True, bounds=bounds, method="L-BFGS-B").x
+    w = found[:-1] / spread
+    bias = float(found[-1] - w @ mean)
+    return {"weights": dict(zip(names, w.round(4).tolist(), strict=True)), "bias": round(bias, 4), "n": len(y)}
 
 
-def fit_rivals(rows: Sequence[Row]) -> Row:
-    """Slope of the rivals' scores and level of "none of them", where the first hypothesis is wrong."""
+def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
+    """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some pose is right and some
+    are not; without ``ties`` the resolution is 0."""
     cases = []
-    for row in rows:
+    for row, w in zip(rows, weight, strict=True):
         right = np.array(row["errors"]) < RIGHT
-        if not right[0] and len(right) > 1:
-            scores = np.array(row["scores"])[1:]
-            cases.append((np.append(scores - scores.max(), 0.0), np.append(right[1:], not right.any())))
+        if row["right"] and not right.all():
+            scores = np.array(row["scores"])
+            cases.append((scores.max() - scores, right, w))
 
-    def loss(p: np.ndarray) -> float:
-        logits = [np.exp(p[0]) * s + p[1] * (np.arange(len(s)) == len(s) - 1) for s, _ in cases]
-        likelihood = (logsumexp(x) - logsumexp(x[right]) for x, (_, right) in zip(logits, cases, strict=True))
-        return 0.05 * float((p**2).sum()) + sum(map(float, likelihood))
+    def loss(slope: float, resolution: float) -> float:
+        total = 0.05 * slope**2
+        for behind, right, w in cases:
+            logits = -slope * np.maximum(0.0, behind - resolution)
+            total += w * (logsumexp(logits) - logsumexp(logits[right]))
+        return float(total)
 
-    found = minimize(loss, np.zeros(2), method="L-BFGS-B").x
-    return {"slope": round(float(np.exp(found[0])), 4), "none": round(float(found[1]), 4)}
+    found = []
+    for resolution in RESOLUTIONS if ties else (0.0,):
+        best = minimize_scalar(loss, args=(resolution,), bounds=(0.01, 10.0), method="bounded")
+        found.append((best.fun, round(float(best.x), 4), resolution))
+    _, slope, resolution = min(found)
+    return {"slope": slope, "resolution": resolution}
 
 
-def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str]) -> tuple[Row, Row]:
+def first_probability(row: Row, constants: Row) -> float:
+    """Confidence of a row."""
+    any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
+    scores = np.array(row["scores"])
+    logits = -constants["slope"] * np.maximum(0.0, scores.max() - scores - constants["resolution"])
+    return float(any_right * np.exp(logits[0] - logsumexp(logits)))
+
+
+def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
+    """How well probabilities (n,) tell the right answers (n,) bool."""
+    sure = p >= RELIABLE
+    quality: Row = {"n": len(p), "right": float(np.average(right, weights=weight))}
+    quality |= {"said": float(np.average(p, weights=weight)), "reliable": float(np.average(sure, weights=weight))}
+    quality["auc"] = float(roc_auc_score(right, p, sample_weight=weight)) if len(set(right.tolist())) == 2 else None
+    quality["right if reliable"] = float(np.average(right[sure], weights=weight[sure])) if sure.any() else None
+    quality["reliable and wrong"] = int((sure & ~right).sum())
+    return quality
+
+
+def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
+    """Constants of a model of registrations, and their quality on held-out folds, in all and by set."""
+    for row in rows:
+        present = row["set"] not in ABSENT
+        row["right"] = present and min(row["errors"]) < RIGHT
+        row["first"] = present and row["errors"][0] < RIGHT
+    sets = np.array([row["set"] for row in rows])
+    ordinary = float(sum(name not in SHARES for name in sets))
+    factor = ordinary / (1.0 - sum(SHARES[name] for name in set(sets) if name in SHARES))
+    weight = np.array([factor * SHARES[name] / (sets == name).sum() if name in SHARES else 1.0 for name in sets])
+    signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
+
+    def fit(train: np.ndarray) -> Row:
+        some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
+        return fit_logistic(some, weight[train], signs) | fit_shares(some, weight[train], ties=exact)
+
+    fold, p = folds_of(rows), np.zeros(len(rows))
+    for k in range(FOLDS):
+        constants = fit(fold != k)
+        p[fold == k] = [first_probability(row, constants) for row, own in zip(rows, fold == k, strict=True) if own]
+    first = np.array([row["first"] for row in rows])
+    quality = quality_of(p, first, weight)
+    by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
+    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items()}
+    return fit(np.full(len(rows), True)), quality
+
+
+def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str], meshes: Path | None) -> tuple[Row, Row]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out kinds of objects."""
     constants: Row = json.loads(CONSTANTS.read_text())
     quality: Row = {}
     for name in models:
         if name in KINDS:
-            constants[name], quality[name] = fit_logistic(rows_of(work, KINDS[name], jobs, limit))
+            rows = rows_of(work, KINDS[name], jobs, limit)
+            constants[name] = fit_logistic(rows, np.ones(len(rows)), {})
             continue
-        rows = [row | {"set": s} for s in MODELS[name] for row in rows_of(work, s, jobs, limit)]
-        rows = [row | {"right": row["set"] != "wrong" and row["errors"][0] < RIGHT} for row in rows]
-        wrong = np.array([row["set"] == "wrong" for row in rows])
-        weight = np.where(wrong, WRONG_FRACTION / (1 - WRONG_FRACTION) * (~wrong).sum() / max(1, wrong.sum()), 1.0)
-        fitted, quality[name] = fit_logistic(rows, weight)
-        constants[name] = fitted | fit_rivals([row for row in rows if row["set"] != "wrong"])
-        model = LogisticModel(fitted["weights"], fitted["bias"])
-        right = [row for row in rows if row["right"] and "distance2" in row]
-        distances = [row["distance2"] for row in right if model(row["features"]) >= RELIABLE]
+        rows = [row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs, limit)]
+        constants[name], quality[name] = fit_registrations(rows, exact=name == "instance")
+        right = [row for row in rows if row["first"] and "distance2" in row]
+        distances = [row["distance2"] for row in right if first_probability(row, constants[name]) >= RELIABLE]
         if distances:
             scale = constants["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
-            constants["covariance_scale"] = round(scale, 3)
+            quality[name]["covariance_scale"] = round(scale, 3)
     return constants, quality
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--meshes", type=Path, required=True, help="folder of scripts/benchmark/meshes.py")
+    parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
     parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--render", action="store_true", help="render the sets only")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     render_sets(options.work, options.meshes, options.count, options.jobs, options.models)
-    constants, quality = calibrate(options.work, options.jobs, options.limit, options.models)
+    if options.render:
+        return
+    constants, quality = calibrate(options.work, options.jobs, options.limit, options.models, options.meshes)
     record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
     if options.write:

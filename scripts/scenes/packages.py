@@ -70,8 +70,11 @@ def carton(rng: Rng) -> tuple[np.ndarray, ...]:
     return corners.reshape(-1, 3), np.arange(36).reshape(-1, 3), uv.reshape(-1, 2)
 
 
-def package(rng: Rng) -> TexturedMesh:
-    """A printed package, 8 to 25 cm high, in metres."""
+def package(rng: Rng, print_rng: Rng | None = None) -> TexturedMesh:
+    """A printed package, 8 to 25 cm high, in metres; with another print if ``print_rng`` is given."""
     vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)
-    picture = (label(rng).astype(np.float32) / 255) ** 2.2
-    return TexturedMesh.from_arrays(vertices * rng.uniform(0.08, 0.25), faces, [Texture(picture, 0.3)], uv=uv)
+    picture = label(rng)
+    height = rng.uniform(0.08, 0.25)
+    picture = picture if print_rng is None else label(print_rng)
+    linear = (picture.astype(np.float32) / 255) ** 2.2
+    return TexturedMesh.from_arrays(vertices * height, faces, [Texture(linear, 0.3)], uv=uv)

@@ -13,6 +13,7 @@ import torch
 
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
 from curvireg_torch.geometry.cameras import rotation_towards
+from curvireg_torch.registration.framing import outside_fraction
 from scripts.scenes.light import Light, random_light
 from scripts.scenes.materials import random_picture, random_rotation
 from scripts.scenes.surfaces import Array, Rng
@@ -130,6 +131,37 @@ def look_at(points: Array, size: tuple[int, int], rng: Rng, *, fill: float, azim
         distance *= np.ptp(flat, axis=0).max() / fill if placed[:, 2].min() > 0.05 else 1.5
         distance = max(distance, nearest)
     return R, distance * ray - R @ middle, K
+
+
+def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: Rng) -> View:
+    """The view, turned so that about ``fraction`` of the outline of points (P, 3) lies outside the picture, at one side
+    or at two."""
+    R, t, K = view
+    H, W = size
+    seen = (points @ R.T + t) @ K.T
+    pixels = seen[:, :2] / seen[:, 2:]
+    middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
+    reach = np.ptp(pixels, axis=0)
+    side = rng.choice([-1.0, 0.0, 1.0], 2)
+    side = side if side.any() else np.array([rng.choice([-1.0, 1.0]), 0.0])
+    border = np.where(side > 0, [W - 0.5, H - 0.5], -0.5)
+    hull = torch.from_numpy(points)
+    low, high = -0.6, 0.6
+    for _ in range(20):
+        part = 0.5 * (low + high)
+        target = np.where(side == 0, middle, border + side * part * reach)
+        turn = _turn_to(np.linalg.inv(K) @ (*middle, 1.0), np.linalg.inv(K) @ (*target, 1.0))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = torch.from_numpy(turn @ R), torch.from_numpy(turn @ t)
+        too_little = outside_fraction(hull, pose, torch.from_numpy(K), size) < fraction
+        low, high = (part, high) if too_little else (low, part)
+    return turn @ R, turn @ t, K
+
+
+def _turn_to(ray: Array, target: Array) -> Array:
+    """(3, 3) rotation from one ray to another."""
+    first, second = (rotation_towards(torch.from_numpy(one)).numpy() for one in (ray, target))
+    return np.asarray(second @ first.T)
 
 
 def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:

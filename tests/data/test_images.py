@@ -179,3 +179,30 @@ def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_pat
         path.write_bytes(plain)
         with_exif(path, block)
         assert read_photo(path).orientation == 1
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_few_bits_in_sixteen_are_stretched(tmp_path, bits, channels):
+    shape = (6, 8, 3)[: 2 if channels == 1 else 3]
+    pixels = np.random.default_rng(bits).integers(0, 2**bits, shape).astype(np.uint16)
+    pixels[0, 0] = 2**bits - 1
+    cv2.imwrite(str(tmp_path / "camera.png"), pixels)
+    photo = read_photo(tmp_path / "camera.png")
+    expected = np.round(pixels[..., ::-1] * 255.0 / (2**bits - 1)) if channels == 3 else pixels * 255.0 / (2**bits - 1)
+    shown = photo.image.movedim(0, -1).numpy().astype(float)
+    assert np.abs(shown - (expected if channels == 3 else expected[..., None])).max() <= 0.5 + 1e-9
+    assert f"16 bits, of which the lower {bits} are used: stretched" in photo.notes
+
+
+def test_sixteen_bits_that_are_used_are_not_stretched(tmp_path):
+    pixels = np.full((4, 4), 2**14, np.uint16)
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    photo = read_photo(tmp_path / "a.png")
+    assert int(photo.image.max()) == 64
+    assert photo.notes == ("grey: three equal channels",)
+    cv2.imwrite(str(tmp_path / "black.png"), 0 * pixels)
+    assert read_photo(tmp_path / "black.png").notes == ("grey: three equal channels",)
+    cv2.imwrite(str(tmp_path / "colour.tif"), np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16))
+    (note,) = read_photo(tmp_path / "colour.tif").notes
+    assert note == "16 bits, of which the lower ones are used: 16 levels remain; save it as PNG"

@@ -12,6 +12,7 @@ from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import confidence
 from curvireg_torch.registration.contour_fit import contour_support
 from curvireg_torch.registration.edges import EdgeCrops
+from curvireg_torch.registration.poses import RANK_ALONE, SCORE_WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar
 
@@ -37,28 +38,48 @@ def test_concentration_in_closed_form():
     assert confidence.concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
 
 
-def test_logistic_model_and_probabilities_of_hypotheses_in_closed_form():
+def test_logistic_model_in_closed_form():
     model = confidence.LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
     assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
     assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
     assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, "bounded without a rival"
     assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (1.0, 0.0)
-    constants = confidence.CALIBRATION["instance"]
-    found = confidence.hypothesis_probabilities(0.6, torch.tensor([3.0, 1.0, 0.0]), exact=True)
-    weights = [1.0, math.exp(-constants["slope"]), math.exp(constants["none"])]
-    assert found == pytest.approx((0.6, *(0.4 * w / sum(weights) for w in weights[:2])))
-    assert confidence.hypothesis_probabilities(0.6, torch.tensor([3.0]), exact=True) == (0.6,)
+
+
+def test_shares_are_equal_within_the_resolution_and_fall_with_the_slope_beyond(monkeypatch):
+    monkeypatch.setitem(confidence.CALIBRATION, "instance", {"slope": 2.0, "resolution": 0.5})
+    for scores, weights in (
+        ([3.0, 3.0], [1.0, 1.0]),
+        ([3.0, 2.6], [1.0, 1.0]),
+        ([2.6, 3.0], [1.0, 1.0]),
+        ([3.0, 1.5, -1.0], [1.0, math.exp(-2.0), math.exp(-7.0)]),
+        ([3.0], [1.0]),
+    ):
+        found = confidence.shares(torch.tensor(scores), exact=True)
+        assert found.tolist() == pytest.approx([w / sum(weights) for w in weights])
+    found = confidence.hypothesis_probabilities(0.8, torch.tensor([3.0, 2.0]), exact=True)
+    assert found == pytest.approx((0.8 / (1 + math.exp(-1.0)), 0.8 - 0.8 / (1 + math.exp(-1.0))))
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_every_feature_raises_the_confidence(exact):
+def test_two_equal_poses_have_one_half_each_at_most(exact):
+    first, second = confidence.hypothesis_probabilities(1.0, torch.tensor([4.2, 4.2]), exact=exact)
+    assert first == second == 0.5
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     model = confidence.CALIBRATION["instance" if exact else "category"]
-    assert tuple(model["weights"]) == confidence.CONFIDENCE_FEATURES
+    assert set(model["weights"]) == set(confidence.CONFIDENCE_FEATURES)
+    assert all(model["weights"][name] >= 0.0 for name in confidence.EVIDENCE_FEATURES)
+    assert all(model["weights"][name] <= 0.0 for name in confidence.DOUBT_FEATURES)
     tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3, "landmarks": 1.0}
-    for name in confidence.CONFIDENCE_FEATURES[: 5 if exact else 4]:  # similar meshes have no landmarks
-        better = {**tied, name: tied[name] + 0.1}
-        more, less = (confidence.registration_confidence(features, exact=exact) for features in (better, tied))
-        assert more > less
+    tied |= {"undetermined": 0.5, "outside": 0.1, "border": 1.0}
+    decisive = ("similarity", "edge_support", "undetermined") if exact else ("similarity",)
+    for name in decisive:
+        more = confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact)
+        less = confidence.probability_of_any(tied, exact=exact)
+        assert more > less if name in confidence.EVIDENCE_FEATURES else more < less
 
 
 def test_confidence_features():
@@ -66,13 +87,25 @@ def test_confidence_features():
         [[0.0, 0.7, 0.4, 1.0, 2.0], [-1.0, 0.6, 0.5, 0.4, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0]], dtype=torch.float64
     )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
-    expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0}
-    assert confidence.confidence_features(evidence, scores, 0.3) == pytest.approx(expected)
+    doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0}
+    expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0, **doubts}
+    assert confidence.confidence_features(evidence, scores, 0.3, **doubts) == pytest.approx(expected)
     for factor in (10.0, -10.0):
-        margin = confidence.confidence_features(evidence, factor * scores, 0.3)["margin"]
+        margin = confidence.confidence_features(evidence, factor * scores, 0.3, **doubts)["margin"]
         assert margin == math.copysign(confidence.MAX_MARGIN, factor)
-    alone = confidence.confidence_features(evidence[:1], scores[:1], None)
+    alone = confidence.confidence_features(evidence[:1], scores[:1], None, **doubts)
     assert alone["margin"] is alone["concentration"] is None
+
+
+def test_undetermined_axes():
+    variances = torch.tensor([0.04, 0.25, 9.0, 1.0, 1.0, 1.0], dtype=torch.float64)
+    covariance = torch.diag(variances)
+    assert confidence.undetermined_axes(covariance) == pytest.approx(0.2 + 0.5 + 1.0)
+    assert confidence.undetermined_axes(torch.full_like(covariance, torch.nan)) == 3.0
+    few, many = torch.eye(4).repeat(35, 1, 1), torch.eye(4).repeat(36, 1, 1)
+    assert confidence.undetermined_axes(covariance, few) == pytest.approx(1.7)
+    assert confidence.undetermined_axes(covariance, many) == pytest.approx(0.7), "one axis need not be known"
+    assert confidence.undetermined_axes(0.01 * covariance, many) == 0.0
 
 
 def test_only_the_default_pipeline_is_calibrated():
@@ -102,8 +135,12 @@ def test_uncalibrated_pipeline_gives_no_number():
 def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
     result = learned_registrar()([image], box[None], camera)[0]
-    expected = confidence.registration_confidence(result.confidence_features, exact=camera is not None)
-    assert (result.confidence, result.confidence_features["similarity"]) == (pytest.approx(expected), result.score)
+    any_right = confidence.probability_of_any(result.confidence_features, exact=camera is not None)
+    weights = SCORE_WEIGHTS if camera is not None else RANK_ALONE
+    scores = [sum(w * v for w, v in zip(weights, h.evidence.values(), strict=True)) for h in result.hypotheses]
+    expected = confidence.hypothesis_probabilities(any_right, torch.tensor(scores), exact=camera is not None)
+    assert result.probabilities == pytest.approx(expected, abs=1e-5)
+    assert result.confidence_features["similarity"] == result.score
     assert result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
     assert len(result.probabilities) == len(result.hypotheses)
     assert sum(result.probabilities) + result.none == pytest.approx(1.0)

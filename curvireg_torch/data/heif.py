@@ -1,0 +1,69 @@
+"""HEIC and AVIF, the photographs of telephones, by optional decoders that are loaded when one is read."""
+
+import re
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+from ..errors import MAX_IMAGE_BYTES, ImageError, MissingDependencyError
+from ..utils.pictures import check_pixels, damaged_picture, open_picture
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+_START = re.compile(rb".{4}ftyp", re.DOTALL)
+_HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
+_AVIF = {b"avif", b"avis"}
+_MAX_BRANDS_BYTES = 400  # of the box that names a file's kinds
+_INSTALL = "pip install 'curvireg_torch[heic]' (in a checkout: pip install -e '.[heic]'), or save it as JPEG"
+
+
+def heif_kind(data: bytes) -> str | None:
+    """ "HEIC" or "AVIF" by the brands that a file's first box names; None of any other file."""
+    if not _START.match(data):
+        return None
+    size = min(int.from_bytes(data[:4], "big"), _MAX_BRANDS_BYTES)
+    places = [8, *range(16, size - 3, 4)]  # the main brand, its version, and the compatible ones
+    brands = {data[place : place + 4] for place in places}
+    if brands & _AVIF:
+        return "AVIF"
+    return "HEIC" if brands & _HEIC else None
+
+
+def open_photograph(data: bytes) -> "Image":
+    """:func:`.open_picture`, and HEIC and AVIF too; pixels are not decoded yet. Pictures of HEIC are turned as its
+    properties say: their EXIF orientation is 1.
+
+    Raises:
+        MissingDependencyError: the decoder is not installed.
+        ImageError: as by :func:`.open_picture`.
+    """
+    kind = heif_kind(data)
+    if kind is None:
+        return open_picture(data)
+    if len(data) > MAX_IMAGE_BYTES:
+        raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller")
+    try:
+        image = _heic(data) if kind == "HEIC" else _avif(data)
+    except MissingDependencyError:
+        raise
+    except Exception as error:  # decoders raise errors of any kind for damaged files
+        raise damaged_picture(error) from error
+    check_pixels(image)
+    return image
+
+
+def _heic(data: bytes) -> "Image":
+    try:
+        from pi_heif import HeifImageFile
+    except ImportError as error:
+        raise MissingDependencyError(f"HEIC needs pi-heif: {_INSTALL}") from error
+    image: Image = HeifImageFile(BytesIO(data))
+    return image
+
+
+def _avif(data: bytes) -> "Image":
+    from PIL import Image, features
+
+    if "avif" not in features.modules or not features.check("avif"):
+        raise MissingDependencyError("AVIF needs Pillow 11.3: pip install 'pillow>=11.3', or save it as JPEG")
+    return Image.open(BytesIO(data), formats=["AVIF"])

@@ -1,0 +1,114 @@
+"""Masks of objects: white on black, by a label, by transparency."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import ImageError, InvalidInputError, MissingFileError
+from .images import as_in_file, decoded, oriented
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+MAX_LABEL = 127  # of a picture of 8 bits that counts as one of labels: brighter ones are white
+MAX_LISTED = 12  # labels that a message names
+
+
+def mask_file(mask: str | os.PathLike[str]) -> tuple[Path, int | None]:
+    """The file and the label of ``FILE`` or ``FILE:LABEL``.
+
+    Example:
+        >>> mask_file("labels.png:2")
+        (PosixPath('labels.png'), 2)
+    """
+    front, colon, label = str(mask).rpartition(":")
+    if colon and label.isdecimal() and not os.path.isfile(mask):
+        return Path(front), int(label)
+    return Path(mask), None
+
+
+def read_mask(mask: str | os.PathLike[str]) -> NDArray[np.float32]:
+    """(H, W) in [0, 1], 1 = object, of a picture in which the object is white, or one of several labels.
+
+    Args:
+        mask: ``FILE``, or ``FILE:LABEL`` for the pixels of that value: of the palette's index, of grey of 8 or 16
+            bits. Without a label: an alpha channel that varies is the mask; else the brightest channel; pixels of a
+            single dark value beside 0 are the object.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        ImageError: it cannot be read.
+        InvalidInputError: no pixel has the label, or several labels are there and none is chosen.
+
+    Example:
+        >>> import tempfile
+        >>> from PIL import Image
+        >>> file = Path(tempfile.mkdtemp(), "labels.png")
+        >>> Image.fromarray(np.array([[0, 2], [5, 0]], np.uint8)).save(file)
+        >>> read_mask(f"{file}:2").tolist()
+        [[0.0, 1.0], [0.0, 0.0]]
+    """
+    file, label = mask_file(mask)
+    if not file.is_file():
+        raise MissingFileError("no such file; check the path of the mask", subject=mask)
+    (values, largest), orientation = decoded(file, _values)
+    values = oriented(values, orientation)[..., 0]
+    if label is not None:
+        return _labelled(values, label, file)
+    try:
+        return mask_of_values(values, largest)
+    except InvalidInputError as error:
+        raise error.with_subject(mask) from error
+
+
+def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:
+    """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of its only label."""
+    if values.size == 0 or int(values.max()) > largest * MAX_LABEL / 255:
+        return np.asarray(values / largest, dtype=np.float32)
+    labels = np.unique(values)
+    labels = labels[labels != 0]
+    if len(labels) == 1:
+        return np.asarray(values == labels[0], dtype=np.float32)
+    if len(labels) > 1:
+        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (", ..." if len(labels) > MAX_LISTED else "")
+        raise InvalidInputError(
+            f"mask: no white pixel, but labels {listed}; choose one as FILE:LABEL, or mask == LABEL"
+        )
+    return np.zeros(values.shape, np.float32)
+
+
+def _labelled(values: NDArray[Any], label: int, file: Path) -> NDArray[np.float32]:
+    chosen = np.equal(values, label)
+    if not chosen.any():
+        labels = np.unique(values)
+        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (", ..." if len(labels) > MAX_LISTED else "")
+        raise InvalidInputError(f"mask: no pixel has the label {label}; it has {listed}", subject=file)
+    return np.asarray(chosen, dtype=np.float32)
+
+
+def _values(image: "Image", orientation: int, _: bytes) -> tuple[NDArray[Any], int]:
+    """(H, W, 1) values of an open picture, as they are stored, and the value of white."""
+    values, largest = _grey(image)
+    return as_in_file(values[..., None], image, orientation), largest
+
+
+def _grey(image: "Image") -> tuple[NDArray[Any], int]:
+    if image.mode == "P":
+        indices = np.asarray(image)
+        colours = np.asarray(image.convert("RGB")).max(axis=2)
+        is_black_and_white = bool(np.isin(colours, (0, 255)).all()) and len(np.unique(indices)) <= 2
+        return (colours if is_black_and_white else indices), 255
+    if image.has_transparency_data:
+        alpha = np.asarray(image.convert("RGBA"))[..., 3]
+        if alpha.min() != alpha.max():
+            return alpha, 255
+    if image.mode == "1":
+        return np.asarray(image).astype(np.uint8), 1
+    if image.mode == "I" or image.mode.startswith("I;16"):
+        return np.asarray(image).astype(np.int64), 65535
+    if image.mode == "F":
+        raise ImageError("mask: expected whole numbers, got floating values; save it as PNG")
+    return np.asarray(image.convert("RGB")).max(axis=2), 255

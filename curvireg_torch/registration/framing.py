@@ -1,0 +1,72 @@
+"""How far a photograph shows an object: what lies outside it, and boxes that its border cuts."""
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..geometry.cameras import project_points
+
+BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
+MUCH_OUTSIDE = 0.1  # Fraction of the object outside the photograph from which a result carries a warning
+
+
+def photograph_box(size: tuple[int, int]) -> Tensor:
+    """(4,) float64 box of a photograph of ``size`` (H, W)."""
+    height, width = size
+    return torch.tensor([-0.5, -0.5, width - 0.5, height - 0.5], dtype=torch.float64)
+
+
+def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
+    """The part of a box (4,) inside a photograph of ``size`` (H, W), which it overlaps."""
+    limits = photograph_box(size).to(box)
+    low = torch.maximum(box[:2], limits[:2])
+    high = torch.minimum(box[2:], limits[2:])
+    return torch.cat([low, high])
+
+
+def border_sides(box: Tensor, size: tuple[int, int]) -> int:
+    """Number of sides of a box (4,) that lie on the border of a photograph of ``size`` (H, W), or beyond it.
+
+    Example:
+        >>> border_sides(torch.tensor([0.0, 10.0, 50.0, 60.0]), (480, 640))
+        1
+    """
+    limits = photograph_box(size).to(box)
+    low = box[:2] <= limits[:2] + BORDER
+    high = box[2:] >= limits[2:] - BORDER
+    return int(low.sum() + high.sum())
+
+
+def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> float:
+    """Fraction of the outline's area that lies outside a photograph of ``size`` (H, W), in [0, 1].
+
+    Args:
+        hull: (V, 3) corners of the mesh's convex hull.
+        T: (4, 4) pose of the mesh.
+        K: (3, 3) camera matrix in px of the photograph.
+
+    Returns:
+        The fraction of the projected hull's area; 1 for a mesh that reaches behind the camera.
+    """
+    depth = hull.to(T) @ T[2, :3] + T[2, 3]
+    if float(depth.min()) <= 0.0:
+        return 1.0
+    pixels = project_points(hull.to(T), T[None], K[None])[0].numpy()
+    x0, y0, x1, y1 = photograph_box(size).tolist()
+    # In units of the photograph's longer side: OpenCV computes in single precision.
+    scale = 1.0 / max(size)
+    outline = cv2.convexHull((scale * pixels).astype(np.float32))
+    frame = scale * np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    whole = cv2.contourArea(outline)
+    if whole <= 0.0:
+        return 0.0
+    inside, _ = cv2.intersectConvexConvex(outline, frame.astype(np.float32))
+    return min(max(1.0 - float(inside) / whole, 0.0), 1.0)
+
+
+def outside_warnings(fraction: float) -> tuple[str, ...]:
+    """What is questionable about a photograph that does not show a ``fraction`` of the object."""
+    if fraction < MUCH_OUTSIDE:
+        return ()
+    return (f"{100 * fraction:.0f} % of the object lies outside the photograph; take one that shows all of it",)

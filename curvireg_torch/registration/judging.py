@@ -1,0 +1,151 @@
+"""Judgement of the fitted poses of one photograph: their order, their probabilities, and what is questionable."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+import trimesh
+from torch import Tensor
+
+from ..matching import Ranking
+from ..mesh import has_colours, mesh_radius
+from ..terms import QueryFeatures
+from .confidence import (
+    are_near,
+    concentration,
+    confidence_features,
+    hypothesis_probabilities,
+    is_calibrated,
+    probability_of_any,
+    undetermined_axes,
+)
+from .edges import EdgeCrops
+from .framing import border_sides, outside_fraction, outside_warnings
+from .inputs import ImageItem
+from .landmarks import LandmarkMatches
+from .poses import SCORE_WEIGHTS, Poses, hypothesis_of, named_features, pose_scores
+from .priors import Limits
+from .result import FailedRegistration, Registration
+
+if TYPE_CHECKING:
+    from .registrar import Registrar
+
+OUTSIDE_MARGIN = 1.0
+"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
+
+FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
+
+
+@dataclass(frozen=True)
+class Work:
+    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
+    fits, and ``landmarks`` in the box, if there are any."""
+
+    item: ImageItem
+    query: QueryFeatures
+    ranking: Ranking
+    descriptor: Tensor
+    limits: Limits | None
+    exact: bool
+    symmetries: Tensor | None
+    crops: EdgeCrops | None
+    landmarks: LandmarkMatches | None
+
+
+def judged(
+    registrar: "Registrar", work: Work, poses: Poses, features: Tensor, distinct: Tensor, outside: Tensor
+) -> Registration:
+    """Hypotheses, best first, those that merged last, and their probabilities.
+
+    Args:
+        registrar: of the mesh.
+        work: the photograph.
+        poses: H of them.
+        features: (H, F) :data:`.POSE_FEATURES`.
+        distinct: (H,) bool, False of poses that merged with a better one and returned to their views.
+        outside: (H,) bool, those that lie outside the limits and are not reported.
+    """
+    scores = pose_scores(features, exact=work.exact)
+    order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
+    own = order[~outside[order]]
+    best = own[:1]
+    reported = own[: registrar.pipeline.hypotheses].tolist()
+    fraction = _outside_fraction(registrar, work, poses[best])
+    # Poses that merged have no probability of their own.
+    rivals = own[distinct[own]]
+    near = are_near(registrar.bank.rotations, poses.rotation[best[0]], work.symmetries)
+    measured = confidence_features(
+        features[rivals],
+        scores[rivals],
+        concentration(work.ranking.scores[0], near),
+        undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
+        outside=fraction,
+        border=border_sides(work.item.box, work.item.size),
+    )
+    gain = _gain_outside(features, best, order[outside[order]])
+    if gain is not None and len(rivals) == 1:  # limits that leave no rival do not make a pose uncertain
+        share = measured["concentration"] or 1.0
+        measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
+    probabilities: tuple[float, ...] = ()
+    if is_calibrated(registrar.pipeline):
+        any_right = probability_of_any(measured, exact=work.exact)
+        every = hypothesis_probabilities(any_right, scores[rivals], exact=work.exact)
+        probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
+    item = work.item
+    with_camera = item.camera_matrix is not None
+    hypotheses = [hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported]
+    return Registration(
+        tuple(hypotheses),
+        probabilities,
+        work.ranking,
+        measured,
+        prior=item.prior,
+        prior_contradiction=_contradiction(registrar, work, poses[best], gain),
+        warnings=item.warnings + registrar.mesh_warnings + outside_warnings(fraction),
+        notes=registrar.mesh_notes,
+    )
+
+
+def _outside_fraction(registrar: "Registrar", work: Work, best: Poses) -> float:
+    """Fraction of the object that lies outside the photograph at the ``best`` pose."""
+    return outside_fraction(registrar.describer.hull, best.T[0], best.cameras[0], work.item.size)
+
+
+def _gain_outside(features: Tensor, best: Tensor, outside: Tensor) -> float | None:
+    """Score of the pose outside the limits, minus that of the best one; without the rank, which it does not have."""
+    if not len(outside):
+        return None
+    weights = torch.tensor(SCORE_WEIGHTS[1:]).to(features)
+    return float((features[outside, 1:] - features[best, 1:]) @ weights)
+
+
+def _contradiction(registrar: "Registrar", work: Work, best: Poses, gain: float | None) -> str | None:
+    """See :attr:`.Registration.prior_contradiction`."""
+    if work.limits is None:
+        return None
+    K = work.item.camera_matrix
+    placement = best.rotation, best.distance, best.view, best.rank
+    filling = Poses.in_box(registrar.describer, work.item.box, K, *placement)
+    better = gain is not None and gain > OUTSIDE_MARGIN
+    return work.limits.contradiction(best, filling, better_outside=better)
+
+
+def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
+    """What makes every pose of a flat mesh questionable, in words."""
+    vertices = torch.from_numpy(mesh.vertices.copy()).double()
+    thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+    if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
+        return ()
+    return ("the mesh is flat and has no colours: front and back look alike",)
+
+
+def better_of(
+    one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
+) -> Registration | FailedRegistration:
+    """The registration with more confidence, or with a higher score where there is none; ``model`` is the rival's."""
+    if not isinstance(rival, Registration):
+        return one
+    if not isinstance(one, Registration):
+        return replace(rival, model=model)
+    ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
+    return replace(rival, model=model) if ahead else one

@@ -1,0 +1,88 @@
+"""Objects of which several poses look the same from most sides: what tells them apart is inside, below, or small."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from scripts.scenes.families import rotation
+from scripts.scenes.surfaces import AROUND, Array, Part, Rng, Surface, bar, box, join, lathe
+
+
+def holed(rng: Rng) -> list[Part]:
+    """A body of revolution with one hole in its wall."""
+    levels = int(rng.integers(4, 9))
+    radii = rng.uniform(0.3, 0.45) * np.ones(levels)
+    if rng.random() < 0.5:
+        radii = radii * np.linspace(1.0, rng.uniform(0.6, 1.3), levels)
+    heights = np.linspace(0.0, rng.uniform(0.6, 1.6), levels)
+    body = lathe(radii, heights)
+    row = int(rng.integers(0, levels - 1))
+    columns = int(rng.integers(3, 8))
+    first = int(rng.integers(AROUND))
+    ring = np.arange((levels - 1) * AROUND)
+    hidden = (ring // AROUND == row) & ((ring % AROUND - first) % AROUND < columns)
+    kept = np.concatenate([np.tile(~hidden, 2), np.ones(len(body.faces) - 2 * len(ring), bool)])
+    return [(Surface(body.vertices, body.faces[kept]), 0)]
+
+
+def hollow(rng: Rng) -> list[Part]:
+    """A box with a cavity in one half, open below."""
+    w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.4, 0.8, 0.7))
+    wall = rng.uniform(0.03, 0.08)
+    deep = h - wall
+    cavity = (0.5 * w - 1.5 * wall, d - 2.0 * wall, deep)
+    at = 0.25 * w
+    parts = [_without_bottom((w, d, h), (0.0, 0.0, 0.5 * h)), _without_bottom(cavity, (at, 0.0, 0.5 * deep))]
+    half = np.array([(-0.5 * w, -0.5 * d, 0), (0.0, -0.5 * d, 0), (0.0, 0.5 * d, 0), (-0.5 * w, 0.5 * d, 0)])
+    parts.append(Surface(half, np.array([[0, 2, 1], [0, 3, 2]])))
+    return [(part, 0) for part in parts]
+
+
+def footed(rng: Rng) -> list[Part]:
+    """A box or a disc with a block under one end."""
+    w, d, h = rng.uniform((0.7, 0.5, 0.15), (1.2, 0.7, 0.6))
+    round_body = rng.random() < 0.4
+    body = lathe(np.full(2, 0.5 * w), np.array([0.0, h])) if round_body else box((w, d, h)).moved((0, 0, 0.5 * h))
+    block = box(rng.uniform((0.1, 0.1, 0.03), (0.2, 0.25, 0.08)))
+    return [(body, 0), (block.moved((0.3 * w, 0, -0.02)), 0)]
+
+
+def marked(rng: Rng) -> list[Part]:
+    """A box or a cylinder with a small cube on one end of its top."""
+    w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.2, 0.7, 0.7))
+    round_body = rng.random() < 0.3
+    body = lathe(np.full(2, 0.4 * w), np.array([0.0, h])) if round_body else box((w, d, h)).moved((0, 0, 0.5 * h))
+    side = rng.uniform(0.05, 0.14)
+    at = 0.4 * w - 0.5 * side if not round_body else 0.3 * w
+    return [(body, 0), (box(side).moved((at, 0, h + 0.5 * side)), 0)]
+
+
+def handed(rng: Rng) -> list[Part]:
+    """A bracket that its mirror image does not match, such as a left part."""
+    long, wide, thick = rng.uniform((0.8, 0.3, 0.08), (1.2, 0.5, 0.2))
+    plate = box((long, wide, thick))
+    arm = box((thick, wide, rng.uniform(0.3, 0.7)))
+    arm = arm.moved((0.5 * (long - thick), 0, 0.5 * float(np.ptp(arm.vertices[:, 2]))))
+    reach = rng.uniform(0.3, 0.6)
+    pin = bar((-0.3 * long, 0, 0), (-0.3 * long, 0.5 * wide + reach, 0), rng.uniform(0.04, 0.09))
+    return [(plate, 0), (arm, 0), (pin, 0)]
+
+
+def _without_bottom(size: tuple[float, float, float], at: tuple[float, float, float]) -> Surface:
+    solid = box(size).moved(at)
+    corners = solid.vertices[solid.faces]
+    bottom = (corners[..., 2] <= solid.vertices[:, 2].min() + 1e-9).all(axis=1)
+    return Surface(solid.vertices, solid.faces[~bottom])
+
+
+FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
+    family.__name__: family for family in (holed, hollow, footed, marked, handed)
+}
+
+
+def tied_shape(rng: Rng, family: str) -> tuple[Array, Array]:
+    """Vertices (V, 3) of radius 1 around the origin, z up, and faces (F, 3), of a family of ``FAMILIES``."""
+    surface = join([part for part, _ in FAMILIES[family](rng)])
+    points = surface.vertices @ rotation(2, rng.uniform(0.0, 2.0 * np.pi)).T
+    points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))
+    return points / float(np.linalg.norm(points, axis=1).max()), surface.faces

@@ -1,0 +1,93 @@
+"""Masks as programs write them: white, labels, palettes, transparency."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from curvireg_torch.data.masks import mask_file, read_mask
+from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.registration.inputs import image_item
+from tests._support.exif import exif, with_exif
+
+OBJECT = np.zeros((20, 30), bool)
+OBJECT[4:14, 6:24] = True
+
+
+def written(path, values, mode=None):
+    Image.fromarray(values, mode).save(path)
+    return path
+
+
+@pytest.mark.parametrize("white", [255, 200, 2, 1, 127])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_one_value_beside_zero_is_the_object(tmp_path, white, dtype):
+    value = white if white < 200 or dtype == np.uint8 else 257 * white
+    file = written(tmp_path / "mask.png", (value * OBJECT).astype(dtype))
+    found = read_mask(file)
+    assert np.array_equal(found >= 0.5, OBJECT)
+    assert found.dtype == np.float32
+    item = image_item(torch.rand(3, 20, 30), None, mask=file)
+    assert item.box.tolist() == [5.5, 3.5, 23.5, 13.5]
+
+
+def test_labels_are_chosen_by_their_number(tmp_path):
+    labels = np.zeros((20, 30), np.uint8)
+    labels[OBJECT] = 2
+    labels[:3] = 5
+    file = written(tmp_path / "labels.png", labels)
+    assert np.array_equal(read_mask(f"{file}:2"), OBJECT.astype(np.float32))
+    assert np.array_equal(read_mask(f"{file}:5"), (labels == 5).astype(np.float32))
+    with pytest.raises(InvalidInputError, match="no white pixel, but labels 2, 5; choose one as FILE:LABEL"):
+        read_mask(file)
+    with pytest.raises(InvalidInputError, match="no pixel has the label 3; it has 0, 2, 5"):
+        read_mask(f"{file}:3")
+    bright = written(tmp_path / "bright.png", np.where(labels == 2, 200, labels).astype(np.uint8))
+    assert np.array_equal(read_mask(f"{bright}:200") > 0, OBJECT)
+    deep = written(tmp_path / "deep.png", (300 * labels.astype(np.uint16)))
+    assert np.array_equal(read_mask(f"{deep}:600") > 0, OBJECT)
+    with pytest.raises(MissingFileError, match=r"lost\.png:2: no such file"):
+        read_mask(tmp_path / "lost.png:2")
+    assert mask_file("a:b") == mask_file(mask_file("a:b")[0])
+
+
+def test_palettes_are_labels_unless_they_are_black_and_white(tmp_path):
+    labels = OBJECT.astype(np.uint8) * 2
+    picture = Image.fromarray(labels, "P")
+    picture.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    picture.save(tmp_path / "voc.png")
+    assert np.array_equal(read_mask(tmp_path / "voc.png"), OBJECT.astype(np.float32))
+    assert np.array_equal(read_mask(f"{tmp_path / 'voc.png'}:2"), OBJECT.astype(np.float32))
+    picture = Image.fromarray(1 - OBJECT.astype(np.uint8), "P")
+    picture.putpalette([255, 255, 255, 0, 0, 0])
+    picture.save(tmp_path / "inverse.png")
+    assert np.array_equal(read_mask(tmp_path / "inverse.png"), OBJECT.astype(np.float32))
+
+
+def test_transparency_that_varies_is_the_mask(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 255, (20, 30, 4), dtype=np.uint8)
+    picture[..., 3] = 255 * OBJECT
+    file = written(tmp_path / "cut.png", picture)
+    assert np.array_equal(read_mask(file), OBJECT.astype(np.float32))
+    picture[...] = 255 * OBJECT[..., None]
+    picture[..., 3] = 255
+    assert np.array_equal(read_mask(written(tmp_path / "opaque.png", picture)), OBJECT.astype(np.float32))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_masks_are_turned_as_their_photographs(tmp_path, suffix):
+    file = tmp_path / f"mask{suffix}"
+    if suffix == ".png":
+        cv2.imwrite(str(file), 255 * OBJECT.astype(np.uint8))
+        with_exif(file, exif(6))
+    else:
+        Image.fromarray(255 * OBJECT.astype(np.uint8)).save(file, tiffinfo={274: 6})
+    assert np.array_equal(read_mask(file) > 0, np.rot90(OBJECT, -1))
+
+
+def test_arrays_of_labels_are_read_as_files_are():
+    item = image_item(torch.rand(3, 20, 30), None, mask=2 * OBJECT.astype(np.uint8))
+    assert torch.equal(item.mask, torch.from_numpy(OBJECT).float())
+    with pytest.raises(InvalidInputError, match=r"labels 2, 5; .* mask == LABEL"):
+        image_item(torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8)))

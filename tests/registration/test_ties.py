@@ -1,0 +1,131 @@
+"""Poses that look the same: named, never believed; and small features that tell which one is right."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from curvireg_torch import Registrar, Registration, ViewBank, sample_views
+from curvireg_torch.geometry import rotation_error, rotation_from_viewpoint, transform
+from curvireg_torch.mesh import mesh_centre, mesh_radius, mesh_symmetries
+from curvireg_torch.mesh.symmetry import FEATURE_FRACTION, feature_fractions
+from curvireg_torch.registration.siblings import MAX_SIBLINGS, spread, telling_symmetries
+from curvireg_torch.synthetic import synthesize_photograph
+from tests._support.scenes import CAMERA, SIZE
+
+
+@cache
+def hollow_box() -> trimesh.Trimesh:
+    """A box of 200 x 120 x 90, one half of which is hollow from below: from above it looks like a plain box."""
+    outer = trimesh.creation.box((200, 120, 90))
+    cavity = trimesh.creation.box((80, 90, 70))
+    cavity.apply_translation((44, 0, -10))
+    parts = []
+    for part in (outer, cavity):
+        below = (part.triangles[..., 2] <= part.bounds[0, 2] + 1e-6).all(axis=1)
+        parts.append(trimesh.Trimesh(part.vertices, part.faces[~below], process=False))
+    floor = np.array([(-100, -60, -45), (4, -60, -45), (4, 60, -45), (-100, 60, -45)], float)
+    parts.append(trimesh.Trimesh(floor, [[0, 2, 1], [0, 3, 2]], process=False))
+    return trimesh.util.concatenate(parts)
+
+
+@cache
+def marked_box() -> trimesh.Trimesh:
+    """A box with a cube of 11.5 % of its radius on one end of its top."""
+    box = trimesh.creation.box((200, 120, 80))
+    cube = trimesh.creation.box((14, 14, 14))
+    cube.apply_translation((85, 0, 47))
+    return trimesh.util.concatenate([box, cube])
+
+
+@cache
+def registrar_of(mesh: trimesh.Trimesh, **options: object) -> Registrar:
+    views = sample_views(azimuth_step=15, elevations=[10, 30, 50])
+    return Registrar(ViewBank.build(mesh, views, image_size=96, progress=False), **options)
+
+
+def photograph(mesh: trimesh.Trimesh, azimuth: float, elevation: float, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
+    generator = torch.Generator().manual_seed(seed)
+    R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
+    ahead = torch.tensor([0.0, 0.0, 5.0 * mesh_radius(mesh)], dtype=torch.float64)
+    T = transform(R, ahead - R @ mesh_centre(mesh))
+    return (*synthesize_photograph(mesh, T, CAMERA, SIZE, generator), T)
+
+
+def registered(registrar: Registrar, azimuth: float, elevation: float, seed: int) -> tuple[Registration, float]:
+    """The result and its error in degrees."""
+    image, box, T = photograph(registrar.bank.mesh, azimuth, elevation, seed)
+    result = registrar([image], box[None], CAMERA)[0]
+    return result, float(rotation_error(result.rotation, T[:3, :3]))
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "seed"), [(35.0, 25.0, 0), (160.0, 40.0, 1), (250.0, 15.0, 2)])
+def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimuth, elevation, seed):
+    assert len(mesh_symmetries(hollow_box())) == 1
+    result, error = registered(registrar_of(hollow_box()), azimuth, elevation, seed)
+    assert min(error, abs(180.0 - error)) < 5.0, "one of the two"
+    assert result.ambiguous == "half turn"
+    assert result.probabilities[0] == pytest.approx(result.probabilities[1], rel=0.3)
+    assert result.confidence <= 0.5
+    assert not result.reliable
+    turn = float(rotation_error(result.hypotheses[0].rotation, result.hypotheses[1].rotation))
+    assert turn == pytest.approx(180.0, abs=5.0)
+
+
+def test_rig_that_sees_only_what_looks_the_same_names_the_tie():
+    registrar = registrar_of(hollow_box())
+    images, boxes, poses = zip(*(photograph(hollow_box(), a, 30.0, int(a)) for a in (20.0, 65.0, 110.0)), strict=True)
+    result = registrar.register_views(list(images), list(boxes), CAMERA, torch.stack(poses))
+    assert result.ambiguous == "half turn"
+    assert not result.reliable
+
+
+def test_symmetric_mesh_without_given_symmetries_is_ambiguous():
+    box = trimesh.creation.box((200, 120, 80))
+    assert registered(registrar_of(box), 40.0, 30.0, 0)[0].ambiguous is None
+    bank = registrar_of(box).bank
+    result, _ = registered(Registrar(bank, symmetries=torch.eye(4)[None]), 40.0, 30.0, 0)
+    assert result.ambiguous is not None
+    assert result.confidence <= 0.5
+
+
+@pytest.mark.parametrize("azimuth", [20.0, 75.0, 140.0, 200.0, 310.0])
+def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_differs(azimuth):
+    mesh = marked_box()
+    assert len(mesh_symmetries(mesh)) == 4
+    result, _ = registered(registrar_of(mesh), azimuth, 35.0, int(azimuth))
+    turned = result.rotation @ mesh_symmetries(mesh)[1:, :3, :3]
+    assert float(rotation_error(turned, result.hypotheses[1].rotation).min()) < 10.0
+
+
+def test_given_symmetries_are_trusted():
+    bank, group = registrar_of(marked_box()).bank, mesh_symmetries(marked_box())
+    result, _ = registered(Registrar(bank, symmetries=group), 20.0, 35.0, 20)
+    turned = result.rotation @ group[1:, :3, :3].double()
+    for hypothesis in result.hypotheses[1:]:
+        assert float(rotation_error(turned, hypothesis.rotation).min()) > 10.0
+
+
+def test_telling_symmetries_are_those_that_a_feature_breaks():
+    box, cylinder = trimesh.creation.box((200, 120, 80)), trimesh.creation.cylinder(40, 150, sections=72)
+    for mesh in (box, cylinder):
+        assert len(telling_symmetries(mesh, mesh_symmetries(mesh))) == 1, "nothing to measure"
+    group = mesh_symmetries(marked_box())
+    fractions = feature_fractions(marked_box(), group)
+    assert fractions[0] == 0.0
+    assert bool((fractions[1:] > FEATURE_FRACTION).all())
+    telling = telling_symmetries(marked_box(), group)
+    assert torch.equal(telling[0], torch.eye(4).double())
+    assert len(telling) == 4
+
+
+def test_spread_keeps_few_symmetries_far_apart():
+    group = mesh_symmetries(trimesh.creation.cylinder(40, 150, sections=72))
+    some = spread(group)
+    assert (len(group), len(some)) == (72, MAX_SIBLINGS)
+    apart = rotation_error(some[:, None, :3, :3], some[None, :, :3, :3]) + 360.0 * torch.eye(MAX_SIBLINGS)
+    assert float(apart.min()) >= 30.0
