@@ -2,10 +2,12 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..geometry import symmetry_transforms
@@ -25,6 +27,7 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
             most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
+        transform, target_transform: see :class:`ObjectDataset`.
 
     Attributes:
         models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
@@ -49,13 +52,21 @@ class BOPDataset(ObjectDataset):
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
-    def __init__(self, root: str | os.PathLike[str], split: str = "test", *, targets: bool | None = None) -> None:
-        super().__init__()
-        self.root, self.split = existing_root(root, _README), split
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str = "test",
+        *,
+        targets: bool | None = None,
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
+    ) -> None:
+        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
+        self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
-        self.models_info = _models_info(self.root / "models" / "models_info.json")
+        self.models_info = read_models_info(self.root / "models" / "models_info.json")
         self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
@@ -162,7 +173,7 @@ def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
     return ((math.nan,) * 4,) * 4
 
 
-def _models_info(path: Path) -> dict[int, dict[str, Any]]:
+def read_models_info(path: Path) -> dict[int, dict[str, Any]]:
     """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
     entries = {}
     for key, entry in read_json(path, dict, _README).items():

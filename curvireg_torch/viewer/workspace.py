@@ -175,7 +175,7 @@ class Workspace:
                 f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
-            if path.name == "scene_camera.json" and session.options.unit == "m":
+            if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
                 await self.set_option("unit", "mm")  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
@@ -286,6 +286,8 @@ def unpack(archive: Path, folder: Path) -> Path:
             raise cannot_store(name, error) from None
         raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
     meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
+    robots = [path for path in meshes if path.suffix.lower() == ".urdf"]
+    meshes = robots if len(robots) == 1 else meshes  # the others are those of its links
     if len(meshes) != 1:
         found = "no mesh" if not meshes else "several meshes: " + ", ".join(p.name for p in meshes[:4])
         raise InvalidInputError(f"{name}: {found}; put one of {', '.join(MESHES)} with its parts into it")

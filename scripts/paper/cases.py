@@ -88,7 +88,7 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
     translation = s.get("translation", torch.full((3,), math.nan))
     pose = torch.cat([s["rotation"], translation[:, None]], dim=1).double()
     known = bool(pose[:, :3].isfinite().all() and s["box"].isfinite().all())
-    if not known or s.get("visib_fract", 1.0) <= UNOCCLUDED:
+    if not known or s.get("visib_fract", 1.0) < UNOCCLUDED:
         return None
     mesh = str(s[kind.scored.mesh])
     camera = s.get("camera_matrix")

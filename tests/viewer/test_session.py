@@ -13,8 +13,9 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
+from curvireg_torch.data.pose_files import read_pose
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
-from curvireg_torch.evaluation.opening import WITHIN, RegisterOptions, read_start
+from curvireg_torch.evaluation.opening import WITHIN, RegisterOptions
 from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpoint, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
@@ -107,9 +108,9 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     folder = registered[1]
     session.shot.choose(1)
     (folder / "chosen.json").write_text(to_json(session.document()))
-    start, confidence = read_start(folder / "chosen.json")
-    assert start == tuple(map(tuple, session.shot.answer.pose.transform.tolist()))
-    assert confidence is None
+    start = read_pose(folder / "chosen.json")
+    assert torch.equal(start.T, session.shot.answer.pose.transform.double())
+    assert start.confidence is None
     scene = trimesh.load(io.BytesIO(session.shot.glb()), file_type="glb")
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     assert np.allclose(flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5)
