@@ -51,8 +51,7 @@ def stray_warning(mesh: trimesh.Trimesh, stray: NDArray[np.bool_]) -> MeshWarnin
     fraction = float(area[stray].sum() / area.sum())
     centre = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[stray]].mean(axis=(0, 1))
     place = ", ".join(f"{value:.4g}" for value in centre)
-    faces = f"{count:,} face{'s' * (count != 1)} of {len(stray):,}"
-    text = f"{faces} near ({place}) lie apart from the rest with {fraction:.2g} of the area: left out, as left over"
+    text = f"of {len(stray):,} faces {count:,} near ({place}), with {fraction:.2g} of the area, apart from the rest: left out"
     return MeshWarning("stray", text)
 
 
