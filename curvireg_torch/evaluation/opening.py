@@ -355,25 +355,23 @@ def _open_bank(
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
-    _check_bank(options, bank, mesh)
-    return bank
-
-
-def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
-    """Refuse options that are about the mesh and that the bank was not built with."""
-    from ..mesh.mesh import mesh_unit, mesh_up
-
-    unit = mesh_unit(bank.mesh)
-    up = mesh_up(bank.mesh)
-    again = "or build it again with 'curvireg bank'"
-    if options.unit_is_given and options.unit != unit:
-        kind = f"with --unit {unit}" if unit else "without a unit"
-        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
-        raise BankError(message, subject=path)
-    if options.up not in (None, up):
-        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
-        raise BankError(message, subject=path)
+    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
+    return bank
+
+
+def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
+    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    built_unit = mesh_unit(bank.mesh)
+    built_up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if unit not in (None, built_unit):
+        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
+        raise BankError(f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path)
+    if up not in (None, built_up):
+        raise BankError(f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path)
