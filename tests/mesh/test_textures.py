@@ -62,7 +62,7 @@ def test_only_the_formats_of_photographs_are_decoded(
     tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch, carrier: str, kind: str
 ) -> None:
     def refuse(*words: object, **how: object) -> None:
-        raise AssertionError(f"a program is started: {words}")
+        raise AssertionError(f"a program is started: {words} {how}")
 
     monkeypatch.setattr("subprocess.Popen", refuse)
     mesh, texts = load(write(tmp_path, carrier, encoded(kind)))
