@@ -161,7 +161,9 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     assert (tmp_path / "repeatability.csv").read_text().startswith(",MFC,MFC low,MFC high,MFC N")
     (record,) = (tmp_path / "records").iterdir()
     assert len(json.loads(record.read_text())) == 2
+    assert run(monkeypatch, "precision", *words[1:], "--partial") == 2  # no records of views
     monkeypatch.setattr(reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again")))
+    assert run(monkeypatch, *words, "--partial") == 0
     assert run(monkeypatch, "curve", *words[1:]) == 0
     assert (tmp_path / "curve.png").stat().st_size > 1000
     assert len((tmp_path / "curve_all.csv").read_text().splitlines()) == 41
