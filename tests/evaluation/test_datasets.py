@@ -156,6 +156,12 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
 
 
+def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate):
+    settings = evaluate("pascal3d", pascal.root, "--categories", "car", "--limit", "1", "--preset", "paper")["settings"]
+    assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
+    assert (settings["pipeline"]["views"]["pose"], settings["pipeline"]["views"]["frame"]) == ("paper", "principal")
+
+
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
     assert (summary["protocol"], summary["settings"]["dataset"]) == ("cad=annotated pose=any box=0.1 seed=3", "bop")
