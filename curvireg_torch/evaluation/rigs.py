@@ -166,7 +166,9 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
     for key, camera in cameras.items():
-        names = [f"{kind}/{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")]
+        numbers = dict.fromkeys((key.zfill(6), key.zfill(4), key))
+        ends = [f"{number}{end}" for number in numbers for end in (".png", ".jpg", ".tif")]
+        names = [f"{kind}/{end}" for kind in ("rgb", "gray") for end in ends]
         pictures = list(map(find, names))
         photo = next(filter(os.path.isfile, pictures), pictures[0])
         values = camera if isinstance(camera, dict) else {}
