@@ -433,3 +433,29 @@ def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatc
 
     asyncio.run(work())
     assert (stored(workspace), workspace.receiving) == ([], {})
+
+
+def test_unpack_reads_no_directory_that_is_larger_than_it_says(tmp_path, monkeypatch):
+    """Two records at the end of an archive tell the size of its directory, and a third one may lie in the last."""
+    monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # it would be read by then
+    content = pack(tmp_path / "a.zip", {f"{k:0200}.txt": b"" for k in range(6000)}).read_bytes()
+    end = content.rindex(b"PK\5\6")
+    size, start = struct.unpack_from("<II", content, end + 12)
+    assert size > 1000 * module.DIRECTORY_BYTES
+    record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 6000, 6000, size, start)
+    record += struct.pack("<IIQI", 0x07064B50, 0, end, 1)
+    small = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 6000, 6000, 100, start, 0)
+    inner = struct.pack("<4sHHHHIIH", b"PK\5\6", *struct.unpack("<HH", b"PK\5\6"), 6000, 6000, size, 100, 0)
+    for ends in (content[end:], record + small, inner):
+        (tmp_path / "a.zip").write_bytes(content[:end] + ends)
+        with pytest.raises(InvalidInputError, match=r"^a\.zip: more than 1,000 files"):
+            unpack(tmp_path / "a.zip", tmp_path / "parts")
+
+
+def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
+    mesh = trimesh.creation.box().export(file_type="ply")
+    deep = "a/" * module.MAX_ARCHIVE_DEPTH
+    assert unpack(pack(tmp_path / "a.zip", {f"{deep}a.ply": mesh}), tmp_path / "parts").is_file()
+    with pytest.raises(InvalidInputError, match=r"^a\.zip: folders in more than 32 folders; pack only"):
+        unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
+    assert not (tmp_path / "more").exists()
