@@ -22,6 +22,7 @@ from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from .._support import miniature
 from .._support.exif import exif, with_exif
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
+from ..mesh.step import step_file
 
 # Commands that are not run here, and the reason
 SKIPPED = {
@@ -70,6 +71,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kettle.joinpath("views.csv").write_text(table)
     mesh.export(kettle / "mesh.stl")
     mesh.apply_scale(1000.0).export(folder / "part.stl")
+    folder.joinpath("part.step").write_text(step_file(mesh.extents.tolist(), "mm"))
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
     miniature.write_image(folder / "photo.png", (128, 128))
