@@ -180,9 +180,25 @@ def write_page(folder: Path, page: Path) -> None:
     """Replace the part of a page between its markers by the tables of a folder."""
     from scripts._shared import update_page
 
-    parts = [folder / f"{name}.md" for name in ON_PAGE]
-    found = [path.read_text(encoding="utf-8") for path in parts if path.exists()]
+    found = []
+    for name in ON_PAGE:
+        path = folder / f"{name}.md"
+        if path.exists():
+            found.append(path.read_text(encoding="utf-8"))
+        if name == "curve" and (folder / "curve.png").exists():
+            found.append(f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n")
     update_page(page, "paper", "\n".join([f"Measured at commit {commit()}.", "", *found]))
+
+
+def _picture(folder: Path, page: Path) -> str:
+    """The plot of the curve beside a page; returns its path from there."""
+    from PIL import Image
+
+    name = "images/paper-curve.webp"
+    target = page.parent / name
+    target.parent.mkdir(exist_ok=True)
+    Image.open(folder / "curve.png").convert("RGB").save(target, quality=80)
+    return name
 
 
 def main() -> int:
