@@ -159,7 +159,8 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     if summary is None:  # another process writes it
         return
     if summary["n"] == 0:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
+        skipped = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items())
+        reasons = skipped or "no object is annotated"
         raise InvalidInputError(f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json")
     print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
     numbers = {**summary, **summary.get("detection", {})}.items()

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, PoseFolder
-from ..data.bop import read_models_info
+from ..data.bop_models import read_models_info
 from ..errors import InvalidInputError
 from ..geometry import Camera, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
