@@ -23,6 +23,7 @@ from .._support import miniature
 from .._support.exif import exif, with_exif
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 from .._support.peers import write_peers
+from ..mesh.step import step_file
 
 # Commands that are not run here, and the reason
 SKIPPED = {
@@ -78,6 +79,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mesh.export(kettle / "mesh.stl")
     write_peers(folder, folder / "photo.jpg", mesh, pose(AZIMUTHS["photo.jpg"]), PHOTO_CAMERA)
     mesh.apply_scale(1000.0).export(folder / "part.stl")
+    folder.joinpath("part.step").write_text(step_file(mesh.extents.tolist(), "mm"))
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
     miniature.write_image(folder / "photo.png", (128, 128))
