@@ -27,10 +27,19 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
+_WIDTH, _HEIGHT, _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = (
+    256,
+    257,
+    262,
+    258,
+    254,
+    0x0112,
+    0x8769,
+    0xA405,
+)
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
-_WIDTH, _HEIGHT = 0xA002, 0xA003  # EXIF sizes in px of the picture that the camera took
+_TAKEN_WIDTH, _TAKEN_HEIGHT = 0xA002, 0xA003  # EXIF sizes in px of the picture that the camera took
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
@@ -154,6 +163,17 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
+def photo_size(path: Path) -> tuple[int, int]:
+    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the same."""
+
+    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
+        tags = getattr(image, "tag_v2", {})  # of a TIFF, whose size Pillow turns or not, by its version
+        return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
+
+    (width, height), orientation = decoded(path, stored_size)
+    return (width, height) if orientation > 4 else (height, width)
+
+
 class _Exif(NamedTuple):
     """What is used of a file's metadata, see :class:`Photo`."""
 
@@ -223,8 +243,8 @@ def _exif(image: "Image") -> _Exif:
         orientation = exif.get(_ORIENTATION, 1)
         directory = exif.get_ifd(_EXIF_DIRECTORY)
         focal = float(directory.get(_FOCAL_35MM, 0))
-        width = int(directory.get(_WIDTH, 0))
-        height = int(directory.get(_HEIGHT, 0))
+        width = int(directory.get(_TAKEN_WIDTH, 0))
+        height = int(directory.get(_TAKEN_HEIGHT, 0))
     valid = isinstance(orientation, int) and orientation in range(1, 9)
     return _Exif(
         orientation if valid else 1,

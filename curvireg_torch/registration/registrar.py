@@ -22,6 +22,7 @@ from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
 from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .confidence import MIN_LANDMARKS, are_near
 from .contour_fit import measure_contours
@@ -167,6 +168,7 @@ class Registrar:
         self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
     @torch.no_grad()
+    @in_full_precision
     def __call__(
         self,
         images: Tensor | Sequence[Any],
@@ -207,10 +209,12 @@ class Registrar:
             results = [better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
+    @in_full_precision
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
+    @in_full_precision
     def register_views(
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:

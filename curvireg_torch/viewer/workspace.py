@@ -1,9 +1,8 @@
 """The work that the windows of the page show, and the files that it receives. It needs no NiceGUI."""
 
 import asyncio
-import os
+import errno
 import shutil
-import struct
 import tempfile
 import time
 import traceback
@@ -12,17 +11,19 @@ import zipfile
 from collections.abc import AsyncIterator, Callable
 from contextvars import ContextVar
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from ..data import load_camera
-from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
+from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError, OutputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
-from .session import STATIC, Session
+from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
+MAX_ARCHIVE_DEPTH = 32  # folders around a file in a zip archive
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
 SAMPLE_CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
@@ -87,16 +88,20 @@ class Workspace:
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
                 self.messages.pop("pose", None)
             if caught:
-                self.messages[part] = "; ".join(map(self.session.describe_warning, caught))
+                self._show(part, "; ".join(map(self.session.describe_warning, caught)))
             return True if result is None else result
         except CurviregError as error:
-            self.messages[part] = str(error.with_subject(self.session.name(error.subject)))
+            self._show(part, str(error.with_subject(self.session.name(error.subject))))
         except OSError as error:
-            self.messages[part] = str(error)
+            self._show(part, f"{error.strerror or error}; check the machine on which the page runs")
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
-            self.messages[part] = f"{type(error).__name__}: {error}; see the terminal"
+            self._show(part, f"{type(error).__name__}: {error}; see the terminal")
         return None
+
+    def _show(self, part: str, message: str) -> None:
+        """Show a message, in which uploaded files have their names alone."""
+        self.messages[part] = self.session.without_folders(message)
 
     def start_search(self) -> asyncio.Task[None]:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a time."""
@@ -118,24 +123,44 @@ class Workspace:
         """End the search at its next step."""
         self.session.cancelled = self.searching
 
+    def close(self) -> None:
+        """End the search, and remove the uploaded files."""
+        self.stop()
+        for folder in self.folder.glob("upload-*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
         """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
         stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
         if stored + sum(each for _, each in self.receiving.values()) + size > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
-        folder, received = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder)), 0
-        self.receiving[folder] = name, size
+        path = self._new_place(name)
+        self.receiving[path.parent] = name, size
         try:
-            with (folder / name).open("wb") as file:
+            await self._store(path, size, blocks)
+            await self._open_upload(path)
+        finally:
+            del self.receiving[path.parent]
+            self._remove_unused()
+
+    def _new_place(self, name: str) -> Path:
+        """The path of an upload, in a folder of its own."""
+        try:
+            return Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder), name)
+        except OSError as error:
+            raise cannot_store(name, error) from error
+
+    async def _store(self, path: Path, size: int, blocks: AsyncIterator[bytes]) -> None:
+        received = 0
+        try:
+            with path.open("wb") as file:
                 async for block in blocks:
                     received += len(block)
                     if received > size:  # in chunks, a request may send more than it has announced
-                        raise InvalidInputError(f"{name}: larger than announced; send it again")
+                        raise InvalidInputError(f"{path.name}: larger than announced; send it again")
                     await asyncio.to_thread(file.write, block)
-            await self._open_upload(folder / name)
-        finally:
-            del self.receiving[folder]
-            self._remove_unused()
+        except OSError as error:
+            raise cannot_store(path.name, error) from error
 
     async def _open_upload(self, path: Path) -> None:
         suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
@@ -150,7 +175,7 @@ class Workspace:
                 f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
-            if path.name == "scene_camera.json" and session.options.unit == "m":
+            if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
                 await self.set_option("unit", "mm")  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
@@ -159,7 +184,7 @@ class Workspace:
         elif suffix in CALIBRATIONS:
             await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
         elif suffix == ".zip":
-            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / "parts")):
+            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / UNPACKED)):
                 await self.open_mesh(mesh)
         elif suffix in MESHES_AND_BANKS:
             await self.open_mesh(path)
@@ -233,26 +258,56 @@ class Workspace:
         return f"file/{name}?v={self._version}"
 
 
+def cannot_store(name: str, error: OSError) -> OutputError:
+    """The error of a file for which there is no place."""
+    advice = "make room on the machine on which the page runs, and send it again"
+    return OutputError(f"{name}: cannot be stored ({error.strerror or error}); {advice}")
+
+
+class _Archive(FileIO):
+    """A zip archive of which no more than ``most`` bytes are read at a time, while ``zipfile`` reads its directory:
+    several records tell its size, and it becomes many times as large in memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.path = path
+        self.most: int | None = MAX_ARCHIVE_FILES * DIRECTORY_BYTES
+
+    def read(self, size: int | None = -1) -> bytes:
+        """As of any file."""
+        if self.most is None:
+            return super().read(size) or b""
+        wanted = self.most + 1 if size is None or size < 0 else min(size, self.most + 1)
+        content = super().read(wanted) or b""
+        if len(content) > self.most:
+            message = f"more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts"
+            raise InvalidInputError(f"{self.path.name}: {message}")
+        return content
+
+
 def unpack(archive: Path, folder: Path) -> Path:
     """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
     name = archive.name
     try:
-        with archive.open("rb") as file:
-            file.seek(-min(archive.stat().st_size, 1 << 16), os.SEEK_END)
-            end = file.read()  # before zipfile reads the whole directory
-        if struct.unpack_from("<I", end, end.rindex(b"PK\5\6") + 12)[0] > MAX_ARCHIVE_FILES * DIRECTORY_BYTES:
-            raise InvalidInputError(f"{name}: more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts")
-        with zipfile.ZipFile(archive) as content:
+        with _Archive(archive) as file, zipfile.ZipFile(file) as content:
+            file.most = None
             members = content.infolist()
             if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:
                 limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
                 raise InvalidInputError(f"{name}: more than {limits}; pack only the mesh and its parts")
+            if any(member.filename.count("/") > MAX_ARCHIVE_DEPTH for member in members):
+                message = f"folders in more than {MAX_ARCHIVE_DEPTH} folders; pack only the mesh and its parts"
+                raise InvalidInputError(f"{name}: {message}")
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
         raise
-    except Exception:  # zipfile raises many kinds
+    except Exception as error:  # zipfile raises many kinds
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise cannot_store(name, error) from None
         raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
     meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
+    robots = [path for path in meshes if path.suffix.lower() == ".urdf"]
+    meshes = robots if len(robots) == 1 else meshes  # the others are those of its links
     if len(meshes) != 1:
         found = "no mesh" if not meshes else "several meshes: " + ", ".join(p.name for p in meshes[:4])
         raise InvalidInputError(f"{name}: {found}; put one of {', '.join(MESHES)} with its parts into it")
