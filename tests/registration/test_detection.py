@@ -192,10 +192,10 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registra
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
-def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found):
+def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found, monkeypatch):
     image, azimuth = found[0], 200.0
     prior = PosePrior(azimuth=(azimuth - 20, azimuth + 20))
-    registrar = cr.Registrar(bank(), mesh_is="similar")
+    monkeypatch.setattr(registrar, "mesh_is", "similar")
     result = registrar([image], prior=prior)[0]
     allowed = _allowed_views(registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior))
     assert sorted(viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()) == [180.0, 210.0]
