@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .errors import InvalidInputError
+from .errors import BankError, InvalidInputError
 from .features.backbone import SHA256, Backbone, describe, similarity
 from .features.learned_field import LearnedCurvilinearSaliency
 from .filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
@@ -447,6 +447,10 @@ class AppearanceModule(Backbone):
         if Appearance.name not in query.computed:  # shared by ranking and rescoring
             query.computed[Appearance.name] = describe(query.crops, self)
         crops = query.computed[Appearance.name]
+        if features.shape[1] not in (crops.shape[1], 2 * crops.shape[1]):  # of a file, which may hold anything
+            raise BankError(
+                f"bank: appearance of {features.shape[1]} numbers a view, expected {crops.shape[1]} or twice"
+            )
         similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 

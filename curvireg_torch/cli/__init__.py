@@ -15,21 +15,25 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
-from . import commands, compare, follow, register
+from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run one command; without any, print the help.
 
     Returns:
         The exit code: 0; 2 for input that cannot be used; 130 after Ctrl-C; 141 when the reader of a pipe has gone.
     """
     try:
         try:
-            return _run(parse(sys.argv[1:] if argv is None else argv))
+            words = sys.argv[1:] if argv is None else argv
+            if not words:
+                build_parser().print_help()
+                return 0
+            return _run(parse(words))
         except KeyboardInterrupt:
             print("curvireg: interrupted", file=sys.stderr)
             return 130
@@ -61,7 +65,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (register.add_register, follow.add_follow, *commands.COMMANDS, compare.add_compare):
+    for add in (
+        register.add_register,
+        follow.add_follow,
+        inspect.add_inspect,
+        *commands.COMMANDS,
+        compare.add_compare,
+    ):
         add(subparsers)
     return parser
 

@@ -98,6 +98,10 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
 _ALTERNATIVES = {
     ("preset", "pipeline"): "expected one of --preset and --pipeline",
     ("camera", "guess"): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
+    ("box", "boxes"): "expected one of --box and --boxes",
+    ("boxes", "mask"): "expected one of --boxes and --mask",
+    ("boxes", "start"): "--start is the pose, so that no box is needed; leave --boxes out",
+    ("boxes", "list"): "the list holds boxes; leave --boxes out",
     ("box", "start"): "--start is the pose, so that no box is needed; leave --box out",
 }
 """Options of which one would be ignored, and what is said about them."""
@@ -108,6 +112,8 @@ def ignored_option(arguments: argparse.Namespace) -> str | None:
     for names, message in _ALTERNATIVES.items():
         if all(getattr(arguments, name, None) is not None for name in names):
             return message
+    if getattr(arguments, "box_format", None) is not None and not (arguments.box or getattr(arguments, "list", None)):
+        return "--box-format: of --box or the boxes of a list; give them too"
     given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
     if given == ["front"] and getattr(arguments, "list", None) is None:
         return "--front limits nothing by itself; give --azimuth, for instance"

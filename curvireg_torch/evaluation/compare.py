@@ -181,8 +181,9 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     lines.append(f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count")
     lines.append("")
     for each in comparisons:
-        values = f"A {_value(each.a, each.a_interval)}   B {_value(each.b, each.b_interval)}"
-        difference = _value(each.difference, each.difference_interval, sign="+")
+        digits = _digits(each)
+        values = f"A {_value(each.a, each.a_interval, digits)}   B {_value(each.b, each.b_interval, digits)}"
+        difference = _value(each.difference, each.difference_interval, f"+{digits}")
         signs = f"B wins {each.wins}, loses {each.losses}, p {each.p:.2g}"
         lines.append(f"{each.score}: {values}   B - A {difference}   {signs}")
     names = [each.score for each in comparisons]
@@ -207,15 +208,19 @@ def _how(run: Run) -> str:
 def _rows(a: Run, b: Run, comparisons: Sequence[Comparison]) -> list[tuple[str, str, list[str]]]:
     """Of each run its name, number of objects, and scores with intervals."""
     count = str(max(each.n for each in comparisons))
-    first = [_value(each.a, each.a_interval) for each in comparisons]
-    second = [_value(each.b, each.b_interval) for each in comparisons]
+    first = [_value(each.a, each.a_interval, _digits(each)) for each in comparisons]
+    second = [_value(each.b, each.b_interval, _digits(each)) for each in comparisons]
     return [(Path(a.name).name, count, first), (Path(b.name).name, count, second)]
 
 
-def _value(value: float, interval: Interval, *, sign: str = "") -> str:
-    digits = ".3f" if abs(value) < 1.0 or not math.isfinite(value) else ".2f"
-    low, high = (format(end, sign + digits) for end in interval)
-    return f"{value:{sign}{digits}} [{low}, {high}]"
+def _digits(comparison: Comparison) -> str:
+    """Format of a score: fractions, or degrees."""
+    return ".2f" if comparison.score.endswith("err_deg") else ".3f"
+
+
+def _value(value: float, interval: Interval, digits: str) -> str:
+    low, high = (format(end, digits) for end in interval)
+    return f"{value:{digits}} [{low}, {high}]"
 
 
 def _markdown(name: str, count: str, cells: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
 from ..utils.choices import (
+    BOX_FORMATS,
     DEFAULT,
     MESH_KINDS,
     PRESET_NAMES,
@@ -23,9 +24,11 @@ from ..utils.choices import (
     START_CONVENTIONS,
     UNITS,
     UP_AXES,
+    VIDEOS,
 )
 
 if TYPE_CHECKING:
+    from ..data.box_files import Box, BoxFile
     from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
@@ -114,6 +117,18 @@ class RegisterOptions:
     meshes: tuple[Path, ...] = ()  # mesh files or banks; of several, each photograph is registered to the best
     box: tuple[float, float, float, float] | None = _option(
         None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
+    )
+    box_format: str | None = _option(
+        None,
+        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, height in px; fractions: "
+        "corners; yolo: centre, width, height in fractions of the picture",
+        choices=BOX_FORMATS,
+    )
+    boxes: Path | None = _option(
+        None,
+        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file of YOLO, or a folder "
+        "of these; PATH:LABEL takes one label",
+        type=Path,
     )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
@@ -208,6 +223,24 @@ class RegisterOptions:
 
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
+    @cached_property
+    def _box_file(self) -> "BoxFile | None":
+        from ..data.box_files import BoxFile
+
+        return None if self.boxes is None else BoxFile(self.boxes)
+
+    def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Box | None":
+        """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that of a detector."""
+        from ..data.box_files import pixel_box
+        from ..data.images import photo_size
+
+        numbers = self.box if numbers is None else numbers
+        if numbers is None:
+            return None if self._box_file is None else self._box_file.box(photo)
+        kind = self.box_format or "xyxy"
+        is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
+        return pixel_box(numbers, kind, photo_size(photo) if is_relative else None)
+
     def read_start(self) -> "PoseFile | None":
         """The pose of the file ``start``, or None."""
         if self.start is None:
@@ -225,8 +258,9 @@ class RegisterOptions:
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
         start = self.read_start()
-        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
-        same |= {"start": start, "prior": prior_from_limits(self.limits or {})}
+        box = self.box_of(photo)
+        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "mask", "instances")}
+        same |= {"box": box, "start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
@@ -321,25 +355,23 @@ def _open_bank(
         loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
-    _check_bank(options, bank, mesh)
-    return bank
-
-
-def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
-    """Refuse options that are about the mesh and that the bank was not built with."""
-    from ..mesh.mesh import mesh_unit, mesh_up
-
-    unit = mesh_unit(bank.mesh)
-    up = mesh_up(bank.mesh)
-    again = "or build it again with 'curvireg bank'"
-    if options.unit_is_given and options.unit != unit:
-        kind = f"with --unit {unit}" if unit else "without a unit"
-        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
-        raise BankError(message, subject=path)
-    if options.up not in (None, up):
-        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
-        raise BankError(message, subject=path)
+    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
+    return bank
+
+
+def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
+    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    built_unit = mesh_unit(bank.mesh)
+    built_up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if unit not in (None, built_unit):
+        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
+        raise BankError(f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path)
+    if up not in (None, built_up):
+        raise BankError(f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path)

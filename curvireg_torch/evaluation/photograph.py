@@ -34,7 +34,7 @@ from ..registration.result import detection_document, result_document
 from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .opening import CAMERA_OPTIONS, start_in_unit
+from .opening import CAMERA_OPTIONS, check_bank, start_in_unit
 from .outputs import output_folder
 from .result_files import View, write_result
 
@@ -161,7 +161,8 @@ def register(
             "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.
         mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
         prior: limits on the pose.
-        unit, up: of a mesh file, see :func:`load_mesh`.
+        unit, up: of a mesh file, see :func:`load_mesh`; None: "m", and the usual axis. A bank must have been built with
+            those that are given.
         pipeline: the default is that of :class:`Registrar`.
         progress: show progress while the views of a mesh are rendered, the first time.
 
@@ -192,7 +193,13 @@ def register(
         camera = Camera(camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera)
     if isinstance(mesh, str | PathLike):
         meshes = (Path(mesh),)
-        mesh = ViewBank.load(mesh) if meshes[0].suffix == ".safetensors" else load_mesh(mesh, unit=unit, up=up)
+        if meshes[0].suffix == ".safetensors":
+            mesh = ViewBank.load(mesh)
+            check_bank(mesh, meshes[0], unit=unit, up=up)
+        else:
+            mesh = load_mesh(mesh, unit=unit or "m", up=up)
+    elif unit is not None or up is not None:
+        raise InvalidInputError("unit, up: of a mesh file; what is given as mesh has its own, leave them out")
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
     entry = Entry(name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
     return register_entry(entry, photo, registrar)

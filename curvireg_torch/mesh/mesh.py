@@ -107,7 +107,7 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         (colours,) = colours_of_parts([source])
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
-    triangles, is_degenerate = _checked_triangles(source, name)
+    triangles, is_degenerate = checked_triangles(source, name)
     vertices = np.asarray(source.vertices, dtype=np.float64)
     mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
     colours = None if colours is None else colours[~is_degenerate]
@@ -138,8 +138,8 @@ def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
 MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
 
 
-def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(F, 3) faces, and (F,) whether a face has no area."""
+def checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(F, 3) faces, and (F,) whether a face has no area; :class:`MeshError` for triangles that are no mesh."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) > MAX_MESH_FACES:
         raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
@@ -259,6 +259,7 @@ def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
     return torch.from_numpy(T)
 
 
+@cached_in_mesh
 def principal_rotation(mesh: trimesh.Trimesh) -> Tensor:
     """(3, 3) float64 rotation of :func:`normalization_transform`."""
     R = normalization_transform(mesh)[:3, :3]

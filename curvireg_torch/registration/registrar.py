@@ -469,8 +469,7 @@ class Registrar:
         if work.limits is not None:
             poses = work.limits.moved_inside(poses)
         distinct = torch.ones(len(poses), dtype=torch.bool)
-        by_rank = replace(work, exact=False)
-        return judged(self, by_rank, poses, self._features(work, poses), distinct, ~distinct)
+        return judged(self, replace(work, exact=False), poses, self._features(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""

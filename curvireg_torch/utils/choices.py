@@ -17,6 +17,10 @@ VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp", ".iges", ".igs", ".dae", ".urdf")
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 
+BOX_FORMATS = ("xyxy", "xywh", "fractions", "yolo")
+"""Four numbers of a box: corners in px; corner, width and height in px; corners, and centre, width and height, in
+fractions of the picture."""
+
 START_CONVENTIONS = ("opencv", "opengl")
 """Axes of the camera of a given pose: x right, y down, z forward; or x right, y up, z backward."""
 

@@ -1,5 +1,8 @@
 """``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
 
+import json
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -8,10 +11,11 @@ import trimesh
 
 from curvireg_torch import ViewBank
 from curvireg_torch.evaluation import photograph
-from curvireg_torch.evaluation.lists import list_photographs
+from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS
+from tests._support.exif import exif
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
 from tests._support.scenes import scene, truck_bank
 
@@ -207,3 +211,48 @@ def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path
         assert np.abs(pixels - expected).mean() < 6  # MJPG is lossy
     (folder / "none.mp4").write_bytes(b"not a video")
     refused(register(folder / "none.mp4", bank, out="none"), "none.mp4: not a video")
+
+
+def test_boxes_of_a_detector_are_found_by_the_name_of_each_photograph(folder, register, tmp_path):
+    x0, y0, x1, y1 = map(float, box_of(0))
+    boxes = [{"image_id": str(seed), "bbox": [x0, y0, x1 - x0, y1 - y0], "score": 0.5} for seed in (0, 1)]
+    (tmp_path / "boxes.json").write_text(json.dumps(boxes))
+    words = "--boxes", tmp_path / "boxes.json", "--no-refine"
+    assert register(folder / "photos", folder / "truck.safetensors", *words, out="boxes") == 0
+    rows = lines(tmp_path / "boxes")
+    assert [row["status"] for row in rows] == ["ok", "ok", "failed"]
+    assert rows[0]["inputs"]["box"] == pytest.approx([x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5], abs=1e-3)
+    assert "no box in" in rows[2]["message"]
+
+
+def test_paths_of_windows_and_boxes_in_fractions_in_lists(folder):
+    x0, y0, x1, y1 = map(float, box_of(0))
+    fractions = [(x0 + 0.5) / 240, (y0 + 0.5) / 180, (x1 + 0.5) / 240, (y1 + 0.5) / 180]
+    path = written(folder / "windows.csv", HEADER, ["photos\\0.png", *fractions], ["photos\\9.png", *fractions])
+    options = RegisterOptions(meshes=(folder / "truck.ply",), box_format="fractions")
+    good, missing = read_list(path, options)
+    assert good.photo == folder / "photos" / "0.png"
+    assert good.name == "photos\\0.png"
+    assert good.box == pytest.approx([x0, y0, x1, y1])
+    assert "no such file" in missing.error
+
+
+def test_photographs_of_telephones_in_folders_and_alone(folder, register, tmp_path, monkeypatch):
+    encoder = pytest.importorskip("pillow_heif")
+    pytest.importorskip("pi_heif")
+    pixels = np.ascontiguousarray(cv2.imread(str(folder / "photos" / "0.png"))[..., ::-1])
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    heic = encoder.from_bytes("RGB", pixels.shape[1::-1], pixels.tobytes())
+    heic.save(shots / "IMG_2.HEIC", quality=95, exif=exif(1, 38))
+    cv2.imwrite(str(shots / "IMG_1.JPG"), pixels[..., ::-1])
+    assert register(shots, folder / "truck.safetensors", "--box", *box_of(0)) == 0
+    assert [(row["inputs"]["photo"][-10:], row["status"]) for row in lines(tmp_path / "out")] == [
+        ("/IMG_1.JPG", "ok"),
+        ("IMG_2.HEIC", "ok"),
+    ]
+    monkeypatch.setitem(sys.modules, "pi_heif", None)  # counted, not left out, where there is no decoder
+    assert register(shots, folder / "truck.safetensors", "--box", *box_of(0), out="without") == 0
+    jpeg, missing = lines(tmp_path / "without")
+    assert jpeg["status"] == "ok"
+    assert "HEIC needs pi-heif: pip install 'curvireg_torch[heic]'" in missing["message"]
