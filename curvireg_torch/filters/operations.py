@@ -115,7 +115,8 @@ def to_grey(image: Tensor) -> Tensor:
         return image
     from kornia.color import rgb_to_grayscale  # here, because its import takes 0.3 s
 
-    return rgb_to_grayscale(image)
+    grey: Tensor = rgb_to_grayscale(image)
+    return grey
 
 
 def may_have_missing(x: Tensor) -> bool:
