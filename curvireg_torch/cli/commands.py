@@ -184,7 +184,7 @@ def add_view(commands: Any) -> None:
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
     add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
     add_limits(parser)
-    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
+    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0 or ::, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
     parser.add_argument("--port", type=whole_number(0, 65535), default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
