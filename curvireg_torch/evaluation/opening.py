@@ -132,7 +132,7 @@ class RegisterOptions:
     )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
-        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or other tools, whose "
         "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
         "result then has no covariance",
         type=camera_option,
