@@ -73,7 +73,8 @@ def measure(phase: str, cases: list[Case], settings: BankSettings, pose: str) ->
     start = time.process_time()
     found = measure_points(cases, settings) if phase == "points" else measure_views(cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
-    names = [{"category": case.category, "cad": case.mesh_path, "seconds": seconds} for case in cases]
+    same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
+    names = [{"category": case.category, **same} for case in cases]
     return [{**name, **record} for name, record in zip(names, found, strict=True)]
 
 
@@ -180,6 +181,8 @@ def write_page(folder: Path, page: Path) -> None:
     """Replace the part of a page between its markers by the tables of a folder."""
     from scripts._shared import update_page
 
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()]
+    commits = sorted({record["commit"] for some in records for record in some})
     found = []
     for name in ON_PAGE:
         path = folder / f"{name}.md"
@@ -187,7 +190,7 @@ def write_page(folder: Path, page: Path) -> None:
             found.append(path.read_text(encoding="utf-8"))
         if name == "curve" and (folder / "curve.png").exists():
             found.append(f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n")
-    update_page(page, "paper", "\n".join([f"Measured at commit {commit()}.", "", *found]))
+    update_page(page, "paper", "\n".join([f"Measured at commit {', '.join(commits)}.", "", *found]))
 
 
 def _picture(folder: Path, page: Path) -> str:

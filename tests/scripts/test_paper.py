@@ -19,6 +19,7 @@ from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from scripts._shared import commit
 from scripts.paper import generated, measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
@@ -163,6 +164,7 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     text = (tmp_path / "repeatability.md").read_text()
     assert "N = 2 (1 CADs)" in text
     assert text in page.read_text()
+    assert f"Measured at commit {commit()}." in page.read_text()
     assert (tmp_path / "repeatability.csv").read_text().startswith(",MFC,MFC low,MFC high,MFC N")
     (record,) = (tmp_path / "records").iterdir()
     assert len(json.loads(record.read_text())) == 2
