@@ -31,6 +31,7 @@ from .inputs import ImageItem, check_crop, image_items
 from .judging import Work, better_of, flat_mesh_warnings, judged
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
+    CLOSE_RIVALS,
     Poses,
     best_views,
     close_rivals,
@@ -43,6 +44,7 @@ from .poses import (
     pose_features,
     pose_scores,
     projected_box,
+    with_details,
     with_edge_support,
     with_quick_fit,
 )
@@ -493,7 +495,7 @@ class Registrar:
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
     def _features(self, work: Work, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES`."""
+        """(H, F) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
         landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
@@ -520,7 +522,11 @@ class Registrar:
         poses, features = self._refitted(work, crops, poses, features, best)
         scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
         rivals = close_rivals(poses, scores, work.symmetries)
-        return self._refitted(work, crops, poses, features, rivals) if len(rivals) else (poses, features)
+        if not len(rivals):
+            return poses, features
+        different = distinct_poses(poses[rivals], scores[rivals], work.symmetries)
+        poses, features = self._refitted(work, crops, poses, features, rivals[different][:CLOSE_RIVALS])
+        return poses, with_details(self.describer, crops, poses, features, int(best), rivals)
 
     def _refitted(
         self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
@@ -547,23 +553,19 @@ class Registrar:
             return poses, features, None
         best = _best_inside(features, outside)
         measure = partial(self._measured, work, crops)
-        siblings = Siblings.of(poses[best], symmetries, self.describer, measure)
+        siblings = Siblings.of(poses[best], symmetries, self.describer, crops, measure)
         kept = siblings.best()
         if kept:
             fitted = self._fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
             new = self._features(work, fitted)
-            better = bool(pose_scores(new, exact=True) > pose_scores(features[best], exact=True))
-            if better:
-                poses, features = self._replaced(work, poses, features, best, fitted, new)
-            else:
-                kept = 0
+            poses, features = self._replaced(work, poses, features, best, fitted, new)
         rival = siblings.rival(kept, features[best])
         if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
             rival = None
         return poses, features, rival
 
     def _measured(self, work: Work, crops: EdgeCrops, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES` of poses that are not fitted."""
+        """(H, F) :data:`POSE_FEATURES` of poses that are not fitted."""
         return self._features(work, with_edge_support(self.describer, crops, poses))
 
     def _with_texture(
