@@ -235,8 +235,8 @@ def compare_with_photograph(
 def pose_features(
     poses: Poses, similarity: Tensor, appearance: Tensor | None = None, landmarks: Tensor | None = None
 ) -> Tensor:
-    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance`` (H,) where the pipeline
-    has that term, and the evidence of ``landmarks`` (H,) where the mesh has any."""
+    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance`` (H,) where the
+    pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has any."""
     appearance, landmarks = (torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks))
     support = poses.edge_support.nan_to_num(0.0)
     details = torch.zeros_like(similarity)

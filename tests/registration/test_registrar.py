@@ -111,7 +111,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, 3))
+    features = F.pad(similarity[:, None], (1, 4))
     outside = torch.tensor([False, False, True, False])
     assert registrar_module._best_inside(features, outside).tolist() == [1]
 
