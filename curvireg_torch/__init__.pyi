@@ -5,6 +5,7 @@ from . import (
     evaluation as evaluation,
     filters as filters,
     geometry as geometry,
+    inspection as inspection,
     mesh as mesh,
     matching as matching,
     features as features,
@@ -94,3 +95,4 @@ from .pipeline import (
 from .version import (
     __version__ as __version__,
 )
+from .inspection import inspect as inspect

@@ -103,6 +103,8 @@ MAX_MESH_COORDINATE = 1e12
 MIN_MESH_EXTENT = 1e-6
 #: Nodes with a mesh in a glTF scene; parts, materials and libraries of an OBJ file; files that a mesh names
 MAX_MESH_PARTS = 10_000
+MAX_CAD_BYTES = 1 << 27  #: Bytes of a STEP, IGES or Collada file
+MAX_CAD_SECONDS = 300  #: Time in which OpenCASCADE must have made triangles of a STEP or IGES file
 MAX_TEXTURE_PIXELS = 1 << 28  #: Pixels of all textures of a mesh together: 16 of 4096 x 4096
 #: Sum of squared corners of all concave faces, which bounds the time of their division: a million quads, or five faces
 #: of 2000 corners

@@ -13,7 +13,7 @@ from .errors import InvalidInputError
 from .filters import gaussian_smooth
 from .geometry import camera_matrix, rotation_from_viewpoint
 from .geometry.cameras import rotation_towards, transform
-from .mesh.mesh import mesh_centre, mesh_radius
+from .mesh import has_colours, mesh_centre, mesh_radius
 from .rendering import render_colour, render_depth
 
 __all__ = ["DemoScene", "demo_scene", "example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
@@ -95,7 +95,7 @@ def synthesize_photograph(
     texture: float = 0.35,
 ) -> tuple[Tensor, Tensor]:
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box (4,) in px.
-    ``texture`` is the contrast of a random solid pattern; a mesh with face colours shows those instead. The background
+    ``texture`` is the contrast of a random solid pattern; a mesh with colours shows those instead. The background
     (3, H, W), default :func:`procedural_background`, is out of focus."""
     H, W = size
     # Supersampling by two.
@@ -122,7 +122,7 @@ def synthesize_photograph(
     surface = shade[..., None] * colour * (1.0 + texture * pattern[..., None])
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
-    if mesh.visual.kind == "face":  # drawn before white
+    if has_colours(mesh):  # drawn before white
         front = (render_colour(mesh, T_cam_from_model, camera_matrix, size)[0] - (1.0 - coverage)).clamp(min=0.0)
     back = procedural_background(size, generator) if background is None else background
     image = front + (1.0 - coverage) * gaussian_smooth(back[None], DEFOCUS)[0]

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from .errors import InvalidInputError
+from .errors import BankError, InvalidInputError
 from .features.backbone import SHA256, Backbone, describe, similarity
 from .features.learned_field import LearnedCurvilinearSaliency
 from .filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
@@ -65,11 +65,19 @@ def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | 
     crops = crops if holes is None else fill_missing(crops, holes)
     crops = to_grey(crops) if grey else crops
     mask: Tensor | None
-    if type(field) is LearnedCurvilinearSaliency:
+    if type(field) is LearnedCurvilinearSaliency and not _has_hooks(field):
         out, mask = field.field_and_mask(crops)
     else:
-        out, mask = field(crops), field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
+        out = field(crops)
+        mask = field.mask(crops) if isinstance(field, LearnedCurvilinearSaliency) else None
     return out if holes is None else out.masked_fill(holes.any(dim=1, keepdim=True), 0.0), mask
+
+
+def _has_hooks(module: nn.Module) -> bool:
+    """Whether a call of ``module`` does more than its ``forward``."""
+    own = module._forward_hooks, module._forward_pre_hooks, module._backward_hooks, module._backward_pre_hooks
+    of_all = torch.nn.modules.module
+    return any(own) or bool(of_all._global_forward_hooks or of_all._global_forward_pre_hooks)
 
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
@@ -179,6 +187,15 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
     """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32. The covariance is (1 - a) S + a
     tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's covariance best from the sample's
     covariance S."""
+    mean, x, S = _centred(descriptors)
+    S = x.T @ x / len(x) if S is None else S
+    a = _shrinkage(x, S)
+    ridge = a * float(S.diagonal().mean()) * torch.eye(len(S), dtype=S.dtype, device=S.device)
+    return mean, (1.0 - a) * S + ridge
+
+
+def _centred(descriptors: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Mean (D,) of (N, D) descriptors, their differences x from it, and x^T x / N if N >= D; float32."""
     check_tensor(descriptors, "descriptors", (None, None))
     count = len(descriptors)
     if count < 2:
@@ -186,13 +203,52 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
     x = descriptors.float()
     mean = x.mean(dim=0)
     x = x - mean
+    return mean, x, x.T @ x / count if count >= x.shape[1] else None
+
+
+def _shrinkage(x: Tensor, product: Tensor) -> float:
+    """The a of :func:`ledoit_wolf`, from x (N, D) with mean 0 and x^T x / N or x x^T / N, which have equal norms."""
     fourth = float(x.square().sum(dim=1).double().square().mean())
-    S = x.T @ x / count
-    square = float(S.double().square().sum())
-    spread = square - float(S.double().trace()) ** 2 / len(S)  # squared distance of S from its multiple of the identity
-    a = min(1.0, max(0.0, (fourth - square) / count / spread)) if spread > 0 else 1.0
-    ridge = a * float(S.diagonal().mean()) * torch.eye(len(S), dtype=S.dtype, device=S.device)
-    return mean, (1.0 - a) * S + ridge
+    square = float(product.double().square().sum())
+    # Squared distance of the covariance from its multiple of the identity
+    spread = square - float(product.double().trace()) ** 2 / x.shape[1]
+    return min(1.0, max(0.0, (fourth - square) / len(x) / spread)) if spread > 0 else 1.0
+
+
+class Precision(nn.Module):
+    r"""y -> Sigma^-1 y, with the :func:`ledoit_wolf` covariance Sigma and the ``mean`` (D,) of (N, D) descriptors.
+
+    With fewer descriptors than entries, N < D, Sigma = r Id + c x^T x is never formed: by Woodbury's identity
+    :math:`\Sigma^{-1} y = (y - x^T (r/c\,Id + x x^T)^{-1} x y) / r`, in which the matrix to solve is (N, N).
+    """
+
+    def __init__(self, descriptors: Tensor) -> None:
+        super().__init__()
+        mean, x, S = _centred(descriptors)
+        product = x @ x.T / len(x) if S is None else S
+        a = _shrinkage(x, product)
+        ridge = a * float(x.square().sum()) / x.numel()
+        matrix = product.double() * (1.0 - a)
+        matrix.diagonal().add_(ridge)
+        factor, failed = torch.linalg.cholesky_ex(matrix)
+        if int(failed) or (S is None and ridge <= 0.0):
+            raise InvalidInputError("descriptors: all views look alike; show the object from several sides")
+        self.ridge, self.share = ridge, (1.0 - a) / len(x)
+        self.mean: Tensor
+        self.factor: Tensor
+        self.register_buffer("mean", mean)
+        self.register_buffer("factor", factor)
+        self.x: Tensor | None
+        self.register_buffer("x", x.double() if S is None else None)
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        """(B, D) -> (B, D) float32."""
+        y = descriptors.to(self.mean).double()
+        if self.x is None:
+            return torch.cholesky_solve(y.T, self.factor).T.float()
+        # The factor is that of c x x^T + r Id, c times the matrix of the identity.
+        inner = torch.cholesky_solve(self.x @ y.T, self.factor).T
+        return ((y - self.share * (inner @ self.x)) / self.ridge).float()
 
 
 @dataclass(frozen=True)
@@ -218,23 +274,17 @@ class Correlation(Term):
         check_option(self.whitening, ("none", "bank", "paper"), "whitening")
 
     def build(self, views: Any) -> Comparison:
-        whitening: Whitening | None = None if self.whitening == "none" else views.whitening
+        whitening: Whitening | None = views.whitening if self.whitening == "bank" else None
 
-        def described(descriptors: Tensor) -> Tensor:
-            if whitening is not None:
-                descriptors = whitening(descriptors)
-            return descriptors if self.whitening == "paper" else F.normalize(descriptors, dim=1)
+        def normalized(descriptors: Tensor) -> Tensor:
+            return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
 
-        known = described(views.descriptors)
-        # (x - mu)^T Sigma^-1 y, where :class:`Whitening` has centred y as well
-        offset = None
-        if whitening is not None and self.whitening == "paper":
-            offset = whitening(torch.zeros_like(views.descriptors[:1]))
+        described = views.precision if self.whitening == "paper" else normalized
+        known = views.descriptors - views.precision.mean if self.whitening == "paper" else normalized(views.descriptors)
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
             queries = described(query.descriptors.flatten(0, 1)).to(known.dtype)
-            queries = queries if offset is None else queries - offset
             return (queries @ known.T).float().view(B, K, len(known)).amax(dim=1)
 
         return compare
@@ -397,6 +447,10 @@ class AppearanceModule(Backbone):
         if Appearance.name not in query.computed:  # shared by ranking and rescoring
             query.computed[Appearance.name] = describe(query.crops, self)
         crops = query.computed[Appearance.name]
+        if features.shape[1] not in (crops.shape[1], 2 * crops.shape[1]):  # of a file, which may hold anything
+            raise BankError(
+                f"bank: appearance of {features.shape[1]} numbers a view, expected {crops.shape[1]} or twice"
+            )
         similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 

@@ -15,7 +15,7 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..utils.files import terminable
 from ..version import __version__
-from . import commands, follow, register
+from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
@@ -61,7 +61,13 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in (register.add_register, follow.add_follow, *commands.COMMANDS):
+    for add in (
+        register.add_register,
+        follow.add_follow,
+        inspect.add_inspect,
+        *commands.COMMANDS,
+        compare.add_compare,
+    ):
         add(subparsers)
     return parser
 

@@ -32,7 +32,7 @@ PICTURES = {
     "viewpoints": "score over the viewing directions, and the hypotheses",
 }
 PROTOCOL = (
-    "cad=annotated|any: the annotated CAD model, or the best of the class; "
+    "cad=annotated|any|other: the annotated CAD model, the best of the class, or another one of it (seed=N); "
     "pose=upright|any: whether objects are known to stand upright; "
     "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of the side (seed=N); "
     "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG; "
@@ -66,12 +66,11 @@ def build_bank(arguments: argparse.Namespace) -> None:
 
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     from ..matching import ViewBank
-    from ..mesh import load_mesh
     from ..utils.threads import one_torch_thread
 
     start, options = time.perf_counter(), register_options(arguments)
     pipeline = options.open_pipeline()
-    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    mesh = options.load_mesh(arguments.mesh)
     settings: dict[str, Any] = {"renderer": options.renderer, "progress": options.progress, "device": options.device}
     with one_torch_thread():
         bank = ViewBank.build(mesh, pipeline=pipeline, **settings)
@@ -142,8 +141,8 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
     if not Path(arguments.root).is_dir():
         raise MissingFileError("no such folder; docs/datasets.md shows the layout", subject=arguments.root)
-    from ..evaluation.benchmarks import Protocol
     from ..evaluation.datasets import evaluate
+    from ..evaluation.protocol import Protocol
     from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
 
@@ -159,7 +158,8 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     if summary is None:  # another process writes it
         return
     if summary["n"] == 0:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items()) or "it is empty"
+        skipped = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items())
+        reasons = skipped or "no object is annotated"
         raise InvalidInputError(f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json")
     print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
     numbers = {**summary, **summary.get("detection", {})}.items()

@@ -62,7 +62,14 @@ def add_follow(commands: Any) -> None:
     parser.add_argument("frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed")
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
     options = [name for name in PHOTOGRAPH if name != "mask"]
-    add_options(parser, *options, "start", "field", box="in px in the first frame; default: the object is detected")
+    add_options(
+        parser,
+        *options,
+        "start",
+        "start_convention",
+        "field",
+        box="in px in the first frame; default: the object is detected",
+    )
     add_limits(parser)
     parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
     parser.add_argument("--show", action="store_true", help="open a page with the latest frame; --out is optional")
@@ -192,8 +199,9 @@ def _poses(
     """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
     import torch
 
-    from ..evaluation.opening import prior_from_limits, read_start
+    from ..evaluation.opening import prior_from_limits, start_in_unit
     from ..geometry import Camera, undistorted
+    from ..mesh.mesh import mesh_unit
     from ..registration import FailedRegistration, Follower
 
     follow, prior = None, prior_from_limits(options.limits or {})
@@ -209,9 +217,9 @@ def _poses(
                 image, box = seen.image, seen.box
             if follow is None:
                 follow = Follower(registrar, _camera_matrix(options, image), prior=prior)
-                if options.start is not None:
-                    pose, confidence = read_start(options.start)
-                    follow.start(image, pose, confidence=1.0 if confidence is None else confidence)
+                if (start := options.read_start()) is not None:
+                    pose = start_in_unit(start, mesh_unit(registrar.bank.mesh))
+                    follow.start(image, pose, confidence=1.0 if start.confidence is None else start.confidence)
             first_box, box = box, None
             result = follow(image, first_box)
         except CurviregError as error:

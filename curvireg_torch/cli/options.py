@@ -20,7 +20,7 @@ from ..evaluation.opening import (
 FIELDS = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
 DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
-MESH = ("unit", "pose", "up")
+MESH = ("unit", "link", "textures", "pose", "up")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 
@@ -50,7 +50,7 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
         if isinstance(kind, Numbers):
             how["metavar"] = re.sub(r"[][]", "", kind.names)
         elif kind is Path:
-            how["metavar"] = "FILE"
+            how.setdefault("metavar", "FILE")
         parser.add_argument(flag, dest=name, **how)
 
 
@@ -90,13 +90,18 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     """The files that a command's options name, and ``more``."""
     named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
     camera = getattr(arguments, "camera", None)
-    calibrations = [camera, camera.rpartition(":")[0]] if isinstance(camera, str) else []
-    return [*more, *(path for path in named if isinstance(path, Path)), *map(Path, filter(None, calibrations))]
+    paths = [*(str(path) for path in named if isinstance(path, Path)), *([camera] if isinstance(camera, str) else [])]
+    named_parts = [path.rpartition(":")[0] for path in paths]  # of FILE:NAME
+    return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
 
 
 _ALTERNATIVES = {
     ("preset", "pipeline"): "expected one of --preset and --pipeline",
     ("camera", "guess"): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
+    ("box", "boxes"): "expected one of --box and --boxes",
+    ("boxes", "mask"): "expected one of --boxes and --mask",
+    ("boxes", "start"): "--start is the pose, so that no box is needed; leave --boxes out",
+    ("boxes", "list"): "the list holds boxes; leave --boxes out",
     ("box", "start"): "--start is the pose, so that no box is needed; leave --box out",
 }
 """Options of which one would be ignored, and what is said about them."""
@@ -107,6 +112,8 @@ def ignored_option(arguments: argparse.Namespace) -> str | None:
     for names, message in _ALTERNATIVES.items():
         if all(getattr(arguments, name, None) is not None for name in names):
             return message
+    if getattr(arguments, "box_format", None) is not None and not (arguments.box or getattr(arguments, "list", None)):
+        return "--box-format: of --box or the boxes of a list; give them too"
     given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
     if given == ["front"] and getattr(arguments, "list", None) is None:
         return "--front limits nothing by itself; give --azimuth, for instance"

@@ -86,7 +86,9 @@ def add_register(commands: Any) -> None:
         "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
     )
     add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
-    add_options(parser, *PHOTOGRAPH, "start", "instances", "field", "top", "refine")
+    add_options(
+        parser, *PHOTOGRAPH, "box_format", "boxes", "start", "start_convention", "instances", "field", "top", "refine"
+    )
     add_limits(parser)
     jobs = "processes for several photographs (default: 1)"
     add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
@@ -118,7 +120,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
         return f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
-    if (arguments.box or arguments.mask) and arguments.instances is not None:
+    if (arguments.box or arguments.boxes or arguments.mask) and arguments.instances is not None:
         return "--instances applies only without a box; leave --box and --mask out"
     if arguments.instances is not None and (arguments.start or rig is not None):
         return "--start and --views are of one object; leave --instances out"
@@ -135,6 +137,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
         return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
+    if arguments.start_convention is not None and arguments.start is None:
+        return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
     if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
@@ -232,7 +236,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     photo, entry = read_photo(path), options.entry(path)
     check_entry(entry, photo)
     with _one_result(arguments, *entry.files):
-        if options.progress and not (options.box or options.mask or options.start):
+        if options.progress and not (options.box or options.boxes or options.mask or options.start):
             print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
         with opened_registrar(options) as (registrar, seconds):
             try:
@@ -314,10 +318,11 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
         source = [str(arguments.list.resolve())]
     if options.guess is not None:
         print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
-    names = ("bank_decides", "pose", "mesh_is", "unit", "up", "top", "refine", "renderer", "device")
+    names = ("bank_decides", "pose", "mesh_is", "unit", "link", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if options.network is None else field_digest(options.network),
+        "textures": None if options.textures is None else str(options.textures),
         **{name: getattr(options, name) for name in names},
     }
     how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}

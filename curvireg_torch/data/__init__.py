@@ -7,17 +7,20 @@ A sample is a dict, one per object. Every dataset reports skipped objects with t
 from ._base import ObjectDataset
 from .bop import BOPDataset
 from .calibrations import load_camera
+from .crops import ObjectCrops, crops
 from .images import Photo, Video, read_image, read_photo
 from .pascal3d import Pascal3DPlus
 from .pose_folder import PoseFolder
 
 __all__ = [
     "BOPDataset",
+    "ObjectCrops",
     "ObjectDataset",
     "Pascal3DPlus",
     "Photo",
     "PoseFolder",
     "Video",
+    "crops",
     "load_camera",
     "read_image",
     "read_photo",

@@ -1,11 +1,14 @@
 """Base class of the datasets: dict samples, images read on access, a record of skipped objects."""
 
+import operator
 import os
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.utils.data import Dataset
 
 from ..errors import MissingFileError
@@ -20,9 +23,24 @@ class ObjectDataset(Dataset[Sample]):
     """One dict per annotated object. The index is built once, photographs are read on access.
 
     ``skipped_items`` maps reasons to names of skipped objects and files.
+
+    Args:
+        root: the folder of the dataset.
+        transform: function of the photograph (3, H, W), whose result becomes ``image``. Boxes and cameras are not
+            adapted: it may change colours, not the geometry; :func:`crops` cuts boxes out.
+        target_transform: function of the sample without its ``image``, which returns a dict.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        root: Path,
+        *,
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
+    ) -> None:
+        self.root = root
+        self.transform = transform
+        self.target_transform = target_transform
         self.skipped_items: dict[str, list[str]] = {}
         # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker is spawned.
         self._items: list[Sample] = []
@@ -45,17 +63,36 @@ class ObjectDataset(Dataset[Sample]):
     def __len__(self) -> int:
         return len(self._items)
 
+    def __repr__(self) -> str:
+        split = getattr(self, "split", None)
+        parts = [f"root={str(self.root)!r}"]
+        parts += [] if split is None else [f"split={split!r}"]
+        return f"{type(self).__name__}({', '.join(parts)}, {len(self)} objects)"
+
     def annotation(self, index: int) -> Sample:
-        """Sample ``index`` without its ``image``."""
+        """Sample ``index`` without its ``image``, before ``target_transform``."""
         return {
             key: torch.tensor(value, dtype=torch.float32) if isinstance(value, tuple) else value
-            for key, value in self._items[index].items()
+            for key, value in self._items[self._checked(index)].items()
         }
 
     def __getitem__(self, index: int) -> Sample:
         sample = self.annotation(index)
-        sample["image"] = read_image(sample["image_path"])
+        image = read_image(sample["image_path"])
+        if self.target_transform is not None:
+            sample = self.target_transform(sample)
+        sample["image"] = image if self.transform is None else self.transform(image)
         return sample
+
+    def _checked(self, index: object) -> int:
+        try:
+            number = operator.index(index)  # type: ignore[arg-type]
+        except TypeError:
+            advice = "take several by torch.utils.data.Subset(dataset, numbers)"
+            raise TypeError(f"{type(self).__name__}: expected a whole number, got {index!r:.60}; {advice}") from None
+        if not -len(self) <= number < len(self):
+            raise IndexError(f"{type(self).__name__}: has {len(self)} objects, got index {number}")
+        return number
 
 
 def existing_root(root: str | os.PathLike[str], readme: str) -> Path:

@@ -2,16 +2,19 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
-from ..geometry import symmetry_transforms
-from ..utils.checks import check_camera_matrix, check_rotation, check_symmetries
+from ..geometry.cameras import projected_boxes, transform
+from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
+from .bop_models import BOPModels
 
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
@@ -25,14 +28,18 @@ class BOPDataset(ObjectDataset):
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
         targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
             most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
+        models: folder of the meshes, such as ``"models_cad"``.
+        transform, target_transform: see :class:`ObjectDataset`.
 
     Attributes:
-        models_info: obj_id -> entry of ``models/models_info.json``, symmetries included.
+        models_info: obj_id -> entry of ``models/models_info.json``, symmetries included; without this file the
+            diameters and sizes of the meshes.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
         - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
-          of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. NaN without ``scene_gt_info.json``
+          of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. Without ``scene_gt_info.json`` the
+          first is that of the mesh at the pose, the second NaN
         - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera;
           ``T_cam_from_world`` (4, 4) in mm, NaN if unknown
         - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
@@ -42,30 +49,51 @@ class BOPDataset(ObjectDataset):
     ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
 
     Raises:
-        MissingFileError: the root, the split's folder, ``models_info.json`` or a required target list does not exist.
-        InvalidInputError: one of those files is damaged.
+        MissingFileError: the root, the split's folder, models or a required target list does not exist.
+        InvalidInputError: one of those files is damaged, or meshes have another unit than ``models_info.json``.
 
     Example:
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
     """
 
-    def __init__(self, root: str | os.PathLike[str], split: str = "test", *, targets: bool | None = None) -> None:
-        super().__init__()
-        self.root, self.split = existing_root(root, _README), split
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        split: str = "test",
+        *,
+        targets: bool | None = None,
+        models: str = "models",
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
+    ) -> None:
+        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
+        self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
-        self.models_info = _models_info(self.root / "models" / "models_info.json")
-        self._models = {path.name for path in (self.root / "models").glob("obj_*.ply")}
+        if not is_plain_name(models):
+            raise MissingFileError(f"no such folder; {_README} shows the layout", subject=self.root / models)
+        self._models = BOPModels(self.root / models)
+        self.models_info = self._models.info
         target_file = self.root / "test_targets_bop19.json"
         if targets is None:
             targets = split == "test" and target_file.is_file()
         counts = _targets(target_file) if targets else None
         for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
             self._index(folder, counts)
+        self._check_unit()
         if counts:  # targets that were not found
             for scene_id, image_id, obj_id in sorted(counts):
                 self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
+
+    def _check_unit(self) -> None:
+        """Refuse meshes that would be less than a pixel wide: their unit is not that of the poses."""
+        for item in self._items[:1]:
+            depth = item["translation"][2]
+            width = item["model_info"]["diameter"] * item["camera_matrix"][0][0] / max(depth, 1e-9)
+            if 0 < width < 1.0:
+                message = f"at the pose of image {item['image_id']} the mesh is {width:.2g} px wide: in metres? "
+                raise InvalidInputError(f"{message}scale it to mm, as the poses are", subject=item["model_path"])
 
     def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None) -> None:
         scene = f"{self.split}/{folder.name}"
@@ -80,18 +108,13 @@ class BOPDataset(ObjectDataset):
             except InvalidInputError:
                 return self._skip("corrupt_annotation", f"{scene}/{name}")
         ground_truth, cameras, infos = contents
-        images = {
-            path.stem: path
-            for subfolder in ("gray", "rgb")  # rgb takes precedence
-            for path in sorted((folder / subfolder).glob("*"))
-            if path.suffix in IMAGE_SUFFIXES
-        }
+        images = images_by_number(folder)
         for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
             item, instances = f"{scene}/{key}", ground_truth[key]
             if not key.isdecimal() or not isinstance(instances, list):
                 self._skip("corrupt_annotation", item)
                 continue
-            image = images.get(f"{int(key):06d}")
+            image = images.get(int(key))
             samples: list[Sample] = []
             for index, entry in enumerate(instances):
                 parsed = self._parse(entry, entry_at(infos.get(key), index), cameras.get(key))
@@ -125,13 +148,17 @@ class BOPDataset(ObjectDataset):
             check_camera_matrix(torch.tensor(_rows(matrix), dtype=torch.float64), "cam_K")
         except InvalidInputError:
             return "corrupt_annotation"
-        box = bop_box(info["bbox_obj"]) if "bbox_obj" in info else _UNKNOWN_BOX
+        obj_id: int = entry["obj_id"]
+        box = (
+            bop_box(info["bbox_obj"])
+            if "bbox_obj" in info
+            else self._box_of_mesh(obj_id, rotation, translation, matrix)
+        )
         if box is None or box[0] == box[2] or box[1] == box[3]:
             return "bad_box"
         visible = finite_numbers([info.get("visib_fract")], 1)
-        obj_id: int = entry["obj_id"]
-        model = f"obj_{obj_id:06d}.ply"
-        if model not in self._models:
+        model = self._models.files.get(obj_id)
+        if model is None:
             return "missing_mesh"
         if obj_id not in self.models_info:
             return "missing_model_info"
@@ -144,9 +171,32 @@ class BOPDataset(ObjectDataset):
             "T_cam_from_world": _camera_pose(camera),
             "obj_id": obj_id,
             "visib_fract": math.nan if visible is None else visible[0],
-            "model_path": str(self.root / "models" / model),
+            "model_path": str(model),
             "model_info": self.models_info[obj_id],
         }
+
+    def _box_of_mesh(self, obj_id: int, *pose_and_camera: tuple[float, ...]) -> tuple[float, ...] | None:
+        """The box around the mesh at a pose: 9, 3 and 9 numbers of rotation, translation and camera; None behind the
+        camera, NaN without a mesh."""
+        hull = self._models.hull(obj_id) if obj_id in self._models.files else None
+        if hull is None:
+            return _UNKNOWN_BOX
+        R, t, K = (torch.tensor(numbers, dtype=torch.float64) for numbers in pose_and_camera)
+        points = hull @ R.view(3, 3).T + t
+        if float(points[:, 2].min()) <= 0:
+            return None
+        box: tuple[float, ...] = tuple(projected_boxes(hull, transform(R.view(3, 3), t), K.view(3, 3)).tolist())
+        return box
+
+
+def images_by_number(scene: Path) -> dict[int, Path]:
+    """The pictures of a scene by their numbers, whatever zeros are in front; ``rgb`` takes precedence over ``gray``."""
+    found = {}
+    for name in ("gray", "rgb"):
+        for path in sorted((scene / name).glob("*")):
+            if path.suffix in IMAGE_SUFFIXES and path.stem.isdecimal():
+                found[int(path.stem)] = path
+    return found
 
 
 def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
@@ -160,24 +210,6 @@ def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
     except InvalidInputError:
         pass
     return ((math.nan,) * 4,) * 4
-
-
-def _models_info(path: Path) -> dict[int, dict[str, Any]]:
-    """obj_id -> entry, each with a diameter and symmetries that metrics can use."""
-    entries = {}
-    for key, entry in read_json(path, dict, _README).items():
-        name = f"entry {key[:20]!r}"
-        if not (key.isdecimal() and len(key) < 10 and isinstance(entry, dict)):
-            raise InvalidInputError(f"{name}: expected an object's number and its values; {_README}", subject=path)
-        diameter = finite_numbers([entry.get("diameter")], 1)
-        if diameter is None or diameter[0] <= 0:
-            raise InvalidInputError(f"{name}: expected a diameter > 0 in mm; {_README}", subject=path)
-        try:
-            check_symmetries(symmetry_transforms(entry, max_step_fraction=1.0))
-        except InvalidInputError as error:
-            raise InvalidInputError(f"{name}: {error}", subject=path) from None
-        entries[int(key)] = entry
-    return entries
 
 
 def bop_box(values: object) -> tuple[float, ...] | None:

@@ -26,7 +26,16 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = 262, 258, 254, 0x0112, 0x8769, 0xA405
+_WIDTH, _HEIGHT, _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = (
+    256,
+    257,
+    262,
+    258,
+    254,
+    0x0112,
+    0x8769,
+    0xA405,
+)
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
@@ -104,6 +113,17 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     Grey images get three equal channels, an alpha channel is dropped. Errors as in :func:`read_photo`.
     """
     return read_photo(path, as_stored=True).image.float().div_(255.0)
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the same."""
+
+    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
+        tags = getattr(image, "tag_v2", {})  # of a TIFF, whose size Pillow turns or not, by its version
+        return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
+
+    (width, height), orientation = decoded(path, stored_size)
+    return (width, height) if orientation > 4 else (height, width)
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:

@@ -2,10 +2,12 @@
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.checks import check_option
@@ -32,6 +34,7 @@ class Pascal3DPlus(ObjectDataset):
         occluded, truncated, difficult: False skips objects with that flag.
         pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release (MATLAB), 0 in sets
             written from Python. It is subtracted.
+        transform, target_transform: see :class:`ObjectDataset`.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
@@ -65,14 +68,17 @@ class Pascal3DPlus(ObjectDataset):
         truncated: bool = True,
         difficult: bool = True,
         pixel_origin: int = 1,
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
         check_option(part, ("pascal", "imagenet"), "part")
         if pixel_origin not in (0, 1):
             raise InvalidInputError(f"pixel_origin: expected 0 or 1, got {pixel_origin}")
         if isinstance(categories, str):
             raise InvalidInputError(f"categories: expected a list of names, got the text {categories!r}")
-        self.root, self.split, self.part = existing_root(root, _README), split, part
+        self.split = split
+        self.part = part
         self.categories = sorted(self._listed() if categories is None else set(categories))
         self.pixel_origin = pixel_origin
         self._excluded = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}

@@ -2,7 +2,11 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
 from ..utils.choices import MESHES
@@ -20,6 +24,10 @@ class PoseFolder(ObjectDataset):
     folder, the box in pixels (centre of the first pixel = 0), PASCAL3D+ viewpoint angles in degrees, distance in units
     of the mesh. Pose columns may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
     photograph may have several lines. The mesh is one file in any format of :func:`curvireg_torch.load_mesh`.
+
+    Args:
+        root: the folder of the objects' folders.
+        transform, target_transform: see :class:`ObjectDataset`.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
@@ -40,9 +48,14 @@ class PoseFolder(ObjectDataset):
         >>> PoseFolder("data/web")[0]["viewpoint"]  # doctest: +SKIP
     """
 
-    def __init__(self, root: str | os.PathLike[str]) -> None:
-        super().__init__()
-        self.root = existing_root(root, _README)
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        *,
+        transform: Callable[[Tensor], Any] | None = None,
+        target_transform: Callable[[Sample], Sample] | None = None,
+    ) -> None:
+        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
         folders = sorted(p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith("."))
         if not folders:
             raise MissingFileError(f"holds no folder of an object; {_README} shows the layout", subject=self.root)

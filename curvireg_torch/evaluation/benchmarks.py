@@ -1,11 +1,11 @@
-"""Datasets as evaluation sees them: the conditions, the objects to register, and the scores of the results."""
+"""Datasets as evaluation sees them: the objects to register, and the scores of the results."""
 
-import hashlib
 import math
+import re
 from abc import ABC, abstractmethod
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,142 +14,31 @@ import torch
 from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, PoseFolder
+from ..data.bop_models import read_models_info
 from ..errors import InvalidInputError
-from ..geometry import Camera, rotation_from_axis_angle, symmetry_transforms, viewpoint_from_rotation
+from ..geometry import Camera, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
 from ..geometry.crops import box_iou
-from ..geometry.pose_prior import PosePrior, object_frame
+from ..geometry.pose_prior import object_frame
 from ..mesh import load_mesh
 from ..mesh.mesh import format_up
-from ..utils.checks import check_integer, check_option
 from ..utils.files import write_csv
 from . import metrics
 from .metrics import symmetric_rotation_error
 from .photograph import Entry
+from .protocol import Protocol, hint_of_truth, perturbed_box, random_numbers
 from .result_files import View
 from .store import Row
 
 MIN_IOU = 0.5  # intersection over union from which a box is right
-UNOCCLUDED = 0.95  # visible fraction above which an object of a BOP set counts as whole
+UNOCCLUDED = 0.95  # visible fraction from which an object of a BOP set counts as whole
+RESULTS_OF_BOP = "curvireg-*_*-*.csv"  # results by the name that bop_toolkit asks for
+NO_VSD = (
+    "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used here: ar_rgb is without it"
+)
 SAME_PLACE = 0.1  # diameters within which the positions in the world of one instance agree, in different photographs
 
 Errors = Mapping[str, Tensor]
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """The information that the method gets about an object, besides the photograph.
-
-    Attributes:
-        cad: "annotated": that CAD. "any": all CADs of the class, the best wins.
-        pose: pose prior: "upright" or "any".
-        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is detected.
-        hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;
-            "pose:45": the same of the whole rotation; "none".
-        views: photographs of one pose that are registered together, each once as the first; for datasets of cameras.
-        seed: of the random numbers, which depend on the object's label besides.
-
-    Raises:
-        InvalidInputError: an unknown choice, a box outside [0, 0.45], a hint outside (0, 180), or fewer than one view.
-
-    Example:
-        >>> protocol = Protocol.parse(["cad=any", "box=0.1"])
-        >>> str(protocol)
-        'cad=any pose=upright box=0.1 seed=0'
-        >>> str(Protocol(pose="any"))
-        'cad=annotated pose=any box=annotated'
-    """
-
-    cad: str = "annotated"
-    pose: str = "upright"
-    box: float | None = 0.0
-    hint: str = "none"
-    views: int = 1
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_option(self.cad, ("annotated", "any"), "cad")
-        check_option(self.pose, ("upright", "any"), "pose")
-        if self.box is not None and not 0.0 <= self.box <= 0.45:
-            raise InvalidInputError(f"box: expected a fraction in [0, 0.45], got {self.box}")
-        if self.hint != "none":
-            self.hint_tolerance()
-        check_integer(self.views, "views")
-        if self.seed and str(self) == str(replace(self, seed=0)):
-            raise InvalidInputError("protocol: seed: nothing is drawn at random; leave it out")
-        if self.views > 1 and self.hint != "none":
-            raise InvalidInputError("protocol: hints are given with one photograph; leave hint or views out")
-
-    @classmethod
-    def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
-        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the default of that key."""
-        values: dict[str, str | float | int | None] = {"pose": pose}
-        named = {"annotated": 0.0, "none": None}
-        for word in words:
-            key, _, value = word.partition("=")
-            check_option(key, [f.name for f in fields(cls)], "protocol")
-            try:
-                if key == "box":
-                    values[key] = named[value] if value in named else float(value)
-                else:
-                    values[key] = int(value) if key in ("seed", "views") else value
-            except ValueError as error:
-                raise InvalidInputError(f"protocol: expected {key}=NUMBER, got {word!r}") from error
-        return cls(**values)  # type: ignore[arg-type]
-
-    def hint_tolerance(self) -> tuple[str, float]:
-        """Kind of the hint and its tolerance in degrees."""
-        kind, _, text = self.hint.partition(":")
-        try:
-            degrees = float(text)
-        except ValueError as error:
-            raise InvalidInputError(f"hint: expected azimuth:DEGREES or pose:DEGREES, got {self.hint!r}") from error
-        check_option(kind, ("azimuth", "pose"), "hint")
-        if not 0.0 < degrees < 180.0:
-            raise InvalidInputError(f"hint: expected degrees in (0, 180), got {self.hint!r}")
-        return kind, degrees
-
-    def __str__(self) -> str:
-        box = "none" if self.box is None else f"{self.box:g}" if self.box else "annotated"
-        hint = "" if self.hint == "none" else f" hint={self.hint}"
-        views = "" if self.views == 1 else f" views={self.views}"
-        seed = f" seed={self.seed}" if self.box or hint or views else ""
-        return f"cad={self.cad} pose={self.pose} box={box}{hint}{views}{seed}"
-
-
-def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:
-    """The box (4,) in px that the method gets for ``label``: edges move by up to ``protocol.box`` of a side."""
-    if not protocol.box:
-        return box
-    offset = 2.0 * torch.rand(4, generator=random_numbers(protocol, label), dtype=torch.float64) - 1.0
-    sides = (box[2:] - box[:2]).repeat(2)
-    return (box + protocol.box * offset * sides).to(box.dtype)
-
-
-def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: str) -> PosePrior | None:
-    """The hint about the object ``label``: a range around its true pose moved at random by up to half its width.
-
-    ``rotation`` (3, 3) is the true one, NaN where it is unknown, ``frame`` that of the mesh, see
-    :func:`curvireg_torch.geometry.pose_prior.object_frame`.
-    """
-    if protocol.hint == "none" or not bool(rotation.isfinite().all()):
-        return None
-    kind, degrees = protocol.hint_tolerance()
-    generator = random_numbers(protocol, f"hint {label}")
-    R = rotation.double()
-    if kind == "azimuth":
-        offset = degrees * (2.0 * torch.rand((), generator=generator, dtype=torch.float64) - 1.0)
-        centre = float(viewpoint_from_rotation(R @ frame.mT)[0] + offset)
-        return PosePrior(azimuth=((centre - degrees) % 360.0, (centre + degrees) % 360.0))
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    angle = torch.deg2rad(degrees * torch.rand((), generator=generator, dtype=torch.float64))
-    return PosePrior(rotation=rotation_from_axis_angle(axis * angle) @ R, within=degrees)
-
-
-def random_numbers(protocol: Protocol, label: str) -> torch.Generator:
-    """The generator that draws what the protocol leaves to chance about the object ``label``."""
-    seed = int.from_bytes(hashlib.sha256(f"{protocol.seed} {label}".encode()).digest()[:7])
-    return torch.Generator().manual_seed(seed)
 
 
 class Benchmark(ABC):
@@ -164,6 +53,9 @@ class Benchmark(ABC):
         groups: name of the groups that are scored by themselves, and key of the group in a sample.
         columns: of the table of predictions.
         reports: names of the files that are written from all results.
+        page_error: name of the error by which the page of the best and the worst marks an object: that up to
+            symmetries, where they are known.
+        measures: scores that are means over the objects: name of the error, and thresholds below which it is right.
         dataset, protocol: as given.
         samples, entries: annotations without photographs, and what is registered, in the order of the dataset.
 
@@ -180,6 +72,11 @@ class Benchmark(ABC):
     groups: ClassVar[tuple[str, str]] = ("per_object", "category")
     columns: ClassVar[Sequence[str]] = ()
     reports: ClassVar[Sequence[str]] = ("summary.json", "predictions.csv", "errors.csv", "index.html")
+    page_error: ClassVar[str] = "error_deg"
+    measures: ClassVar[Mapping[str, tuple[str, Sequence[float]]]] = {
+        "acc_15_deg": ("error_deg", (15.0,)),
+        "acc_30_deg": ("error_deg", (30.0,)),
+    }
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
         if protocol.views > 1 and not self.gives_camera:
@@ -217,21 +114,24 @@ class Benchmark(ABC):
     def _entry(self, sample: Row) -> Entry:
         label, meshes, photo = self.label.format_map(sample), self.meshes(sample), Path(sample["image_path"])
         box, protocol = sample["box"], self.protocol
-        unknown = protocol.box is not None and not bool(box.isfinite().all())
+        error = "" if meshes else "no_other_cad"
+        if protocol.box is not None and not bool(box.isfinite().all()):
+            error = "unknown_box"
+        frame = object_frame(format_up(Path(sample[self.mesh]).suffix))
         return Entry(
             name=str(photo.relative_to(self.dataset.root)),
             photo=photo,
             meshes=meshes,
             box=None if protocol.box is None else tuple(perturbed_box(box, protocol, label).tolist()),
             camera=Camera(sample["camera_matrix"]) if self.gives_camera else None,
-            prior=hint_of_truth(sample["rotation"], object_frame(format_up(meshes[0].suffix)), protocol, label),
+            prior=hint_of_truth(sample["rotation"], frame, protocol, label),
             as_stored=True,
             label=label,
-            error="unknown_box" if unknown else "",
+            error=error,
         )
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
-        """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown. The first one orders."""
+        """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown."""
         R, truth = estimated_rotations(rows), true_rotations(samples)
         known = truth.isfinite().flatten(1).all(1)
         errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
@@ -280,6 +180,20 @@ class Benchmark(ABC):
             lines.append([_cell(line.get(name, "")) for name in self.columns])
         write_csv(path, lines)
 
+    def write_errors(self, path: Path, keys: Sequence[str], samples: Sequence[Row], errors: Errors) -> None:
+        """Write one line for each object with all digits of its errors: ``inf`` for a miss, empty where the truth is
+        unknown."""
+        lines: list[Sequence[object]] = [("key", "group", *errors)]
+        for i, (key, sample) in enumerate(zip(keys, samples, strict=True)):
+            values = [float(error[i]) for error in errors.values()]
+            cells = ["" if math.isnan(value) else repr(value) for value in values]
+            lines.append((key, sample[self.groups[1]], *cells))
+        write_csv(path, lines)
+
+    def results_name(self, settings: Row) -> str | None:
+        """Name of a copy of the predictions that a benchmark's own tools ask for, if there are such tools."""
+        return None
+
 
 def _cell(value: object) -> object:
     if isinstance(value, bool):
@@ -314,6 +228,13 @@ class Pascal3DBenchmark(Benchmark):
     name, label, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
     thresholds: ClassVar = {"acc_pi_6": 30.0, "acc_pi_18": 10.0}
     groups = ("per_class", "category")
+    page_error = "symmetric_error_deg"
+    measures: ClassVar = {
+        "acc_pi_6": ("error_deg", (30.0,)),
+        "acc_pi_18": ("error_deg", (10.0,)),
+        "symmetric_acc_pi_6": ("symmetric_error_deg", (30.0,)),
+        "symmetric_acc_pi_18": ("symmetric_error_deg", (10.0,)),
+    }
     flags = ("truncated", "occluded", "difficult")
     columns = (
         *("image_id", "object_index", "category", "cad_index", "mesh", "azimuth", "elevation", "theta"),
@@ -325,7 +246,14 @@ class Pascal3DBenchmark(Benchmark):
     def meshes(self, sample: Row) -> tuple[Path, ...]:
         if self.protocol.cad == "annotated":
             return super().meshes(sample)
-        return tuple(sorted(Path(sample["cad_path"]).parent.glob("*.off")))
+        annotated = Path(sample["cad_path"])
+        cads = sorted(annotated.parent.glob("*.off"))
+        if self.protocol.cad == "any":
+            return tuple(cads)
+        others = [cad for cad in cads if cad.name != annotated.name]
+        generator = random_numbers(self.protocol, f"cad {self.label.format_map(sample)}")
+        order = torch.randperm(len(others), generator=generator).tolist()
+        return tuple(others[k] for k in order[:1])
 
     def settings(self) -> Row:
         return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset.pixel_origin}
@@ -349,8 +277,37 @@ class Pascal3DBenchmark(Benchmark):
         return {"easy": easy, **{flag: [s[flag] for s in samples] for flag in self.flags}}
 
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
-        symmetries = {name: text for name, (text, _) in SYMMETRIES.items()}
-        return {**super().summary(samples, rows, errors), "symmetries": symmetries}
+        """Scores as :meth:`Benchmark.summary`, also as plain means over the classes, and those of easy objects by
+        class, as some tables have them."""
+        summary = super().summary(samples, rows, errors)
+        easy = self.subsets(samples)["easy"]
+        classes = defaultdict[str, list[int]](list)
+        for i, sample in enumerate(samples):
+            if easy[i]:
+                classes[sample["category"]].append(i)
+        easy_scores = {name: self.scores(rows, errors, classes[name]) for name in sorted(classes)}
+        summary["subsets"]["easy"] |= {"per_class": easy_scores, "mean_over_classes": mean_scores(easy_scores)}
+        summary["mean_over_classes"] = mean_scores(summary["per_class"])
+        summary["symmetries"] = {name: text for name, (text, _) in SYMMETRIES.items()}
+        return summary
+
+
+def mean_scores(groups: Mapping[str, Row]) -> Row:
+    """Plain means of the scores of some groups, which may hold scores themselves, and ``n_classes``, their number.
+
+    Groups of few objects count as much as others.
+    """
+    rows = list(groups.values())
+    if not rows:
+        return {"n_classes": 0}
+    means: Row = {"n_classes": len(rows)}
+    for name, value in rows[0].items():
+        if isinstance(value, dict):
+            means[name] = mean_scores({group: row[name] for group, row in groups.items()})
+            del means[name]["n_classes"]
+        elif name != "n":
+            means[name] = sum(row[name] for row in rows) / len(rows)
+    return means
 
 
 class PoseFolderBenchmark(Benchmark):
@@ -388,10 +345,21 @@ class BOPBenchmark(Benchmark):
     name, unit, mesh, gives_camera = "bop", "mm", "model_path", True
     groups = ("per_object", "obj_id")
     label = "{scene_id}/{image_id}/{instance_index}"
+    reports = (*Benchmark.reports, RESULTS_OF_BOP)
+    page_error = "rotation"
+    measures: ClassVar = {
+        "acc_15_deg": ("rotation", (15.0,)),
+        "acc_30_deg": ("rotation", (30.0,)),
+        "add_recall_0.1d": ("add", metrics.ADD_THRESHOLDS),
+        "mssd_ar": ("mssd", metrics.MSSD_THRESHOLDS),
+        "mspd_ar": ("mspd", metrics.MSPD_THRESHOLDS),
+    }
     dataset: BOPDataset
 
     def __init__(self, dataset: BOPDataset, protocol: Protocol) -> None:
         super().__init__(dataset, protocol)
+        infos = dataset.root / "models_eval" / "models_info.json"
+        self._infos = read_models_info(infos) if infos.is_file() else {}
         if protocol.views > 1:
             for group in same_instances(self.samples):
                 views = [self._views(i, group) for i in group]
@@ -428,8 +396,8 @@ class BOPBenchmark(Benchmark):
         return dict(zip(names, errors, strict=True))
 
     def _errors_of_one_object(self, samples: Sequence[Row], rows: Sequence[Row]) -> Tensor:
-        info = samples[0]["model_info"]
-        points = torch.from_numpy(load_mesh(samples[0]["model_path"], unit=self.unit).vertices.copy())
+        path, info = self._scored_model(samples[0])
+        points = torch.from_numpy(load_mesh(path, unit=self.unit).vertices.copy())
         symmetries = symmetry_transforms(info)
         t = torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
         t_true, K = (torch.stack([s[name].double() for s in samples]) for name in ("translation", "camera_matrix"))
@@ -442,17 +410,38 @@ class BOPBenchmark(Benchmark):
         width = torch.tensor([row["inputs"]["picture"]["width"] for row in rows], dtype=torch.float64)
         return torch.stack([rotation, add / info["diameter"], mssd / info["diameter"], mspd / width])
 
+    def _scored_model(self, sample: Row) -> tuple[Path, Row]:
+        """The model that errors are of, with its diameter and symmetries: that of ``models_eval``, as the BOP challenge
+        has it, where there is one."""
+        path = self.dataset.root / "models_eval" / Path(sample["model_path"]).name
+        info: Row = sample["model_info"]
+        if not path.is_file():
+            return Path(sample["model_path"]), info
+        return path, self._infos.get(sample["obj_id"], info)
+
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
-        """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD."""
-        return {
-            **self.rotation_scores(errors["rotation"][chosen]),
-            "add_recall_0.1d": metrics.average_recall(errors["add"][chosen], metrics.ADD_THRESHOLDS),
-            "mssd_ar": metrics.average_recall(errors["mssd"][chosen], metrics.MSSD_THRESHOLDS),
-            "mspd_ar": metrics.average_recall(errors["mspd"][chosen], metrics.MSPD_THRESHOLDS),
-        }
+        """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD, and ``ar_rgb``, the
+        mean of these two."""
+        recalls = {}
+        for name in ("add_recall_0.1d", "mssd_ar", "mspd_ar"):
+            error, thresholds = self.measures[name]
+            recalls[name] = metrics.average_recall(errors[error][chosen], thresholds)
+        both = (recalls["mssd_ar"] + recalls["mspd_ar"]) / 2.0
+        return {**self.rotation_scores(errors["rotation"][chosen]), **recalls, "ar_rgb": both}
+
+    def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
+        folders = {s["obj_id"]: self._scored_model(s)[0].parent.name for s in samples}
+        models = {name: sorted(key for key, folder in folders.items() if folder == name) for name in folders.values()}
+        return {**super().summary(samples, rows, errors), "models": models, "vsd": NO_VSD}
+
+    def results_name(self, settings: Row) -> str:
+        """METHOD_DATASET-SPLIT.csv, which bop_toolkit takes apart at these signs."""
+        method = f"curvireg-{settings.get('preset', 'custom')}"
+        dataset = re.sub("[_-]", "", self.dataset.root.resolve().name)
+        return f"{method}_{dataset}-{self.dataset.split.replace('_', '-')}.csv"
 
     def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
-        return {"unoccluded": [s["visib_fract"] > UNOCCLUDED for s in samples]}
+        return {"unoccluded": [s["visib_fract"] >= UNOCCLUDED for s in samples]}
 
     def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
         """The results file of the BOP challenge, with all digits; it omits objects without an estimate."""

@@ -45,9 +45,9 @@ def evaluate(
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
 
-    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``summary.json`` and ``index.html``. A second call registers
-    only what is new, or depends on files or settings that have changed. Under ``torchrun``, each process registers a
-    part of the objects.
+    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``errors.csv``, ``summary.json`` and ``index.html``. A second
+    call registers only what is new, or depends on files or settings that have changed. Under ``torchrun``, each process
+    registers a part of the objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
@@ -133,8 +133,11 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
         "versions": {"curvireg_torch": __version__, "python": platform.python_version(), "torch": torch.__version__},
         "seconds": {**seconds, "register_each": seconds["register"] / len(rows) if rows else None},
     }
-    benchmark.write_predictions(store.folder / "predictions.csv", samples, rows, errors)
-    _write_page(benchmark, store.folder, scored, rows, next(iter(errors.values())))
+    for name in filter(None, ("predictions.csv", benchmark.results_name(settings))):
+        benchmark.write_predictions(store.folder / name, samples, rows, errors)
+    keys = [benchmark.entries[i].key for i in scored]
+    benchmark.write_errors(store.folder / "errors.csv", keys, samples, errors)
+    _write_page(benchmark, store.folder, scored, rows, errors[benchmark.page_error])
     write_file(store.folder / "summary.json", to_json(summary).encode())
     return summary
 

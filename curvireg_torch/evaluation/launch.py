@@ -6,6 +6,7 @@ A process that fails has printed its own message.
 import logging
 import sys
 
+from torch.distributed.elastic.multiprocessing.api import SignalException
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 from torch.distributed.run import main
 
@@ -15,3 +16,5 @@ if __name__ == "__main__":
         main(sys.argv[1:])
     except ChildFailedError:
         sys.exit(1)
+    except (KeyboardInterrupt, SignalException):
+        sys.exit(130)

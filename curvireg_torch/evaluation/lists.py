@@ -12,11 +12,11 @@ from typing import Any
 from ..data import Video
 from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
-from ..errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
+from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..registration.result import two_decimals
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
-from ..utils.files import FindFile, read_csv, write_csv
+from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .outputs import output_folder
@@ -47,6 +47,7 @@ def _entry(
     calibrations: Calibrations,
 ) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
+    find = found_in(folder)
     cells, count = _without_empty_end(cells, len(columns)), len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
     values = {name: shown[column].strip() for name, column in columns.items()}
@@ -55,16 +56,18 @@ def _entry(
             raise InvalidInputError(f"{len(cells)} cells, the header has {count}; quote texts with commas")
         if not values["photo"]:
             raise InvalidInputError("photo: empty; name a file")
-        meshes = (folder / values["mesh"],) if values.get("mesh") else options.meshes
+        meshes = (find(values["mesh"]),) if values.get("mesh") else options.meshes
         if not meshes:
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
-        box, camera = numbers_of(values, BOX), camera_of(values, folder.joinpath, calibrations) or options.guess
-        mask = folder / values["mask"] if values.get("mask") else None
+        numbers = numbers_of(values, BOX)
+        box = None if numbers is None else options.box_of(find(values["photo"]), numbers)
+        camera = camera_of(values, find, calibrations) or options.guess
+        mask = find(values["mask"]) if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**(options.limits or {}), **own})
-    except (InvalidInputError, MissingFileError) as error:
+    except CurviregError as error:
         return Entry(shown, values["photo"], error=str(error))
-    photo = folder / values["photo"]
+    photo = find(values["photo"])
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
@@ -111,8 +114,18 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
             common = options.entry(path)
             entries += [replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)]
         else:
-            entries += [options.entry(photo) for photo in find_photographs(path)]
+            entries += [_entry_of(photo, options) for photo in find_photographs(path)]
     return [replace(entry, cells={"photo": entry.name, **numbers}) for entry in entries]
+
+
+def _entry_of(photo: Path, options: RegisterOptions) -> Entry:
+    """The entry of a photograph; its ``error`` is why a detector's file has no box for it."""
+    try:
+        return options.entry(photo)
+    except CurviregError as error:
+        if options.boxes is None:
+            raise
+        return Entry(name=str(photo), photo=photo, meshes=options.meshes, error=str(error))
 
 
 def is_video(path: Path) -> bool:

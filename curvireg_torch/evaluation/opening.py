@@ -14,10 +14,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import BankError, InvalidInputError
-from ..utils.choices import DEFAULT, MESH_KINDS, PRESET_NAMES, RENDERER_NAMES, SIDE_NAMES, UNITS, UP_AXES
-from ..utils.files import finite_numbers, read_json
+from ..utils.choices import (
+    BOX_FORMATS,
+    DEFAULT,
+    MESH_KINDS,
+    PRESET_NAMES,
+    RENDERER_NAMES,
+    SIDE_NAMES,
+    START_CONVENTIONS,
+    UNITS,
+    UP_AXES,
+    VIDEOS,
+)
 
 if TYPE_CHECKING:
+    from ..data.box_files import Box, BoxFile
+    from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
@@ -106,6 +118,18 @@ class RegisterOptions:
     box: tuple[float, float, float, float] | None = _option(
         None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
     )
+    box_format: str | None = _option(
+        None,
+        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, height in px; fractions: "
+        "corners; yolo: centre, width, height in fractions of the picture",
+        choices=BOX_FORMATS,
+    )
+    boxes: Path | None = _option(
+        None,
+        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file of YOLO, or a folder "
+        "of these; PATH:LABEL takes one label",
+        type=Path,
+    )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
         "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
@@ -122,11 +146,26 @@ class RegisterOptions:
         None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
     )
     start: Path | None = _option(
-        None, "result.json, or any JSON with rotation and translation: refine this pose; needs no box", type=Path
+        None,
+        "refine this pose; needs no box: result.json, or JSON with rotation and translation or T_cam_from_model, 4 x 4 "
+        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the format has none",
+        type=Path,
+    )
+    start_convention: str | None = _option(
+        None,
+        "axes of the camera of --start: opencv, x right, y down, z forward (default); opengl, x right, y up, z back",
+        choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
-    unit: str = _option(
-        "m", "of the mesh file, and of lengths in and out (default: m; for a BOP scene mm)", choices=sorted(UNITS)
+    unit: str | None = _option(
+        None,
+        "of the mesh file, and of lengths in and out (default: that which the file states, as STEP, IGES, 3MF, Collada "
+        "and URDF do; else m; for a BOP scene mm)",
+        choices=sorted(UNITS),
+    )
+    link: str | None = _option(None, "link of a URDF whose mesh is registered (default: all, joints at zero)")
+    textures: Path | None = _option(
+        None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
     )
     unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
@@ -164,6 +203,12 @@ class RegisterOptions:
         """Whether the pipeline of a bank file applies, as none was chosen."""
         return self.preset is None and self.pipeline is None
 
+    def load_mesh(self, path: Path) -> Any:
+        """The mesh of a file, with the options that say how it is read."""
+        from ..mesh import load_mesh
+
+        return load_mesh(path, unit=self.unit, up=self.up, link=self.link, textures=self.textures)
+
     def open_pipeline(self) -> "Pipeline":
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
         from ..pipeline import Pipeline, preset_named
@@ -178,6 +223,33 @@ class RegisterOptions:
 
         return None if self.field is None else LearnedCurvilinearSaliency(weights=self.field)
 
+    @cached_property
+    def _box_file(self) -> "BoxFile | None":
+        from ..data.box_files import BoxFile
+
+        return None if self.boxes is None else BoxFile(self.boxes)
+
+    def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Box | None":
+        """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that of a detector."""
+        from ..data.box_files import pixel_box
+        from ..data.images import photo_size
+
+        numbers = self.box if numbers is None else numbers
+        if numbers is None:
+            return None if self._box_file is None else self._box_file.box(photo)
+        kind = self.box_format or "xyxy"
+        is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
+        return pixel_box(numbers, kind, photo_size(photo) if is_relative else None)
+
+    def read_start(self) -> "PoseFile | None":
+        """The pose of the file ``start``, or None."""
+        if self.start is None:
+            return None
+        from ..data.pose_files import read_pose
+
+        mesh = self.meshes[0].stem if self.meshes else ""
+        return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)
+
     def entry(self, photo: Path) -> "Entry":
         """A photograph with the box, camera, meshes and other inputs of these options."""
         from ..geometry import Camera, camera_matrix
@@ -185,9 +257,10 @@ class RegisterOptions:
 
         camera = self.guess if self.camera is None else self.camera
         camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
-        start, confidence = (None, None) if self.start is None else read_start(self.start)
-        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "box", "mask", "instances")}
-        same |= {"start": start, "start_confidence": confidence, "prior": prior_from_limits(self.limits or {})}
+        start = self.read_start()
+        box = self.box_of(photo)
+        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "mask", "instances")}
+        same |= {"box": box, "start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
@@ -240,28 +313,12 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
         raise InvalidInputError(f"--{error}") from error
 
 
-def read_start(path: Path) -> tuple[tuple[tuple[float, ...], ...], float | None]:
-    """(4, 4) pose ``T_cam_from_model`` of a JSON file that holds ``rotation`` and ``translation``, as result.json does,
-    and its ``confidence``, if the file has one.
-    """
-    from ..geometry.cameras import transform
-    from ..utils.checks import check_numbers, check_pose
-
-    content = read_json(path, dict, "docs/guides/known-pose.md")
-    if content.get("frame") == "world":
-        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
-        raise InvalidInputError(message, subject=path)
-    if "rotation" in content and content.get("translation", ...) is None:
-        message = "a result without a translation, as of a photograph without a camera; register with --camera first"
-        raise InvalidInputError(message, subject=path)
-    try:
-        numbers = [check_numbers(content.get(name), name, n) for name, n in (("rotation", 9), ("translation", 3))]
-        T = transform(numbers[0].view(3, 3), numbers[1])
-        check_pose(T, "rotation, translation")
-    except InvalidInputError as error:
-        raise error.with_subject(path) from error
-    confidence = finite_numbers([content.get("confidence")], 1)
-    return tuple(map(tuple, T.tolist())), confidence[0] if confidence else None
+def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
+    T = start.T.clone()
+    if start.unit is not None:
+        T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
+    return tuple(map(tuple, T.tolist()))
 
 
 def open_registrar(
@@ -293,31 +350,28 @@ def _open_bank(
     options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
 ) -> "ViewBank":
     from ..matching import ViewBank, cached_bank
-    from ..mesh import load_mesh
 
     if mesh.suffix != ".safetensors":
-        loaded = load_mesh(mesh, unit=options.unit, up=options.up)
+        loaded = options.load_mesh(mesh)
         return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
     bank = ViewBank.load(mesh)
-    _check_bank(options, bank, mesh)
-    return bank
-
-
-def _check_bank(options: RegisterOptions, bank: "ViewBank", path: Path) -> None:
-    """Refuse options that are about the mesh and that the bank was not built with."""
-    from ..mesh.mesh import mesh_unit, mesh_up
-
-    unit = mesh_unit(bank.mesh)
-    up = mesh_up(bank.mesh)
-    again = "or build it again with 'curvireg bank'"
-    if options.unit_is_given and options.unit != unit:
-        kind = f"with --unit {unit}" if unit else "without a unit"
-        message = f"built {kind}, not with --unit {options.unit}; leave --unit out, {again}"
-        raise BankError(message, subject=path)
-    if options.up not in (None, up):
-        message = f"built with --up={up}, not with --up={options.up}; leave --up out, {again}"
-        raise BankError(message, subject=path)
+    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
         built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=path)
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
+    return bank
+
+
+def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
+    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    built_unit = mesh_unit(bank.mesh)
+    built_up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if unit not in (None, built_unit):
+        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
+        raise BankError(f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path)
+    if up not in (None, built_up):
+        raise BankError(f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path)

@@ -25,8 +25,9 @@ FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,
     "demo": (*ONE_RESULT, "mesh.ply", "photo.png"),
     "register several": (*ROWS, "results.csv"),
-    "evaluate": (*ROWS, "summary.json", "predictions.csv", "errors.csv"),
+    "evaluate": (*ROWS, "summary.json", "predictions.csv", "errors.csv", "curvireg-*_*-*.csv"),
     "follow": ("results.csv", "overlay.mp4"),
+    "inspect": ("inspect.json", "inspect.html"),
 }
 """Names, or patterns of names, that each command may write into the folder of its results."""
 

@@ -18,12 +18,14 @@ from torch import Tensor
 from ..data import Photo, load_camera, read_photo
 from ..data.frames import VideoFrame
 from ..data.masks import mask_file
+from ..data.pose_files import PoseFile
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix, undistorted
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
 from ..mesh import load_mesh
+from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration, detect, refine
 from ..registration.inputs import ImageItem, image_item, image_items
@@ -32,7 +34,7 @@ from ..registration.result import detection_document, result_document
 from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .opening import CAMERA_OPTIONS
+from .opening import CAMERA_OPTIONS, check_bank, start_in_unit
 from .outputs import output_folder
 from .result_files import View, write_result
 
@@ -54,8 +56,7 @@ class Entry:
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
-    start: tuple[tuple[float, ...], ...] | None = None  # (4, 4) pose that is refined; nothing is searched for
-    start_confidence: float | None = None
+    start: PoseFile | None = None  # the pose that is refined; nothing is searched for
     views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
     as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
     label: str = ""  # of a dataset's object: a name that no other object has
@@ -69,7 +70,8 @@ class Entry:
         given = [self.name, self.box, camera, self.instances, prior]
         views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
         mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
-        return [*given, self.start, self.start_confidence, views, self.as_stored, *mask]
+        start = None if self.start is None else (self.start.T.tolist(), self.start.unit, self.start.confidence)
+        return [*given, start, views, self.as_stored, *mask]
 
     def read(self) -> Photo:
         """The photograph, or the frame; errors are those of :func:`read_photo`."""
@@ -143,7 +145,7 @@ def register(
     camera: Any = None,
     mask: Any = None,
     prior: PosePrior | None = None,
-    unit: str = "m",
+    unit: str | None = None,
     up: str | None = None,
     pipeline: Pipeline | None = None,
     progress: bool = True,
@@ -159,7 +161,8 @@ def register(
             "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.
         mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
         prior: limits on the pose.
-        unit, up: of a mesh file, see :func:`load_mesh`.
+        unit, up: of a mesh file, see :func:`load_mesh`; None: "m", and the usual axis. A bank must have been built with
+            those that are given.
         pipeline: the default is that of :class:`Registrar`.
         progress: show progress while the views of a mesh are rendered, the first time.
 
@@ -190,7 +193,13 @@ def register(
         camera = Camera(camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera)
     if isinstance(mesh, str | PathLike):
         meshes = (Path(mesh),)
-        mesh = ViewBank.load(mesh) if meshes[0].suffix == ".safetensors" else load_mesh(mesh, unit=unit, up=up)
+        if meshes[0].suffix == ".safetensors":
+            mesh = ViewBank.load(mesh)
+            check_bank(mesh, meshes[0], unit=unit, up=up)
+        else:
+            mesh = load_mesh(mesh, unit=unit or "m", up=up)
+    elif unit is not None or up is not None:
+        raise InvalidInputError("unit, up: of a mesh file; what is given as mesh has its own, leave them out")
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
     entry = Entry(name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
     return register_entry(entry, photo, registrar)
@@ -219,7 +228,9 @@ def register_entry(
     item = check_entry(entry, photo, camera)
     results: Sequence[Registration | FailedRegistration]
     if entry.start is not None:
-        results = refine(registrar, [photo.image], camera, [entry.start], start_confidences=[entry.start_confidence])
+        start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
+        confidences = [entry.start.confidence]
+        results = refine(registrar, [photo.image], camera, [start_pose], start_confidences=confidences)
     elif entry.views:
         assert camera is not None  # of datasets with cameras only
         first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))

@@ -69,7 +69,10 @@ DATASETS: dict[str, DatasetSpec] = {
         root="folder with models and the split's folder",
         example="data/bop/lm",
         category="object {obj_id}",
-        options={"split": {"default": "test", "help": "folder of the scenes (default: test)"}},
+        options={
+            "split": {"default": "test", "help": "folder of the scenes (default: test)"},
+            "models": {"default": "models", "help": "folder of the meshes (default: models)"},
+        },
     ),
     "web": DatasetSpec(
         dataset="curvireg_torch.data:PoseFolder",

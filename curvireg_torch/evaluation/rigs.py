@@ -20,7 +20,7 @@ from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
 from ..registration.result import result_document
 from ..utils.checks import check_pose
-from ..utils.files import FindFile, check_table_size, finite_numbers, read_csv, read_json
+from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
 from .photograph import register_views
 from .result_files import View
@@ -37,7 +37,7 @@ def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = No
     rig names, by default from its own folder on.
     """
     folder = path if path.is_dir() else path.parent
-    find = find or folder.joinpath
+    find = find or found_in(folder)
     if path.is_dir():
         if (path / "images.txt").is_file():
             return _checked(path, _colmap(path, find))
@@ -166,7 +166,9 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
     for key, camera in cameras.items():
-        names = [f"{kind}/{key.zfill(6)}{end}" for kind in ("rgb", "gray") for end in (".png", ".jpg", ".tif")]
+        numbers = dict.fromkeys((key.zfill(6), key.zfill(4), key))
+        ends = [f"{number}{end}" for number in numbers for end in (".png", ".jpg", ".tif")]
+        names = [f"{kind}/{end}" for kind in ("rgb", "gray") for end in ends]
         pictures = list(map(find, names))
         photo = next(filter(os.path.isfile, pictures), pictures[0])
         values = camera if isinstance(camera, dict) else {}

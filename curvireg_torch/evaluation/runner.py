@@ -68,7 +68,8 @@ def run_entries(
     with workers() as group:
         if group.rank == 0:
             for name in reports:
-                (out / name).unlink(missing_ok=True)
+                for path in out.glob(name):
+                    path.unlink()
         group.wait()
         store = ResultStore(out, group)
         order = {meshes: place for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))}

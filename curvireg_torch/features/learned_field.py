@@ -131,7 +131,8 @@ class LearnedCurvilinearSaliency(nn.Module):
 
     Shape:
         Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0. Computed at a shorter
-        side of ``WORK_SIZE`` px. Missing pixels (NaN or infinite) give 0. dtype kept. Differentiable.
+        side of ``WORK_SIZE`` px. Missing pixels (NaN or infinite) give 0. Differentiable. The output has the dtype of
+        the input; the network computes in that of its weights, which ``.half()`` and ``.bfloat16()`` convert.
 
     Raises:
         InvalidInputError: wrong shape or dtype, or a file whose weights do not fit this network.
@@ -178,11 +179,14 @@ class LearnedCurvilinearSaliency(nn.Module):
         H, W = image.shape[-2:]
         zoom = WORK_SIZE / max(min(H, W), max(H, W) / MAX_ASPECT)
         size = [max(1, round(side * zoom / 16)) * 16 for side in (H, W)]
-        x = ops.fill_missing(image.to(self.network.head.weight.dtype)).expand(-1, 3, -1, -1)
+        weight = self.network.head.weight
+        # Resized in float32 at least: on a CPU, torch has no antialiasing of half types.
+        x = ops.fill_missing(image.to(ops.at_least_float32(weight[:0]).dtype)).expand(-1, 3, -1, -1)
         if size != [H, W]:
             x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=True)
-        x = self.network(x.contiguous(memory_format=torch.channels_last))
-        return F.interpolate(x.contiguous(), (H, W), mode="bilinear", align_corners=False)
+        x = self.network(x.to(weight.dtype).contiguous(memory_format=torch.channels_last))
+        x = ops.at_least_float32(x).contiguous()
+        return F.interpolate(x, (H, W), mode="bilinear", align_corners=False)
 
     def extra_repr(self) -> str:
         return f"weights={self.weights!r}"

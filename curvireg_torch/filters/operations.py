@@ -31,7 +31,9 @@ def squared_length(x: Tensor, y: Tensor) -> Tensor:
 def full_precision(x: Tensor) -> AbstractContextManager[object]:
     """Disable autocast: a second derivative has no correct digit left in bfloat16."""
     device = x.device.type
-    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else nullcontext()
+    if not torch.amp.is_autocast_available(device) or not torch.is_autocast_enabled(device):  # such as "meta"
+        return nullcontext()
+    return torch.autocast(device, enabled=False)
 
 
 def at_least_float32(x: Tensor) -> Tensor:

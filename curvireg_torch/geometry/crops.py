@@ -33,7 +33,9 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
                 f"{name}: coordinates beyond {MAX_BOX_COORDINATE:g} px; give pixel coordinates of the {W} x {H} image"
             )
         if x1 <= x0 or y1 <= y0:
-            raise InvalidInputError(f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height")
+            raise InvalidInputError(
+                f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height, or --box-format xywh"
+            )
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
             raise InvalidInputError(f"{name}: entirely outside the {W} x {H} image; give its pixel coordinates")
 

@@ -19,17 +19,19 @@ from ..errors import BankError, CurviregError, InvalidInputError, MissingFileErr
 from ..geometry.viewpoint import ViewSphere, up_rotation
 from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
+from ..mesh.mesh import as_mesh, checked_triangles, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
-from ..terms import Whitening, ledoit_wolf
-from ..utils.checks import check_symmetries, check_tensor
+from ..terms import Precision, Whitening, ledoit_wolf
+from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
+from ..utils.choices import UNITS, UP_AXES
 from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 8
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
+EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
 
 
@@ -85,8 +87,13 @@ class ViewBank:
 
     @cached_property
     def whitening(self) -> Whitening:
-        """Mean and shrunk covariance of the views' descriptors, for :class:`Correlation`."""
+        """By mean and shrunk covariance of the views' descriptors, for ``Correlation(whitening="bank")``."""
         return Whitening(*ledoit_wolf(self.descriptors))
+
+    @cached_property
+    def precision(self) -> Precision:
+        """Inverse of the shrunk covariance of the views' descriptors, for ``Correlation(whitening="paper")``."""
+        return Precision(self.descriptors)
 
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""
@@ -251,8 +258,10 @@ class ViewBank:
             raise
         except (SafetensorError, OSError) as error:
             raise BankError(f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path) from error
-        except (KeyError, TypeError, ValueError, CurviregError) as error:
-            raise BankError(f"incomplete bank ({error!r}); {REBUILD}", subject=path) from error
+        except Exception as error:  # a file may hold anything
+            reason = str(error) if isinstance(error, CurviregError) else repr(error)
+            reason = reason.partition("\n")[0][:200]
+            raise BankError(f"incomplete bank ({reason}); {REBUILD}", subject=path) from error
         return cls(mesh, views, pipeline, tensors).to(device)
 
 
@@ -280,8 +289,10 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     mesh._cache.update({n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors})
     if len(mesh.faces) > VIEW_FACES:
         mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
-    check_tensor(extreme_points(mesh), "extreme_points", (None, 3))
+    _check_extreme_points(mesh)
+    check_option(up, UP_AXES, "up")
     if unit:
+        check_option(unit, UNITS, "unit")
         mesh.units = unit
     mesh.metadata["up"] = up
     if "mesh.colours.uv" in tensors:
@@ -296,10 +307,27 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
 
 
 def _triangles(tensors: Mapping[str, Tensor], name: str) -> trimesh.Trimesh:
-    vertices, faces = (tensors[f"{name}.{part}"].numpy() for part in ("vertices", "faces"))
-    if faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all():
+    vertices = tensors[f"{name}.vertices"]
+    faces = tensors[f"{name}.faces"]
+    check_tensor(vertices, f"{name}.vertices", (None, 3))
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype != torch.int32 or not len(faces):
         raise ValueError(f"{name}: not a mesh")
-    return trimesh.Trimesh(vertices=vertices, faces=faces, process=False)
+    mesh = trimesh.Trimesh(vertices=vertices.double().numpy(), faces=faces.numpy(), process=False)
+    checked_triangles(mesh, name)
+    return mesh
+
+
+def _check_extreme_points(mesh: trimesh.Trimesh) -> None:
+    """Raise for points that do not fill the mesh's box, as those outermost in all directions do."""
+    points = extreme_points(mesh)
+    check_tensor(points, "extreme_points", (None, 3))
+    if points.dtype != torch.float64:
+        raise ValueError("extreme_points: expected float64")
+    check_finite(points, "extreme_points")
+    bounds = torch.stack([points.amin(dim=0), points.amax(dim=0)]) if len(points) else torch.full((2, 3), torch.nan)
+    gap = (bounds - torch.from_numpy(np.array(mesh.bounds))).abs().max()
+    if not float(gap) <= EXTREME_TOLERANCE * mesh_radius(mesh):
+        raise ValueError("extreme_points: those of another mesh")
 
 
 def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
@@ -323,6 +351,8 @@ def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[
         # A sum in float32 is finite if all half-precision values are, and fast.
         if x.shape != (N, width) or (x.is_floating_point() and not bool(x.sum(dtype=torch.float32).isfinite())):
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
+    if any(tensors[name].dtype != torch.uint8 for name in ("points", "silhouettes")):
+        raise ValueError("points, silhouettes: expected uint8")
     if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
         raise ValueError("viewpoints that are not finite")
     if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():

@@ -1,15 +1,16 @@
 """All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ..errors import InvalidInputError
 from ..features import field_points
 from ..geometry import ViewSphere
 from ..mesh import mesh_radius
@@ -17,19 +18,23 @@ from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..terms import (
     Appearance,
+    Comparison,
     Correlation,
     QueryFeatures,
+    Term,
     crop_regions,
     jittered_boxes,
     photograph_field,
     whole_box_shapes,
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
+from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import VIEWS_AT_A_TIME, ViewBank, packed
 from .cells import DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
+_PREPARED = ("_terms", "_described_views", "_packing", "describer")  # attributes that follow from bank and pipeline
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
@@ -115,6 +120,9 @@ class ViewMatcher(nn.Module):
     The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
     :class:`curvireg_torch.Registrar` prevents that.
 
+    It computes in float32, also under autocast: ``.half()`` and other dtypes are refused. ``.to(device)`` moves bank,
+    terms and field. A copy, also by pickle, has a bank of its own.
+
     Args:
         bank: the views of a mesh.
         pipeline: field, terms and box jitter; default the bank's.
@@ -147,13 +155,44 @@ class ViewMatcher(nn.Module):
         bank.check_compatible(pipeline)
         pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
         self.bank, self._renderer = bank, renderer
-        self._described_views = DescribedViews(bank.described_views_file)
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
-        terms = [term for term in pipeline.terms if term.weight > 0]
-        self._terms = [(term, term.build(bank)) for term in terms if not isinstance(term, Appearance)]
-        self._appearance = next((term.build().to(bank.device) for term in terms if isinstance(term, Appearance)), None)
+        appearance = next((term for term in pipeline.terms if isinstance(term, Appearance) and term.weight > 0), None)
+        self._appearance = None if appearance is None else appearance.build().to(bank.device)
+        self._prepare()
+
+    @in_full_precision
+    def _prepare(self) -> None:
+        """Compute from bank and pipeline what is on the bank's device, and is not copied."""
+        for name in _PREPARED:
+            self.__dict__.pop(name, None)
+        self._described_views = DescribedViews(self.bank.described_views_file)
+        terms = [term for term in self.pipeline.terms if term.weight > 0 and not isinstance(term, Appearance)]
+        self._terms: list[tuple[Term, Comparison]] = [(term, term.build(self.bank)) for term in terms]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Move to another device. Modules convert their tensors by a function: what it does to one of float32 tells."""
+        moved = fn(torch.zeros(0, device=self.bank.device))
+        if moved.dtype != torch.float32:
+            raise InvalidInputError(f"ViewMatcher: computes in float32, got {moved.dtype}; convert its field only")
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        if moved.device != self.bank.device:
+            self.bank = self.bank.to(moved.device)
+            self._prepare_on_one_thread()
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is computed from the rest: comparisons and renderers cannot be pickled."""
+        return {name: x for name, x in self.__dict__.items() if name not in _PREPARED}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        self._prepare_on_one_thread()
+
+    def _prepare_on_one_thread(self) -> None:
+        """Whatever number of threads torch has, rounding is that of a matcher which the registrar built."""
+        map_on_threads(lambda _: self._prepare(), [0])
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
@@ -168,6 +207,7 @@ class ViewMatcher(nn.Module):
         """
         return self.rank(self.query(images, boxes))
 
+    @in_full_precision
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
         settings = self.bank.settings
@@ -180,6 +220,7 @@ class ViewMatcher(nn.Module):
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
         return self.describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
 
+    @in_full_precision
     def describe(self, regions: Tensor, shapes: Tensor) -> QueryFeatures:
         """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
         B, K = regions.shape[:2]
@@ -194,6 +235,7 @@ class ViewMatcher(nn.Module):
             mask=None if mask is None else mask.unflatten(0, (B, K))[:, 0],
         )
 
+    @in_full_precision
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
         """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
         views out, whose score is 0."""
@@ -210,6 +252,7 @@ class ViewMatcher(nn.Module):
             outside = outside.masked_fill(best == -torch.inf, -1)
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)
 
+    @in_full_precision
     def similarity(self, query: QueryFeatures, allowed: Tensor | None = None) -> Tensor:
         """(B,) normalised correlation of the view that is best without the appearance term, at a fraction of the cost
         of :meth:`rank`."""
@@ -227,6 +270,7 @@ class ViewMatcher(nn.Module):
         )
 
     @torch.no_grad()
+    @in_full_precision
     def compare_views(self, query: QueryFeatures, views: ViewSphere) -> Tensor:
         """(N,) log scores of further views of the mesh for one described photograph, 0 for the best of them, by all
         terms but appearance; mu and Sigma of whitened descriptors are those of the bank."""
@@ -235,8 +279,9 @@ class ViewMatcher(nn.Module):
         described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
         tensors = {name: torch.cat([part[name] for part in described]) for name in described[0]}
         few = ViewBank(self.bank.mesh, views, self.bank.pipeline, tensors)
-        if any(getattr(term, "whitening", "none") != "none" for term, _ in self._terms):
-            few.whitening = self.bank.whitening
+        for whitening, name in (("bank", "whitening"), ("paper", "precision")):
+            if any(getattr(term, "whitening", "none") == whitening for term, _ in self._terms):
+                setattr(few, name, getattr(self.bank, name))
         scores = [term.weight * term.log_score(term.build(few)(query)) for term, _ in self._terms]
         log = torch.stack(scores).sum(dim=0)[0]
         return log - log.max()
@@ -290,6 +335,7 @@ class ViewMatcher(nn.Module):
         chunks = [views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
+    @in_full_precision
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
         """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
         that of the most similar view of its ranking."""

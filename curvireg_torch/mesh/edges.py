@@ -107,9 +107,11 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     """Vertices at the same place joined, and each triangle once, without those of no area."""
     cell = np.ptp(vertices, axis=0).max() * WELD
     index, inverse = _unique(np.round(vertices / cell).astype(np.int64))
-    vertices, faces = vertices[index], inverse[faces]
-    a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
+    a, b, c = inverse[faces].T
+    has_area = (a != b) & (b != c) & (c != a)
+    if not has_area.any():  # parts that are smaller than a cell: welding would leave nothing of the mesh
+        return vertices, faces
+    vertices, faces = vertices[index], inverse[faces][has_area]
     first, _ = _unique(np.sort(faces, axis=1))
     return vertices, faces[np.sort(first)]
 

@@ -11,12 +11,15 @@ import numpy as np
 
 from ..errors import MAX_MESH_LINES, CurviregError, MeshError
 from ..utils.files import file_digest, text_digest
+from .cad import read_collada, read_step
 from .gltf import read_gltf
 from .obj import read_obj
 from .ply import read_ply
 from .polygons import triangles_of_faces
 from .source import MeshSource, ReadMesh, plain_text
 from .stl import read_stl
+from .threemf import read_threemf
+from .urdf import read_urdf
 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it would print tracebacks of files that it cannot read
 # Formats whose files may name buffers, material files, textures or meshes beside them
@@ -49,6 +52,8 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of values that as_mesh reports
+            if suffix == ".urdf":
+                return read_urdf(source, read_source, link)
             return READERS[suffix](source)
     except CurviregError as error:
         raise error.with_subject(path) from None
@@ -80,10 +85,16 @@ def read_off(source: MeshSource) -> ReadMesh:
 
 
 READERS: dict[str, Callable[[MeshSource], ReadMesh]] = {
+    ".3mf": read_threemf,
+    ".dae": read_collada,
     ".glb": read_gltf,
     ".gltf": read_gltf,
+    ".iges": read_step,
+    ".igs": read_step,
     ".obj": read_obj,
     ".off": read_off,
     ".ply": read_ply,
+    ".step": read_step,
     ".stl": read_stl,
+    ".stp": read_step,
 }

@@ -18,9 +18,10 @@ from torch import Tensor
 from ..errors import MAX_MESH_COORDINATE, MAX_MESH_FACES, MIN_MESH_EXTENT, CurviregWarning, MeshError, MissingFileError
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
-from .colours import SurfaceColours, colours_of_parts
+from .colours import colours_of_parts
 from .files import read_source
 from .health import precision_warning, stray_faces, stray_warning
+from .scenes import joined_scene
 from .source import MeshSource, MeshWarning
 
 Found = TypeVar("Found")
@@ -99,14 +100,14 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
     noticed = list(mesh_warnings(source)) if isinstance(source, trimesh.Trimesh) else []
     if isinstance(source, trimesh.Scene):
         try:
-            source, colours = _joined(source)
+            source, colours = joined_scene(source)
         except Exception as error:  # singular transforms, unconnected parts, malformed vertices
             raise MeshError(f"its parts cannot be put together ({error}); re-export the file", subject=name) from error
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
         raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
-    triangles, is_degenerate = _checked_triangles(source, name)
+    triangles, is_degenerate = checked_triangles(source, name)
     vertices = np.asarray(source.vertices, dtype=np.float64)
     mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
     colours = None if colours is None else colours[~is_degenerate]
@@ -137,8 +138,8 @@ def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
 MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
 
 
-def _checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(F, 3) faces, and (F,) whether a face has no area."""
+def checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(F, 3) faces, and (F,) whether a face has no area; :class:`MeshError` for triangles that are no mesh."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) > MAX_MESH_FACES:
         raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
@@ -181,36 +182,6 @@ def format_up(suffix: str) -> str:
 def mesh_up(mesh: trimesh.Trimesh) -> str:
     """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in the file's frame."""
     return str(mesh.metadata.get("up", "z"))
-
-
-def _joined(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColours | None]:
-    """One mesh of a scene's parts at their places: ``scene.dump()`` takes time with the cube of a part's depth, and
-    would pack textures into one that cannot repeat."""
-    geometry = {name: part for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)}
-    colours = dict(zip(geometry, colours_of_parts(geometry.values()), strict=True))
-    forest = scene.graph.transforms
-    world = {scene.graph.base_frame: np.eye(4)}
-    parts, found = [], []
-    for node in scene.graph.nodes_geometry:
-        path = [node]
-        while path[-1] not in world and path[-1] in forest.parents:
-            path.append(forest.parents[path[-1]])
-        if path[-1] not in world:  # not below the base frame: trimesh searches the graph
-            world[path[-1]] = scene.graph.get(path[-1])[0]
-        for child, parent in zip(path[-2::-1], path[:0:-1], strict=True):
-            world[child] = world[parent] @ forest.edge_data[parent, child].get("matrix", np.eye(4))
-        name = forest.node_data[node]["geometry"]
-        if name in geometry:
-            bare = trimesh.Trimesh(geometry[name].vertices, geometry[name].faces, process=False)
-            parts.append(bare.apply_transform(world[node]))
-            found.append(colours[name])
-    if not parts:
-        return None, None
-    mesh = trimesh.util.concatenate(parts)
-    if all(each is None for each in found):
-        return mesh, None
-    known = [each or SurfaceColours.plain(len(part.faces)) for each, part in zip(found, parts, strict=True)]
-    return mesh, SurfaceColours.concatenate(known)
 
 
 def cached_in_mesh(function: Callable[[trimesh.Trimesh], Found]) -> Callable[[trimesh.Trimesh], Found]:

@@ -98,6 +98,16 @@ class MeshSource:
             raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
         return self.path.read_bytes()
 
+    def beside(self, path: Path) -> "MeshSource":
+        """The source of another mesh file that this one names; what it requests and reads counts for this one."""
+        other = MeshSource(path, [self.folder, *self.extra])
+        other.requested = self.requested
+        other._bytes_left = self._bytes_left - path.stat().st_size
+        if other._bytes_left < 0:
+            raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
+        self._bytes_left = other._bytes_left
+        return other
+
     def warn(self, kind: str, text: str) -> None:
         """Note a warning, once, and of each kind a few only."""
         same = [warning for warning in self.warnings if warning.kind == kind]
@@ -124,12 +134,14 @@ class MeshSource:
 
     def _places(self, name: str) -> list[Path]:
         """Where in the folders a file of a name may be, existing or not."""
-        names = self._relative_names(name)
-        inside = [place for place in names if place.is_relative_to(self.folder)]
+        relative = self._relative_name(name)
+        if relative is None:
+            return []
+        beside = (self.folder / relative).resolve()
+        inside = [beside] if beside.is_relative_to(self.folder) else []
         for folder in self.extra:
-            inside += [place for place in names if place.is_relative_to(folder)]
-            base = PurePosixPath(name.replace("\\", "/")).name
-            inside += [(folder / base).resolve()]
+            places = [beside, (folder / relative).resolve(), (folder / relative.name).resolve()]
+            inside += [place for place in places if place.is_relative_to(folder) and place not in inside]
         return inside
 
     def read(self, name: str) -> bytes:
@@ -185,14 +197,14 @@ class MeshSource:
             raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
         return path.read_bytes()
 
-    def _relative_names(self, name: str) -> list[Path]:
-        """Places that a name may mean: backslashes separate folders too, and of absolute names the last part counts."""
+    @staticmethod
+    def _relative_name(name: str) -> PurePosixPath | None:
+        """A name as a relative path: backslashes separate folders too, and of absolute names the last part counts."""
         if "://" in name or "\0" in name or not name.strip():
-            return []
+            return None
         path = PurePosixPath(name.replace("\\", "/"))
         is_absolute = path.is_absolute() or ":" in path.parts[0]
-        parts = [path.name] if is_absolute else [str(path)]
-        return [(self.folder / part).resolve() for part in parts]
+        return PurePosixPath(path.name) if is_absolute else path
 
     def _existing(self, path: Path) -> Path | None:
         """The file itself, or one whose name differs in upper and lower case only."""

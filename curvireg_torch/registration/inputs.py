@@ -37,6 +37,8 @@ from ..utils.checks import (
 from .framing import clipped
 
 MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
+MAX_FRACTION = 1.5  # largest coordinate of a box that is probably meant in fractions of the picture
+FRACTIONS = "box: in px, not fractions of the photograph; multiply them, or give --box-format fractions, or yolo"
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
@@ -137,6 +139,8 @@ def image_items(
         try:
             item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
+                if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
+                    raise InvalidInputError(FRACTIONS)
                 small = min(item.size) < MIN_BOX_SIDE
                 where = "the photograph has" if small else "the part of the photograph in the box has"
                 message = f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"

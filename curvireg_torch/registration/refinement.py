@@ -25,6 +25,7 @@ from .poses import (
     similarities,
 )
 from .result import FailedRegistration, Registration
+from .starts import why_outside
 from .tracker import OUTSIDE, boxes_at
 
 if TYPE_CHECKING:
@@ -87,10 +88,12 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     describer, K = registrar.describer, item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
-        raise LostObjectError(OUTSIDE)
+        raise LostObjectError(why_outside(describer.hull, T[0], K, item.size))
     T, boxes = T[visible], boxes[visible]
     if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
-        raise LostObjectError(f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance")
+        problem = why_outside(describer.hull, T[0], K, item.size)
+        tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
+        raise LostObjectError(tiny if problem == OUTSIDE else problem)
     images, each = [item.image] * len(T), torch.arange(len(T))
     query = registrar.matcher.query(images, boxes.float())
     check_crop(query.crops[0])

@@ -22,6 +22,7 @@ from ..rendering import DepthRenderer
 from ..terms import QueryFeatures
 from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .confidence import MIN_LANDMARKS, are_near
 from .contour_fit import measure_contours
@@ -166,6 +167,7 @@ class Registrar:
         self.mesh_is, self.symmetries, self.progress = mesh_is, symmetries, progress
 
     @torch.no_grad()
+    @in_full_precision
     def __call__(
         self,
         images: Tensor | Sequence[Any],
@@ -206,10 +208,12 @@ class Registrar:
             results = [better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)]
         return results
 
+    @in_full_precision
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
+    @in_full_precision
     def register_views(
         self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
     ) -> Registration:
@@ -467,8 +471,7 @@ class Registrar:
         if work.limits is not None:
             poses = work.limits.moved_inside(poses)
         distinct = torch.ones(len(poses), dtype=torch.bool)
-        by_rank = replace(work, exact=False)
-        return judged(self, by_rank, poses, self._features(work, poses), distinct, ~distinct)
+        return judged(self, replace(work, exact=False), poses, self._features(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""

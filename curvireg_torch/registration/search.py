@@ -88,7 +88,7 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
     steps, width, farther = NEIGHBOUR_STEPS, ANGLE_STEP, DISTANCE_STEP
     pose = rotations[order[0]], distances[order[0]]
     for _ in range(MAX_ROUNDS):
-        best = order[:BEST_VIEWS] if perspective else _different(rotations, order)
+        best = order[:BEST_VIEWS] if perspective else different_views(rotations, order, BEST_VIEWS)
         near = angles_near(angles[best], angles[best[0]])
         coherent = coherent_views(near, steps)
         chosen, away = near[coherent], distances[best[coherent]]
@@ -111,12 +111,12 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
     return pose[0] @ frame, pose[1] * mesh_radius(bank.mesh)
 
 
-def _different(rotations: Tensor, order: Tensor) -> Tensor:
-    """The first views of ``order`` (N,) with different rotations (N, 3, 3), :data:`BEST_VIEWS` of them."""
+def different_views(rotations: Tensor, order: Tensor, count: int) -> Tensor:
+    """(K,) the first ``count`` views of ``order`` (N,) whose rotations (N, 3, 3) differ; fewer if there are no more."""
     chosen: list[int] = []
     for view in order.tolist():
         if all(float((rotations[view] - rotations[other]).abs().max()) > 1e-4 for other in chosen):
             chosen.append(view)
-        if len(chosen) == BEST_VIEWS:
+        if len(chosen) == count:
             break
     return torch.tensor(chosen, dtype=torch.long)

@@ -14,8 +14,15 @@ UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.304
 PHONE_IMAGES = (".avif", ".heic", ".heif")  # which optional decoders read
 IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp", *PHONE_IMAGES)
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp", ".iges", ".igs", ".dae", ".urdf")
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
+
+BOX_FORMATS = ("xyxy", "xywh", "fractions", "yolo")
+"""Four numbers of a box: corners in px; corner, width and height in px; corners, and centre, width and height, in
+fractions of the picture."""
+
+START_CONVENTIONS = ("opencv", "opengl")
+"""Axes of the camera of a given pose: x right, y down, z forward; or x right, y up, z backward."""
 
 MESH_KINDS = ("exact", "similar")
 """Whether a mesh is that of the photographed object itself, or of another one of its kind."""

@@ -12,9 +12,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
 from ..errors import MAX_TABLE_BYTES, InvalidInputError, MissingFileError, OutputError
@@ -124,20 +124,37 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping
     write_file(path, save(content, dict(metadata or {})))
 
 
+def terminable() -> AbstractContextManager[None]:
+    """Context in which SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: every ``finally``
+    runs, and no partial file remains."""
+    return signals_handled([signal.SIGTERM, *hangup_signals()], _exit_after)
+
+
 @contextmanager
-def terminable() -> Iterator[None]:
-    """Context in which SIGTERM ends the process as Ctrl-C does: every ``finally`` runs, and no partial file remains."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+def signals_handled(numbers: Iterable[int], handler: Callable[[int, Any], object]) -> Iterator[None]:
+    """Context in which signals call ``handler``; in the main thread, as others cannot handle signals."""
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, before in previous.items():
+            signal.signal(number, before)
 
 
-def read_json(path: Path, kind: type[Any], readme: str) -> Any:
+def hangup_signals() -> list[int]:
+    """SIGHUP, where the system has it and nohup does not ignore it."""
+    hangup = getattr(signal, "SIGHUP", None)
+    return [] if hangup is None or signal.getsignal(hangup) is signal.SIG_IGN else [hangup]
+
+
+def _exit_after(number: int, _: object) -> None:
+    sys.exit(128 + number)
+
+
+def read_json(path: Path, kind: type[Any] | tuple[type[Any], ...], readme: str) -> Any:
     """The content of a JSON file whose top level must be a ``kind`` (dict or list)."""
     if not path.is_file():
         raise MissingFileError(f"no such file; {readme} shows the layout", subject=path)
@@ -147,9 +164,20 @@ def read_json(path: Path, kind: type[Any], readme: str) -> Any:
     except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path) from error
     if not isinstance(content, kind):
-        expected = "an object" if kind is dict else "a list"
+        expected = "a list" if kind is list else "an object"
         raise InvalidInputError(f"expected {expected} of JSON; {readme} shows the layout", subject=path)
     return content
+
+
+def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
+    """The file and the name of ``FILE:NAME``; a file or folder that exists has no name."""
+    file = Path(path)
+    text = str(path)
+    while not os.path.exists(file) and ":" in str(file):  # unlike Path.exists, whatever the name is
+        file = Path(str(file).rpartition(":")[0])
+    if not os.path.exists(file):
+        return Path(path), ""
+    return file, text[len(str(file)) + 1 :]
 
 
 def read_csv(path: Path) -> list[list[str]]:
@@ -172,6 +200,22 @@ def file_name(text: str) -> str:
     last = text.replace("\\", "/").rpartition("/")[2]
     name = "".join(c for c in last if c.isprintable()).strip(" .")
     return name[-MAX_NAME:] or "file"
+
+
+def found_in(folder: Path) -> FindFile:
+    """A :data:`FindFile` of any name in ``folder``; one with backslashes, as Windows writes them, is read as there.
+
+    Example:
+        >>> found_in(Path("lists"))("shots\\\\0.png").as_posix()
+        'lists/shots/0.png'
+    """
+
+    def find(name: str) -> Path:
+        path = folder / name
+        is_posix = "\\" not in name or os.path.exists(path)
+        return path if is_posix else folder.joinpath(*PureWindowsPath(name).parts)
+
+    return find
 
 
 def only_in(folder: Path) -> FindFile:

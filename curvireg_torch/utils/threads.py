@@ -8,6 +8,8 @@ from typing import TypeVar
 
 import torch
 
+from .precision import full_precision
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -17,6 +19,7 @@ photograph, one takes 0.58, four 0.43, sixteen 0.60. Processes do not share it: 
 
 _this_thread = threading.local()
 _threads_for_jobs = 1
+_starting = threading.Lock()  # of the threads of a pool: meanwhile torch's number for the process is 1
 
 
 @contextmanager
@@ -71,10 +74,12 @@ def map_on_threads(
 
     There a result depends neither on the number of items nor on the number of threads, which would change its rounding.
     Threads that are left over help with :func:`for_each`. For other devices than the CPU, jobs run in sequence here.
+    Autocast is off, as on a new thread.
     """
     threads = available_threads()
     if threads == 1 or torch.device(device).type != "cpu":
-        return [job(item) for item in items]
+        with full_precision():
+            return [job(item) for item in items]
     threads_each, with_gradients = max(1, threads // max(1, len(items))), torch.is_grad_enabled()
 
     def run(item: Item) -> Result:
@@ -92,17 +97,44 @@ def single_threaded_pool() -> Iterator[ThreadPoolExecutor]:
 
     Operations on a few images are too short to divide. After an error, jobs that have not started are cancelled.
     """
-    threads = torch.get_num_threads()
-    with ThreadPoolExecutor(available_threads(), initializer=_compute_single_threaded) as pool:
+    workers = available_threads()
+    with ThreadPoolExecutor(workers, initializer=_compute_single_threaded) as pool:
         try:
+            _start(pool, workers)
             yield pool
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _start(pool: ThreadPoolExecutor, workers: int) -> None:
+    """Start all threads of a pool, and let torch count threads for the process as before.
+
+    A thread takes this number over with its first call of torch, and keeps it: those that the caller starts during the
+    jobs would compute single-threaded ever after.
+    """
+    with _starting:
+        threads = _on_new_thread(torch.get_num_threads)
+        started = threading.Barrier(workers + 1)
+        try:
+            for _ in range(workers):
+                pool.submit(started.wait)
+            started.wait()
+        except BaseException:
+            started.abort()  # a thread that cannot be started must not keep the others waiting
+            raise
         finally:
-            torch.set_num_threads(threads)  # some libraries count threads for the whole process
+            _on_new_thread(lambda: torch.set_num_threads(threads))
+
+
+def _on_new_thread(function: Callable[[], Result]) -> Result:
+    """The result of a function of a thread of its own: it reads and sets torch's number for the process, not the one
+    that the calling thread has kept."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(function).result()
 
 
 def _compute_single_threaded() -> None:
     _this_thread.threads = 1
+    torch.get_num_threads()  # a thread's first call takes over the number of the process, which is set back
     torch.set_num_threads(1)

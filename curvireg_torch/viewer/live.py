@@ -1,7 +1,9 @@
 """A page with the latest frame of a video and the contours of its pose: ``curvireg follow --show``."""
 
 import sys
+import tempfile
 import threading
+from pathlib import Path
 from typing import Any, Self
 
 from nicegui import app, ui
@@ -35,7 +37,8 @@ class LivePage:
         app.get("/frame")(self._send)
         ui.page("/")(self._build)
         self._listener = listen(HOST, 0)
-        self._server = make_server(self._listener, HOST, browser=True, printed_to=sys.stderr)
+        self._folder = tempfile.TemporaryDirectory(prefix="curvireg-follow-")
+        self._server = make_server(self._listener, HOST, browser_folder=Path(self._folder.name), printed_to=sys.stderr)
         self._thread = threading.Thread(target=self._server.run, args=([self._listener],), daemon=True)
         self._thread.start()
         return self
@@ -46,6 +49,7 @@ class LivePage:
         self._server.should_exit = True
         self._thread.join(STOP_SECONDS)
         self._listener.close()
+        self._folder.cleanup()
 
     def show(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
         """Take the next frame; dropped while the one before is on its way."""

@@ -1,6 +1,9 @@
 """The server of the viewer: its secret address, what it refuses, the page, its files and uploads."""
 
 import errno
+import ipaddress
+import os
+import re
 import secrets
 import socket
 import sys
@@ -17,14 +20,13 @@ import uvicorn
 from fastapi import FastAPI
 from nicegui import app, ui
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import MAX_MESH_BYTES, InvalidInputError
+from ..errors import MAX_MESH_BYTES, InvalidInputError, OutputError
 from ..evaluation.opening import RegisterOptions
-from ..utils.files import file_name
+from ..utils.files import file_name, hangup_signals, signals_handled, terminable
 from ..utils.threads import one_torch_thread
 from .page import build_page
 from .workspace import Workspace, show_warning
@@ -42,18 +44,22 @@ SECURITY_HEADERS = {
 }
 """Of every answer."""
 
-_LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
-_EVERYONE = ("0.0.0.0", "::")
+SECONDS_TO_END = 3  # that requests on their way may take once the server ends
+_LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]+)(?::\d*)?")  # a header Host: name, or address in brackets, and port
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
     """Serve the page with these inputs until Ctrl-C; the printed address contains a random token."""
-    with listen(host, port) as listener, tempfile.TemporaryDirectory(prefix="curvireg-view-") as folder:
+    # The page's shutdown removes what is in the folder; a job that still runs may add to it.
+    uploads = tempfile.TemporaryDirectory(prefix="curvireg-view-", ignore_cleanup_errors=True)
+    with terminable(), listen(host, port) as listener, uploads as folder:
         workspace = Workspace(options, Path(folder))
         workspace.load()  # errors come before anything opens
         add_page(workspace)
-        server = make_server(listener, host, browser=browser)
-        with one_torch_thread(), warnings.catch_warnings():
+        server = make_server(listener, host, browser_folder=Path(folder) if browser else None)
+        hangup = signals_handled(hangup_signals(), server.handle_exit)  # uvicorn handles the others
+        with one_torch_thread(), warnings.catch_warnings(), hangup:
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show_warning
             with suppress(KeyboardInterrupt):  # uvicorn raises it again once the server has ended
@@ -61,9 +67,10 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
 
 
 def make_server(
-    listener: socket.socket, host: str, *, browser: bool, printed_to: TextIO | None = None
+    listener: socket.socket, host: str, *, browser_folder: Path | None, printed_to: TextIO | None = None
 ) -> uvicorn.Server:
-    """A guarded server of the application of NiceGUI, whose secret address is printed, and perhaps opened."""
+    """A guarded server of the application of NiceGUI, whose secret address is printed; it opens in the browser by a
+    file in ``browser_folder``, if that is given."""
     prefix = f"/{secrets.token_urlsafe(16)}"
     site = FastAPI(openapi_url=None)
     ui.run_with(
@@ -77,19 +84,49 @@ def make_server(
         show_welcome_message=False,
     )
     # h11 refuses requests with two hosts.
-    config = uvicorn.Config(guarded(site, host), log_level="warning", server_header=False, ws="wsproto", http="h11")
-    name = socket.gethostname() if host in _EVERYONE else f"[{host}]" if ":" in host else host
-    address = f"http://{name}:{listener.getsockname()[1]}{prefix}/"
-    print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
-    if host not in _LOOPBACK:
-        print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
-    if browser:
-        threading.Timer(0.5, webbrowser.open, (address,)).start()
+    config = uvicorn.Config(
+        guarded(site, host, listener.getsockname()[0]),
+        log_level="warning",
+        server_header=False,
+        ws="wsproto",
+        http="h11",
+        timeout_graceful_shutdown=SECONDS_TO_END,
+    )
+    address = print_address(listener, host, prefix, printed_to)
+    if browser_folder is not None:
+        page = redirect_file(browser_folder, address)
+        threading.Timer(0.5, webbrowser.open, (page.as_uri(),)).start()
     return uvicorn.Server(config)
 
 
+def print_address(listener: socket.socket, host: str, prefix: str, printed_to: TextIO | None = None) -> str:
+    """Print and return the address of the page, and say who may use it."""
+    bound, number = listener.getsockname()[:2]
+    name = socket.gethostname() if _is_everyone(bound) else _plain_host(host)
+    name = f"[{name}]" if ":" in name else name
+    address = f"http://{name}:{number}{prefix}/"
+    print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
+    if not _is_loopback(bound):
+        print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
+    return address
+
+
+def redirect_file(folder: Path, address: str) -> Path:
+    """A page that leads to the secret address, which only this user can read: what a program is started with, such as
+    the address that a browser is to open, all users of a machine can see."""
+    page = folder / "open.html"
+    content = f"""<!DOCTYPE html>
+<meta charset="utf-8"><meta name="referrer" content="no-referrer"><meta http-equiv="refresh" content="0; url={address}">
+<title>curvireg</title><a href="{address}">To the page</a>
+"""
+    with os.fdopen(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+        file.write(content)
+    return page
+
+
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens on a host and a port, 0 for a free one."""
+    """A socket that listens on a host, perhaps an IPv6 address in brackets, and a port, 0 for a free one."""
+    host = host.strip("[]")
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
@@ -98,14 +135,16 @@ def listen(host: str, port: int) -> socket.socket:
         raise InvalidInputError(f"--host {host} --port {port}: {error.strerror}") from None
 
 
-def guarded(site: ASGIApp, host: str) -> ASGIApp:
+def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
     """The site, without requests of other sites, and with :data:`SECURITY_HEADERS` on every answer.
 
-    A browser that is led here by another site's name (DNS rebinding) sends that name as Host, which must be that of
-    ``host``; anything goes if everyone may connect. A script of another site sends its own Origin.
+    A browser that is led here by another site's name (DNS rebinding) sends that name as Host, which must be one of
+    ``hosts``; anything goes if everyone may connect. A script of another site sends its own Origin.
     """
-    names = ["*"] if host in _EVERYONE else list(_LOOPBACK) if host in _LOOPBACK else [host.lower()]
-    trusted = TrustedHostMiddleware(site, names, www_redirect=False)
+    names = set(map(_plain_host, hosts))
+    if any(map(_is_loopback, hosts)):
+        names |= set(_LOOPBACK)
+    is_open = any(map(_is_everyone, hosts))
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
         async def send_with_headers(message: Message) -> None:
@@ -115,13 +154,38 @@ def guarded(site: ASGIApp, host: str) -> ASGIApp:
 
         headers = Headers(scope=scope) if scope["type"] != "lifespan" else Headers()
         own = headers.get("host", "").lower()
+        named = _HOST.fullmatch(own)
+        is_known = scope["type"] == "lifespan" or is_open or (named is not None and _plain_host(named[1]) in names)
         if any(urlsplit(origin).netloc.lower() != own for origin in headers.getlist("origin")):
             refusal = PlainTextResponse("requests of other sites are refused", status_code=403)
             await refusal(scope, receive, send_with_headers)
+        elif not is_known:
+            refusal = PlainTextResponse("this is not the name of the page's machine", status_code=400)
+            await refusal(scope, receive, send_with_headers)
         else:
-            await trusted(scope, receive, send_with_headers)
+            await site(scope, receive, send_with_headers)
 
     return guard
+
+
+def _plain_host(host: str) -> str:
+    """A host in the one way in which it is compared: of IPv6 addresses there are many spellings."""
+    host = host.strip("[]").partition("%")[0].lower()  # the zone behind % has a meaning on this machine only
+    try:
+        return ipaddress.ip_address(host).compressed
+    except ValueError:
+        return host
+
+
+def _is_everyone(host: str) -> bool:
+    return _plain_host(host) in ("0.0.0.0", "::")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(_plain_host(host)).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
 
 
 def add_page(workspace: Workspace) -> None:
@@ -142,7 +206,7 @@ def add_page(workspace: Workspace) -> None:
             await workspace.receive(name, int(length), request.stream())
         except InvalidInputError as error:
             workspace.messages["file"] = str(error)
-            return PlainTextResponse(str(error), status_code=413)
+            return PlainTextResponse(str(error), status_code=507 if isinstance(error, OutputError) else 413)
         except ClientDisconnect:
             workspace.messages["file"] = f"{name}: it did not arrive; send it again"
         return Response(status_code=204)
@@ -151,4 +215,4 @@ def add_page(workspace: Workspace) -> None:
     app.get("/file/{name}")(send_file)
     app.post("/upload")(receive_file)
     app.add_exception_handler(404, lambda *_: PlainTextResponse("not found", status_code=404))
-    app.on_shutdown(workspace.stop)
+    app.on_shutdown(workspace.close)

@@ -1,6 +1,7 @@
 """Photographs, mesh, rig and options, what is registered with them, and how. It needs no page and no NiceGUI."""
 
 import math
+import re
 import shlex
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
-from ..mesh import has_colours, load_mesh, mesh_centre, mesh_radius, mesh_up
+from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up
 from ..registration import Registrar, Registration
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
@@ -31,7 +32,8 @@ from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[View]]
-_OPTIONS = ("unit", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
+UNPACKED = "parts"  # the folder of what was in an archive
+_OPTIONS = ("unit", "link", "textures", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
@@ -77,6 +79,14 @@ class Session:
     def name(self, path: str | Path) -> str:
         """What the user calls a file."""
         return Path(path).name if {self.folder, STATIC} & {*Path(path).parents} else str(path)
+
+    def without_folders(self, text: str) -> str:
+        """A text in which uploaded files, and those unpacked from an archive, have their names alone."""
+        if self.folder is None:
+            return text
+        folders = {str(self.folder), str(self.folder.resolve())}
+        places = "|".join(map(re.escape, sorted(folders, key=len, reverse=True)))
+        return re.sub(rf"(?:{places})[/\\](?:upload-\w+[/\\]?)?(?:{UNPACKED}[/\\])?", "", text)
 
     def usable_name(self, path: Path) -> str:
         """:meth:`name`, in commands and programs; the sample has no other place than its own."""
@@ -222,10 +232,10 @@ class Session:
             bank = ViewBank.load(path)
             mesh, facts = bank.mesh, f"bank of {len(bank)} views"
         else:
-            mesh = load_mesh(path, unit=self.options.unit, up=self.options.up)
+            mesh = self.options.load_mesh(path)
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
             colours = "in its colours" if has_colours(mesh) else "in grey"
-            facts = f"{len(mesh.faces):,} faces, {size} {self.options.unit}, rendered {colours}"
+            facts = f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered {colours}"
         self.mesh_path, self.mesh, self.mesh_facts = path, mesh, facts
         for shot in self.shots:
             shot.result = None
@@ -381,7 +391,9 @@ class Session:
         if self.shot.is_undistorted:
             read = "cr.geometry.undistorted(cr.data.read_photo({}).image, cr.load_camera('CALIBRATION')).image"
             photos = list(map(read.format, photos))
-        model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r})"
+        more = {name: getattr(request, name) for name in ("link", "textures") if getattr(request, name) is not None}
+        given = "".join(f", {name}={str(value)!r}" for name, value in more.items())
+        model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r}{given})"
         model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
         pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
         pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline

@@ -34,6 +34,7 @@ NOT_IN_RIG = (
 )
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
 CAMERA_HINT = "With it the position is found. All photographs have the same: type it, or choose a calibration."
+UNIT_CHOICES: Mapping[str | None, str] = {None: "as the file says, else m", **{unit: unit for unit in UNITS}}
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
@@ -167,7 +168,7 @@ class Inputs:
         self.shown: tuple[Any, ...] = ()
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
-            self._select("unit", "unit of the mesh", {unit: unit for unit in UNITS})
+            self._select("unit", "unit of the mesh", UNIT_CHOICES)
             self._select("up", "axis that points up", AXES)
             self._select("pose", "how it may stand", POSES)
             self._select("preset", "method", PRESETS)

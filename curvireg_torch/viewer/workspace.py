@@ -1,6 +1,7 @@
 """The work that the windows of the page show, and the files that it receives. It needs no NiceGUI."""
 
 import asyncio
+import errno
 import os
 import shutil
 import struct
@@ -16,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from ..data import load_camera
-from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError
+from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError, OutputError
 from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
-from .session import STATIC, Session
+from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
@@ -87,16 +88,20 @@ class Workspace:
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
                 self.messages.pop("pose", None)
             if caught:
-                self.messages[part] = "; ".join(map(self.session.describe_warning, caught))
+                self._show(part, "; ".join(map(self.session.describe_warning, caught)))
             return True if result is None else result
         except CurviregError as error:
-            self.messages[part] = str(error.with_subject(self.session.name(error.subject)))
+            self._show(part, str(error.with_subject(self.session.name(error.subject))))
         except OSError as error:
-            self.messages[part] = str(error)
+            self._show(part, f"{error.strerror or error}; check the machine on which the page runs")
         except Exception as error:  # a defect must not end the page; the terminal has the traceback
             traceback.print_exc()
-            self.messages[part] = f"{type(error).__name__}: {error}; see the terminal"
+            self._show(part, f"{type(error).__name__}: {error}; see the terminal")
         return None
+
+    def _show(self, part: str, message: str) -> None:
+        """Show a message, in which uploaded files have their names alone."""
+        self.messages[part] = self.session.without_folders(message)
 
     def start_search(self) -> asyncio.Task[None]:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a time."""
@@ -118,24 +123,44 @@ class Workspace:
         """End the search at its next step."""
         self.session.cancelled = self.searching
 
+    def close(self) -> None:
+        """End the search, and remove the uploaded files."""
+        self.stop()
+        for folder in self.folder.glob("upload-*"):
+            shutil.rmtree(folder, ignore_errors=True)
+
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
         """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
         stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
         if stored + sum(each for _, each in self.receiving.values()) + size > MAX_VIEWER_BYTES:
             raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
-        folder, received = Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder)), 0
-        self.receiving[folder] = name, size
+        path = self._new_place(name)
+        self.receiving[path.parent] = name, size
         try:
-            with (folder / name).open("wb") as file:
+            await self._store(path, size, blocks)
+            await self._open_upload(path)
+        finally:
+            del self.receiving[path.parent]
+            self._remove_unused()
+
+    def _new_place(self, name: str) -> Path:
+        """The path of an upload, in a folder of its own."""
+        try:
+            return Path(tempfile.mkdtemp(prefix="upload-", dir=self.folder), name)
+        except OSError as error:
+            raise cannot_store(name, error) from error
+
+    async def _store(self, path: Path, size: int, blocks: AsyncIterator[bytes]) -> None:
+        received = 0
+        try:
+            with path.open("wb") as file:
                 async for block in blocks:
                     received += len(block)
                     if received > size:  # in chunks, a request may send more than it has announced
-                        raise InvalidInputError(f"{name}: larger than announced; send it again")
+                        raise InvalidInputError(f"{path.name}: larger than announced; send it again")
                     await asyncio.to_thread(file.write, block)
-            await self._open_upload(folder / name)
-        finally:
-            del self.receiving[folder]
-            self._remove_unused()
+        except OSError as error:
+            raise cannot_store(path.name, error) from error
 
     async def _open_upload(self, path: Path) -> None:
         suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
@@ -150,7 +175,7 @@ class Workspace:
                 f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
-            if path.name == "scene_camera.json" and session.options.unit == "m":
+            if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
                 await self.set_option("unit", "mm")  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
         elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
@@ -159,7 +184,7 @@ class Workspace:
         elif suffix in CALIBRATIONS:
             await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
         elif suffix == ".zip":
-            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / "parts")):
+            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / UNPACKED)):
                 await self.open_mesh(mesh)
         elif suffix in MESHES_AND_BANKS:
             await self.open_mesh(path)
@@ -233,6 +258,12 @@ class Workspace:
         return f"file/{name}?v={self._version}"
 
 
+def cannot_store(name: str, error: OSError) -> OutputError:
+    """The error of a file for which there is no place."""
+    advice = "make room on the machine on which the page runs, and send it again"
+    return OutputError(f"{name}: cannot be stored ({error.strerror or error}); {advice}")
+
+
 def unpack(archive: Path, folder: Path) -> Path:
     """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
     name = archive.name
@@ -250,9 +281,13 @@ def unpack(archive: Path, folder: Path) -> Path:
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
         raise
-    except Exception:  # zipfile raises many kinds
+    except Exception as error:  # zipfile raises many kinds
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise cannot_store(name, error) from None
         raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
     meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
+    robots = [path for path in meshes if path.suffix.lower() == ".urdf"]
+    meshes = robots if len(robots) == 1 else meshes  # the others are those of its links
     if len(meshes) != 1:
         found = "no mesh" if not meshes else "several meshes: " + ", ".join(p.name for p in meshes[:4])
         raise InvalidInputError(f"{name}: {found}; put one of {', '.join(MESHES)} with its parts into it")

@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import skimage.feature
 import torch
 import torch.nn.functional as F
 from kornia.feature import gftt_response, harris_response
 from torch import Tensor
 
+from curvireg_torch.errors import MissingDependencyError
 from curvireg_torch.features import field_points
 from curvireg_torch.features.hog import strongest_points
 from curvireg_torch.filters import (
@@ -31,6 +31,12 @@ from curvireg_torch.filters.operations import (
     smooth,
     to_grey,
 )
+
+try:
+    import skimage.feature
+except ImportError as error:
+    message = "scikit-image is not installed; pip install 'curvireg_torch[paper]'"
+    raise MissingDependencyError(f"detectors: {message}") from error
 
 __all__ = ["DETECTORS"]
 
@@ -165,7 +171,8 @@ def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
 
 
 DETECTORS: dict[str, Callable[..., Tensor]] = {
-    "mfc": of_field(multiscale_focus_curves),
+    "mfc": of_field(functools.partial(multiscale_focus_curves, mode="reblur-saliency", saliency_weight=0.0)),
+    "mfc x cs": of_field(multiscale_focus_curves),
     "mcs": of_field(multiscale_curvilinear_saliency),
     "ig": of_field(image_gradient),
     "pci": of_field(principal_curvature_image),
@@ -178,4 +185,4 @@ DETECTORS: dict[str, Callable[..., Tensor]] = {
     "sift": sift,
     "surf": fast_hessian,
 }
-"""Every detector of the comparison by its short name, the detectors of the paper first."""
+"""Every detector of the comparison by its short name, the detectors of the paper first; "mfc x cs" is ours."""

@@ -1,53 +1,183 @@
 """Measure the paper's tables and figures on a dataset, as CSV, Markdown and pictures.
 
-    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR
+    pip install 'curvireg_torch[paper]'
+    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N] [--page docs/paper.md]
 
 TABLE is one of
 
 - detectors: intersection percentage and Hausdorff distances of every detector (the paper's IP and HD tables)
 - repeatability: {CS, ASG, HFN} x {MFC, MCS, IG}
 - curve: repeatability in 40 views around the right one
-- precision: {CS, ASG, AR} x {MFC, MCS, IG}, per category
-- angles: errors of elevation, azimuth and in-plane angle, of the estimate and of the closest view
+- sensitivity: intersection percentage by radius and share of points
+- precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected
 - ranks: precision at rank 1, 3, 5, 10, 20
+- angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the closest retrieved view
+- grids: precision with descriptors of 4, 8 and 16 cells
 - all
 
-Every table states what was measured and the number of photographs. Only objects that are neither occluded nor
-truncated are used, as in the paper.
+Every table states what was measured, the number of photographs, and 95 % intervals. Only objects that are neither
+occluded nor truncated are used, as in the paper. DIR/records holds one file for each mesh: an interrupted run goes on
+where it was, and a table is written as soon as all of its records are there. --page writes all tables that DIR holds,
+with the commit, into a page.
 """
 
 import argparse
+import hashlib
+import json
 import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
-from curvireg_torch.errors import CurviregError
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY))  # with an installed wheel, scripts is not a package that Python finds
+
+import torch
+from tqdm import tqdm
+
+from curvireg_torch.errors import CurviregError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.pipeline import BankSettings, Pipeline
+from curvireg_torch.evaluation.runner import POSE_SOURCES
+from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.utils.files import code_digest, file_digest, text_digest
+from scripts._shared import commit, write_json
 from scripts.paper import tables as paper
+from scripts.paper.cases import Case, by_mesh, find_cases
 
-TABLES = ("detectors", "repeatability", "curve", "precision", "angles", "ranks")
+CURVE_OFFSETS = range(-100, 100, 5)
+OF_POINTS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
+    "detectors": paper.detector_tables,
+    "repeatability": paper.repeatability_tables,
+    "curve": lambda records: paper.curve_tables(records, CURVE_OFFSETS),
+    "sensitivity": paper.sensitivity_tables,
+}
+OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
+    "precision": paper.precision_tables,
+    "ranks": paper.rank_tables,
+    "angles": paper.angle_tables,
+    "grids": paper.grid_tables,
+}
+TABLES = (*OF_POINTS, *OF_VIEWS)
+ON_PAGE = ("detectors", "repeatability", "curve", "precision", "ranks_literal", "ranks_corrected", "angles_literal")
+ON_PAGE += ("angles_corrected", "grids", "sensitivity")
+PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
+
+
+def measure(phase: str, cases: list[Case], settings: BankSettings, pose: str) -> list[dict[str, Any]]:
+    """Records of the cases of one mesh."""
+    from scripts.paper.measure import measure_points, measure_views
+
+    start = time.process_time()
+    found = measure_points(cases, settings) if phase == "points" else measure_views(cases, settings, pose)
+    seconds = (time.process_time() - start) / len(cases)
+    names = [{"category": case.category, "cad": case.mesh_path, "seconds": seconds} for case in cases]
+    return [{**name, **record} for name, record in zip(names, found, strict=True)]
 
 
 def run(arguments: argparse.Namespace) -> None:
-    cases = paper.find_cases(arguments.kind, arguments.root, pixel_origin=arguments.pixel_origin, limit=arguments.limit)
-    settings, progress = BankSettings(image_size=arguments.image_size), not arguments.quiet
+    check_packages()
+    origin = {"pixel_origin": arguments.pixel_origin, "limit": arguments.limit}
+    cases = find_cases(arguments.kind, arguments.root, **origin)
+    settings = BankSettings(image_size=arguments.image_size)
+    pose = arguments.pose or DATASETS[arguments.kind].pose
     wanted = TABLES if arguments.table == "all" else (arguments.table,)
-    tables: list[paper.Table] = []
-    if "detectors" in wanted:
-        tables += paper.detector_tables(cases, settings, arguments.eps, progress)
-    if "repeatability" in wanted:
-        tables.append(paper.repeatability_table(cases, settings, arguments.eps, progress))
-    if "curve" in wanted:
-        tables.append(paper.curve_table(cases, settings, arguments.eps, progress))
-    if set(wanted) & {"precision", "angles", "ranks"}:
-        views = Pipeline().with_pose_prior(arguments.pose or DATASETS[arguments.kind].pose).views.sphere()
-        rankings = paper.rank_views(cases, views, settings, progress)
-        tables += [paper.precision_table(rankings)] if "precision" in wanted else []
-        tables += [paper.angle_table(rankings)] if "angles" in wanted else []
-        tables += [paper.rank_table(rankings)] if "ranks" in wanted else []
-    for table in tables:
-        paper.write_table(table, arguments.out)
-        print(table.markdown())
+    what = f"{arguments.root.name}, crops of {settings.image_size} px"
+    for phase, makers in PHASES.items():
+        chosen = [name for name in makers if name in wanted]
+        if not chosen:
+            continue
+        records = collect(phase, cases, settings, pose, arguments)
+        for name in chosen:
+            for table in makers[name](paper.Records(records, what)):
+                table.write(arguments.out)
+                if table.name in ON_PAGE:
+                    print(table.markdown(), flush=True)
+            if name == "curve":
+                draw_curve(records, arguments.out / "curve.png")
+    if arguments.page is not None:
+        write_page(arguments.out, arguments.page)
+
+
+def collect(
+    phase: str, cases: list[Case], settings: BankSettings, pose: str, arguments: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """The records of all cases; those of each mesh are stored when they are known."""
+    code = code_digest(*POSE_SOURCES) + own_digest()
+    groups = list(by_mesh(cases))
+    paths = []
+    for group in groups:
+        files = [file_digest(Path(name)) for name in (group[0].mesh_path, *(case.image_path for case in group))]
+        request = json.dumps([phase, str(settings), pose, code, files, [case.key for case in group]])
+        paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
+    missing = [k for k, path in enumerate(paths) if not path.exists()]
+    done = sum(len(group) for group, path in zip(groups, paths, strict=True) if path.exists())
+    options = [phase] * len(missing), [groups[k] for k in missing], [settings] * len(missing), [pose] * len(missing)
+    with tqdm(total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet) as bar:
+        if arguments.jobs == 1 or len(missing) < 2:
+            measured = map(measure, *options)
+        else:
+            pool = ProcessPoolExecutor(arguments.jobs, get_context("spawn"), torch.set_num_threads, (1,))
+            measured = pool.map(measure, *options)
+        for k, found in zip(missing, measured, strict=True):
+            write_json(paths[k], _finite(found), indent=0)
+            bar.update(len(groups[k]))
+    return [record for path in paths for record in json.loads(path.read_text(encoding="utf-8"))]
+
+
+def _finite(value: Any) -> Any:
+    """The same with None in place of what JSON has no number for."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and value - value != 0.0 else value
+
+
+def own_digest() -> str:
+    """Digest of the code that measures."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name in ("cases.py", "detectors.py", "measure.py", "measures.py"):
+        digest.update(Path(__file__).with_name(name).read_bytes())
+    return digest.hexdigest()
+
+
+def check_packages() -> None:
+    """Say what is missing before anything is measured."""
+    from importlib.util import find_spec
+
+    for module, package in (("skimage", "scikit-image"), ("matplotlib", "matplotlib")):
+        if find_spec(module) is None:
+            raise MissingDependencyError(f"{package} is not installed; pip install 'curvireg_torch[paper]'")
+
+
+def draw_curve(records: list[dict[str, Any]], path: Path) -> None:
+    """Plot the repeatability in 40 views around the true one."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5.0, 3.2), dpi=120)
+    axes = figure.subplots()
+    every = paper.Records(records, "")
+    for name in records[0]["curve"]:
+        means = [every.mean(paper.at("curve", name, k)).mean for k in range(len(CURVE_OFFSETS))]
+        axes.plot(CURVE_OFFSETS, means, label=name)
+    axes.set_xlabel("degrees about z from the true view")
+    axes.set_ylabel("repeatability")
+    axes.legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+
+
+def write_page(folder: Path, page: Path) -> None:
+    """Replace the part of a page between its markers by the tables of a folder."""
+    from scripts._shared import update_page
+
+    parts = [folder / f"{name}.md" for name in ON_PAGE]
+    found = [path.read_text(encoding="utf-8") for path in parts if path.exists()]
+    update_page(page, "paper", "\n".join([f"Measured at commit {commit()}.", "", *found]))
 
 
 def main() -> int:
@@ -57,10 +187,11 @@ def main() -> int:
     parser.add_argument("root", type=Path, metavar="ROOT")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
-    parser.add_argument("--eps", type=float, default=2.0, metavar="PX", help="radius of a hit in the crop (default: 2)")
-    parser.add_argument("--pose", choices=("upright", "any"), help="views of the banks (default: the dataset's)")
+    parser.add_argument("--pose", choices=("upright", "any"), help="corrected views (default: the dataset's)")
     parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
+    parser.add_argument("--page", type=Path, help="page of the documentation that gets the tables")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     try:
         run(parser.parse_args())

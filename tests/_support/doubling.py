@@ -25,7 +25,6 @@ def check_linear(read: Callable[[Any], object], make: Callable[[int], Any], size
 
 
 def _seconds(read: Callable[[Any], object], content: Any) -> float:
-    gc.collect()
     gc.disable()  # what it takes depends on the tests before
     start = time.process_time()
     try:

@@ -1,5 +1,7 @@
 """``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import trimesh
 
 from curvireg_torch import ViewBank
 from curvireg_torch.evaluation import photograph
-from curvireg_torch.evaluation.lists import list_photographs
+from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS
@@ -207,3 +209,27 @@ def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path
         assert np.abs(pixels - expected).mean() < 6  # MJPG is lossy
     (folder / "none.mp4").write_bytes(b"not a video")
     refused(register(folder / "none.mp4", bank, out="none"), "none.mp4: not a video")
+
+
+def test_boxes_of_a_detector_are_found_by_the_name_of_each_photograph(folder, register, tmp_path):
+    x0, y0, x1, y1 = map(float, box_of(0))
+    boxes = [{"image_id": str(seed), "bbox": [x0, y0, x1 - x0, y1 - y0], "score": 0.5} for seed in (0, 1)]
+    (tmp_path / "boxes.json").write_text(json.dumps(boxes))
+    words = "--boxes", tmp_path / "boxes.json", "--no-refine"
+    assert register(folder / "photos", folder / "truck.safetensors", *words, out="boxes") == 0
+    rows = lines(tmp_path / "boxes")
+    assert [row["status"] for row in rows] == ["ok", "ok", "failed"]
+    assert rows[0]["inputs"]["box"] == pytest.approx([x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5], abs=1e-3)
+    assert "no box in" in rows[2]["message"]
+
+
+def test_paths_of_windows_and_boxes_in_fractions_in_lists(folder):
+    x0, y0, x1, y1 = map(float, box_of(0))
+    fractions = [(x0 + 0.5) / 240, (y0 + 0.5) / 180, (x1 + 0.5) / 240, (y1 + 0.5) / 180]
+    path = written(folder / "windows.csv", HEADER, ["photos\\0.png", *fractions], ["photos\\9.png", *fractions])
+    options = RegisterOptions(meshes=(folder / "truck.ply",), box_format="fractions")
+    good, missing = read_list(path, options)
+    assert good.photo == folder / "photos" / "0.png"
+    assert good.name == "photos\\0.png"
+    assert good.box == pytest.approx([x0, y0, x1, y1])
+    assert "no such file" in missing.error

@@ -89,6 +89,8 @@ def test_register_overwrites_no_input(folder, register, refused, tmp_path, capsy
     refused(register(folder / "photos" / "0.png", words[0], *start), "result.json: an input of this command")
     refused(register(out / "overlay.png", *words), "overlay.png: an input of this command")
     refused(register(folder / "photos" / "0.png", out / "pose.glb", *words[1:]), "pose.glb: an input of this command")
+    start[-1] = f"{out / 'result.json'}:0"
+    refused(register(folder / "photos" / "0.png", words[0], *start), "result.json")
     listed = written(out / "results.csv", "photo,x0,y0,x1,y1", [folder / "photos" / "0.png", *box_of(0)])
     before[listed] = listed.read_bytes()
     refused(register("--list", listed, words[0]), "results.csv: an input of this command")

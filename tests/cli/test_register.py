@@ -176,6 +176,26 @@ def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refuse
     refused(register_one(*words, box=()), "rig.json: a result of several photographs, whose pose is in the world")
 
 
+def test_starts_of_other_tools_have_their_convention_and_unit(folder, register_one, refused, document):
+    T = scene(0)[2].double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    path = folder / "gl.json"
+    words = "--start", str(path), "--camera", *CAMERA
+    path.write_text(json.dumps({"T_cam_from_model": (flip @ T).tolist()}))
+    refused(
+        register_one(*words, box=()),
+        "behind the camera: a pose of OpenGL's camera? Then give --start-convention opengl",
+    )
+    assert register_one(*words, "--start-convention", "opengl", box=()) == 0
+    assert float(rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3])) < 3.0
+    entry = {"cam_R_m2c": T[:3, :3].flatten().tolist(), "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(), "obj_id": 1}
+    path.write_text(json.dumps({"4": [entry]}))  # mm, of a mesh in m
+    assert register_one("--start", f"{path}:4", "--camera", *CAMERA, box=()) == 0
+    torch.testing.assert_close(torch.tensor(document()["translation"]).double(), T[:3, 3], rtol=0.1, atol=0.05)
+    with pytest.raises(SystemExit):
+        register_one("--start-convention", "opengl")
+
+
 def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, register_one, document, capsys):
     T, path = scene(0)[2], folder / "start.json"
     pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}

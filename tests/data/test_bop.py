@@ -6,7 +6,7 @@ import torch
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import InvalidInputError, MissingFileError
-from tests._support.miniature import write_bop
+from tests._support.miniature import write_bop, write_mesh
 
 
 @pytest.fixture
@@ -55,7 +55,9 @@ def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_inf
     assert hidden["box"].isfinite().all()
     assert hidden["box_visible"].isnan().all()
     torch.testing.assert_close(sample["image"], torch.full((3, 60, 80), 0.2))
-    assert sample["box"].isnan().all()
+    # Of the cube of 50 mm, 375 to 425 mm away: its near face is the wider one.
+    near = [40 - 24 * 0.8, 30 - 23 * 310 / 375, 40 + 26 * 0.8, 30 + 27 * 310 / 375]
+    assert sample["box"].tolist() == pytest.approx(near)
     assert sample["box_visible"].isnan().all()
     assert sample["visib_fract"] != sample["visib_fract"]
 
@@ -85,7 +87,9 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
         (tree[0] / "test_targets_bop19.json").write_text(content)
         with pytest.raises(InvalidInputError, match="test_targets_bop19"):
             BOPDataset(tree[0])
-    (tree[0] / "models" / "models_info.json").unlink()
+    (tree[0] / "test_targets_bop19.json").unlink()
+    for path in (tree[0] / "models").iterdir():
+        path.unlink()
     with pytest.raises(MissingFileError, match="models_info"):
         BOPDataset(tree[0])
 
@@ -141,3 +145,54 @@ def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(tr
     assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
     edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
     assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible
+
+
+def test_bop_dataset_measures_models_without_models_info(tree):
+    (tree[0] / "models" / "models_info.json").unlink()
+    dataset = BOPDataset(tree[0], targets=False)
+    assert dataset.models_info[1]["diameter"] == pytest.approx(50 * 3**0.5)
+    assert [dataset.models_info[1][key] for key in ("min_x", "size_z")] == pytest.approx([-25.0, 50.0])
+    assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (1, 3, 9, 4), (2, 7, 1, 0)]
+
+
+def test_bop_dataset_reads_names_with_fewer_digits_and_other_folders_of_models(tree):
+    models = (tree[0] / "models").rename(tree[0] / "models_cad")
+    for path in models.glob("obj_*.ply"):
+        path.rename(path.with_name(f"obj_{path.stem[-2:]}.ply"))
+    scene = tree[0] / "test" / "000001"
+    for path in (scene / "rgb").iterdir():
+        path.rename(path.with_name(path.name[2:]))  # 0000.jpg
+    scene.rename(scene.with_name("01"))
+    dataset = BOPDataset(tree[0], targets=False, models="models_cad")
+    assert sorted(ids(dataset)) == [(1, 0, 1, 0), (1, 0, 1, 2), (1, 0, 2, 1), (2, 7, 1, 0)]
+    assert dataset[0]["model_path"].endswith("obj_01.ply")
+    with pytest.raises(MissingFileError, match="models_info"):
+        BOPDataset(tree[0])
+    with pytest.raises(MissingFileError, match="no such folder"):
+        BOPDataset(tree[0], models="../models_cad")
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.1, 25.4])
+def test_bop_dataset_refuses_models_in_another_unit_than_models_info(tree, factor):
+    for number in (1, 2, 9):
+        write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=25.0 * factor)
+    with pytest.raises(
+        InvalidInputError, match=r"across, models_info\.json says 86\.6: .*scale the models to mm"
+    ) as error:
+        BOPDataset(tree[0])
+    assert ("in metres?" in str(error.value)) == (factor == 1e-3)
+
+
+def test_bop_dataset_refuses_models_in_metres_without_models_info(tree):
+    (tree[0] / "models" / "models_info.json").unlink()
+    for number in (1, 2, 9):
+        write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=0.025)
+    with pytest.raises(InvalidInputError, match=r"the mesh is 0\.065 px wide: in metres\? scale it to mm"):
+        BOPDataset(tree[0])
+
+
+def test_bop_dataset_without_scene_gt_info_skips_what_is_behind_the_camera(tree):
+    scene = tree[0] / "test" / "000002" / "scene_gt.json"
+    scene.write_text(scene.read_text().replace("400.0", "-400.0"))
+    before = tree[1]["bad_box"]
+    assert BOPDataset(tree[0], targets=False).skipped["bad_box"] == before + 1

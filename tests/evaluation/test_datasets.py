@@ -39,7 +39,7 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     R = torch.tensor(good["rotation"], dtype=torch.float64)
     torch.testing.assert_close(R @ R.T, torch.eye(3).double(), atol=1e-6, rtol=0)
     files = {p.name for p in (tmp_path / "out").iterdir()} - {MARKER}
-    assert files == {"results.jsonl", "predictions.csv", "summary.json", "index.html", "thumbnails"}
+    assert files == {"results.jsonl", "predictions.csv", "errors.csv", "summary.json", "index.html", "thumbnails"}
     assert (tmp_path / "out" / "index.html").read_text().count("<img") == 3
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["protocol"] == str(Protocol())
 

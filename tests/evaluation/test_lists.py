@@ -4,12 +4,13 @@ import os
 from dataclasses import replace
 
 import pytest
+import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import lists, photograph, runner
-from curvireg_torch.evaluation.lists import list_photographs, read_list
+from curvireg_torch.evaluation.lists import find_photographs, list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.evaluation.photograph import Entry
 from curvireg_torch.pipeline import PRESETS
@@ -103,3 +104,22 @@ def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
     found, name = photograph.camera_of(replace(entry, camera=camera), photo)
     assert (name, found is None) == (source, source is None)
+
+
+def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):
+    """And the guess is that of rows without one."""
+    path = tmp_path / "list.csv"
+    path.write_text("photo,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1,2,30,40,260,260,119.5,89.5\nb.png,1,2,30,40,,,,\n")
+    first, second = read_list(path, RegisterOptions(meshes=(tmp_path / "part.stl",), guess=50.0))
+    assert torch.equal(first.camera.matrix, CAMERA.matrix)
+    assert second.camera == 50.0
+
+
+def test_names_are_in_the_order_of_their_numbers(tmp_path):
+    names = ["b.png", "a10.png", "a9.png", "a09.png", "a.png", "1.png", "x1y10.png", "x1y2.png", "10.png", "2.png"]
+    for name in names:
+        (tmp_path / name).touch()
+    expected = ["1.png", "2.png", "10.png", "a09.png", "a9.png", "a10.png", "a.png", "b.png", "x1y2.png", "x1y10.png"]
+    assert [path.name for path in find_photographs(tmp_path)] == expected
+    assert [path.name for path in find_photographs(tmp_path / "[ab]*.png")] == expected[3:8]
+    assert find_photographs(tmp_path / "none.png") == [tmp_path / "none.png"]

@@ -5,7 +5,7 @@ import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import Protocol
-from curvireg_torch.evaluation.benchmarks import hint_of_truth, perturbed_box
+from curvireg_torch.evaluation.protocol import hint_of_truth, perturbed_box
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+import trimesh
 
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
@@ -83,6 +84,16 @@ def test_pascal3d_summary(furniture, tmp_path):
     assert summary["subsets"]["difficult"]["med_err_deg"] == float("inf")
     assert {name: s["n"] for name, s in summary["per_class"].items()} == {"bottle": 4, "diningtable": 1, "sofa": 3}
     assert summary["per_class"]["sofa"]["acc_pi_6"] == 2 / 3
+    # classes: bottles 1/4, table 0, sofas 2/3; with symmetries 3/4, 1, 2/3
+    mean = summary["mean_over_classes"]
+    assert (mean["n_classes"], mean["acc_pi_6"]) == (3, pytest.approx((1 / 4 + 0 + 2 / 3) / 3))
+    assert mean["acc_pi_18"] == pytest.approx((0 + 0 + 1 / 3) / 3)
+    assert mean["med_err_deg"] == pytest.approx((65 + 180 + 20) / 3, abs=1e-3)
+    assert mean["symmetry_aware"]["acc_pi_6"] == pytest.approx((3 / 4 + 1 + 2 / 3) / 3)
+    # easy ones: a bottle that is 90 degrees off, the table, the sofa that is 5 degrees off
+    easy = summary["subsets"]["easy"]
+    assert {name: s["acc_pi_18"] for name, s in easy["per_class"].items()} == {"bottle": 0, "diningtable": 0, "sofa": 1}
+    assert easy["mean_over_classes"]["med_err_deg"] == pytest.approx((90 + 180 + 5) / 3, abs=1e-3)
     assert summary["seconds"] == {"bank": 16.0, "register": 4.0, "register_each": 0.5}
     assert summary["settings"]["root"] == "where", "a summary is shared: no paths"
 
@@ -231,3 +242,118 @@ def test_detection_recall_counts_the_first_right_proposal_and_clips_boxes():
     low = ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5))
     for annotated, proposed in (left, left[::-1], low):
         assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
+
+
+def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
+    rows = [{"rotation": rotated(furniture.samples[0], "z", 90)}, *[{"skipped": "x"}] * 8]
+    scores_of(furniture, tmp_path / "bottle", rows)
+    page = (tmp_path / "bottle" / "index.html").read_text()
+    assert '<figure class="right">' in page
+    assert "0.0 degrees off" in page
+    assert "1 of 1 within 30 degrees" in page
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    pose = {"rotation": rotated(benchmark.samples[0], "z", 180), "translation": [0.0, 0.0, 500.0]}
+    scores_of(benchmark, tmp_path / "bop", [pose, *[{"skipped": "x"}] * 3])
+    assert "1 of 1 within 30 degrees" in (tmp_path / "bop" / "index.html").read_text()
+
+
+def posed(sample, degrees):
+    """A result whose pose is a rotation about z off."""
+    rotation, translation = rotated(sample, "z", degrees), sample["translation"].tolist()
+    inputs = {"picture": PICTURE, "box": [-9.0, -9.0, -8.0, -8.0]}
+    return {"rotation": rotation, "translation": translation, "inputs": inputs}
+
+
+def test_errors_are_written_with_all_digits(instances, tmp_path):
+    benchmark, samples = instances
+    rows = [posed(s, 7) for s in samples]
+    rows[2] = FAILED
+    summary = scores_of(benchmark, tmp_path, rows)
+    found = table(tmp_path, "errors.csv")
+    assert [row["key"] for row in found] == ["1/0/0", "1/0/1", "1/0/2", "2/7/0"]
+    assert [row["group"] for row in found] == ["1", "2", "1", "1"]
+    errors = benchmark.errors(samples, rows)
+    for name, values in errors.items():
+        assert [float(row[name]) for row in found] == values.tolist(), name
+    assert found[2]["add"] == "inf"
+    assert summary["ar_rgb"] == pytest.approx((summary["mssd_ar"] + summary["mspd_ar"]) / 2)
+    assert "VSD needs depth" in summary["vsd"]
+    web = {"error_deg": torch.tensor([1 / 3, torch.nan], dtype=torch.float64)}
+    groups = [{"obj_id": 1}, {"obj_id": 2}]
+    benchmark.write_errors(tmp_path / "web.csv", ["a", "b"], groups, web)
+    assert [row["error_deg"] for row in table(tmp_path, "web.csv")] == [repr(1 / 3), ""]
+
+
+def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
+    """Of cubes that are three times as large, whose diameter is twice that of the models, and that have no symmetry."""
+    benchmark, samples = instances
+    root = benchmark.dataset.root
+    rows = [posed(s, 20) for s in samples]
+    plain = benchmark.errors(samples, rows)
+    assert scores_of(benchmark, tmp_path / "models", rows)["models"] == {"models": [1, 2]}
+    cube = trimesh.load(root / "models" / "obj_000001.ply")
+    (root / "models_eval").mkdir()
+    cube.apply_scale(3.0).export(root / "models_eval" / "obj_000001.ply")
+    enlarged = BOPBenchmark(benchmark.dataset, benchmark.protocol)
+    first = [i for i, s in enumerate(samples) if s["obj_id"] == 1]
+    second = [i for i, s in enumerate(samples) if s["obj_id"] == 2]
+    found = enlarged.errors(samples, rows)
+    for name in ("add", "mssd", "mspd"):
+        assert (found[name][first] > 2 * plain[name][first]).all(), name
+        assert torch.equal(found[name][second], plain[name][second]), name
+    models = scores_of(enlarged, tmp_path / "some", rows)["models"]
+    assert models == {"models_eval": [1], "models": [2]}
+    info = {"1": {"diameter": 2 * samples[0]["model_info"]["diameter"]}}
+    (root / "models_eval" / "models_info.json").write_text(json.dumps(info))
+    doubled = BOPBenchmark(benchmark.dataset, benchmark.protocol).errors(samples, rows)
+    torch.testing.assert_close(doubled["mssd"][first], found["mssd"][first] / 2)
+    half = [posed(s, 180) for s in samples]
+    errors = BOPBenchmark(benchmark.dataset, benchmark.protocol).errors(samples, half)
+    assert errors["rotation"][first].tolist() == pytest.approx([180] * 3)
+
+
+@pytest.mark.parametrize(("folder", "name"), [("lm", "lm"), ("my-own_set", "myownset")])
+def test_results_have_the_name_that_the_toolkit_takes_apart(bop, tmp_path, folder, name):
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    bop.root = tmp_path / folder
+    bop.split = "test_primesense"
+    (tmp_path / "out").mkdir()
+    store = ResultStore(tmp_path / "out")
+    report(benchmark, store, {"root": "x", "protocol": "", "preset": "fast"}, 0)
+    (file,) = (tmp_path / "out").glob("*_*.csv")
+    assert file.name == f"curvireg-fast_{name}-test-primesense.csv"
+    assert file.read_bytes() == (tmp_path / "out" / "predictions.csv").read_bytes()
+
+
+def test_an_object_that_is_visible_by_95_per_cent_is_unoccluded(instances):
+    benchmark, _ = instances
+    samples = [{"visib_fract": fraction} for fraction in (0.949, 0.95, 0.951, math.nan)]
+    assert benchmark.subsets(samples) == {"unoccluded": [False, True, True, False]}
+
+
+def test_boxes_are_clipped_where_the_last_pixel_ends():
+    """At 99.5 of 100 rows: half of what is then left of the annotated box is proposed."""
+    annotated, proposed = (10.0, 79.5, 30.0, 159.5), (10.0, 89.5, 30.0, 99.5)
+    assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
+    annotated, proposed = (179.5, 10.0, 259.5, 30.0), (189.5, 10.0, 199.5, 30.0)
+    assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
+
+
+def test_another_cad_of_the_class_is_drawn_by_the_seed(furniture):
+    folder = furniture.dataset.root / "CAD" / "sofa"
+    names = [f"{k:02d}.off" for k in range(1, 9)]
+    for name in names[1:]:
+        write_mesh(folder / name)
+    drawn = []
+    for seed in range(6):
+        benchmark = Pascal3DBenchmark(furniture.dataset, Protocol(cad="other", seed=seed))
+        sofas = [entry for entry in benchmark.entries if entry.label.startswith("sofa")]
+        drawn.append([entry.meshes[0].name for entry in sofas])
+        assert all(len(entry.meshes) == 1 for entry in sofas)
+        again = Pascal3DBenchmark(furniture.dataset, Protocol(cad="other", seed=seed))
+        assert [entry.meshes for entry in again.entries] == [entry.meshes for entry in benchmark.entries]
+        alone = {entry.error for entry in benchmark.entries if not entry.label.startswith("sofa")}
+        assert alone == {"no_other_cad"}
+    assert len(set(map(tuple, drawn))) == 6
+    assert {name for some in drawn for name in some} == set(names[1:]), "all, but not the annotated one"
+    assert str(Protocol(cad="other", seed=3)) == "cad=other pose=upright box=annotated seed=3"

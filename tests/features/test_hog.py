@@ -138,3 +138,10 @@ def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide() -> None:
     field = torch.zeros(1, 2, 5, 8)
     field[0, 0, :, 2:6] = torch.tensor([1.0, 2.0, 2.0, 1.0])
     assert field_points(field, fraction=1.0)[0, 0].sum(dim=1).tolist() == [1] * 5
+
+
+@pytest.mark.parametrize("learnable", [False, True])
+def test_hog_on_the_meta_device(learnable: bool) -> None:
+    layer = features.HOG(grid=4, learnable=learnable).to("meta")
+    descriptors = layer(torch.zeros(3, 2, 40, 48, device="meta"))
+    assert (descriptors.device.type, descriptors.shape) == ("meta", (3, layer.length))

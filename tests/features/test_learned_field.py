@@ -100,6 +100,30 @@ def test_learned_field_of_a_square_is_its_outline(field):
     assert mask[:8].mean() < 0.2
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_learned_field_with_weights_of_another_dtype(field, dtype, channels):
+    x = torch.rand(2, channels, 60, 100, generator=torch.Generator().manual_seed(0))
+    converted = LearnedCurvilinearSaliency().to(dtype)
+    assert {p.dtype for p in converted.parameters()} == {dtype}
+    precision = 0.05 if dtype is not torch.float64 else 1e-5
+    for image in (x, x.to(dtype)):
+        out, mask = converted.field_and_mask(image)
+        assert out.dtype == mask.dtype == image.dtype
+        torch.testing.assert_close(mask.float(), field.mask(x), atol=precision, rtol=0)
+        torch.testing.assert_close(
+            doubled_angle(out).float(), doubled_angle(field(x)), atol=precision, rtol=0
+        )  # vectors have no sign
+
+
+def test_learned_field_under_autocast(field):
+    x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = field(x)
+    assert out.dtype == torch.float32
+    torch.testing.assert_close(doubled_angle(out), doubled_angle(field(x)), atol=0.05, rtol=0)
+
+
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
 def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
     field = LearnedCurvilinearSaliency()

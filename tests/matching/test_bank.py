@@ -23,6 +23,7 @@ from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
 from curvireg_torch.utils.files import tensor_digest
+from tests._support.scenes import learned_registrar, scene
 
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
 
@@ -110,6 +111,12 @@ def test_load_refuses_changed_bits_and_truncated_and_missing_files(saved):
         ({"version": "0"}, "bank format 0"),
         ({"pipeline": '{"bank": {"image_size": 64, "colour": 1}}'}, "incomplete"),
         ({"pipeline": Pipeline().to_json()}, "points: not of the shape"),
+        ({"pipeline": "[" * 100_000}, "incomplete"),
+        ({"warnings": "[" * 100_000}, "incomplete"),
+        ({"warnings": "[1]"}, "incomplete"),
+        ({"up": "q"}, "up: expected one of"),
+        ({"up": ""}, "up: expected one of"),
+        ({"unit": "q"}, "unit: expected one of"),
     ],
 )
 def test_load_refuses_other_metadata(saved, metadata, message):
@@ -131,7 +138,24 @@ def with_nan(x):
         ("boxes", lambda x: x[1:], "boxes: not of the shape"),
         ("points", lambda x: x[:, 1:], "points: not of the shape"),
         ("appearance", with_nan, "appearance: .* not finite"),
-        ("mesh.faces", lambda x: x + 10**6, "mesh: not a mesh"),
+        ("mesh.faces", lambda x: x + 10**6, "mesh: faces name vertices that do not exist"),
+        ("mesh.faces", lambda x: x.long(), "mesh: not a mesh"),
+        ("mesh.faces", lambda x: x[:0], "mesh: not a mesh"),
+        ("mesh.faces", lambda x: x.flatten(), "mesh: not a mesh"),
+        ("mesh.faces", lambda x: x[:, :2], "mesh: not a mesh"),
+        ("mesh.vertices", lambda x: 0 * x, "every face is degenerate"),
+        ("mesh.vertices", lambda x: 0 * x + 1e200, "vertices farther than"),
+        ("mesh.vertices", lambda x: 1e-9 * x, "units across"),
+        ("mesh.vertices", with_nan, "NaN or infinite vertices"),
+        ("mesh.vertices", lambda x: x.flatten(), r"mesh\.vertices: expected shape"),
+        ("points", lambda x: x.float(), "expected uint8"),
+        ("silhouettes", lambda x: x.bool(), "expected uint8"),
+        ("extreme_points", with_nan, "extreme_points: expected finite"),
+        ("extreme_points", lambda x: x[:0], "extreme_points: those of another mesh"),
+        ("extreme_points", lambda x: x[:1], "extreme_points: those of another mesh"),
+        ("extreme_points", lambda x: 1.1 * x, "extreme_points: those of another mesh"),
+        ("extreme_points", lambda x: 0.9 * x, "extreme_points: those of another mesh"),
+        ("extreme_points", lambda x: x.float(), "extreme_points: expected float64"),
         ("extreme_points", lambda x: x[:, 1:], "extreme_points: expected shape"),
         ("mesh_symmetries", lambda x: 2 * x, "symmetries: expected"),
     ],
@@ -163,7 +187,7 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
     tensors = load_file(path)
     tensors["view_mesh.faces"] += 10**6
     rewrite(path, tensors, checksum=tensor_digest(tensors, size=16))
-    with pytest.raises(BankError, match="view_mesh: not a mesh"):
+    with pytest.raises(BankError, match="view_mesh: faces name vertices"):
         ViewBank.load(path)
 
 
@@ -176,3 +200,15 @@ def test_float16_storage_changes_no_ranking(small_bank, saved):
     exact, stored = (Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved)))
     assert float((exact - stored).abs().max()) < 1e-4
     assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))
+
+
+def test_features_of_another_network_are_a_bank_error(saved):
+    registrar = learned_registrar()
+    registrar.bank.save(saved)
+    tensors = load_file(saved)
+    tensors["appearance"] = tensors["appearance"][:, :-1].contiguous()
+    rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
+    image, box, _ = scene(0)
+    (result,) = Registrar(ViewBank.load(saved))([image], box[None])
+    assert isinstance(result.error, BankError)
+    assert "appearance of" in str(result.error)

@@ -11,6 +11,7 @@ from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.mesh import normalization_transform
 from curvireg_torch.mesh.edges import MeshEdges, encloses_volumes, simplified
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_up, principal_rotation
+from curvireg_torch.rendering.contours import MeshContours
 
 
 @pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (1.0, 0.9, 0.02), (1.0, 0.05, 0.05)])
@@ -104,3 +105,18 @@ def test_edges_of_one_vertex_are_neighbours():
     """Contour points are spread along the edges in this order, and so over the whole contour."""
     edges = MeshEdges(trimesh.creation.icosphere(subdivisions=3), np.zeros(3), max_faces=2000).edges
     assert edges.tolist() == sorted(edges.tolist())
+
+
+def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float)
+    mesh = trimesh.Trimesh(
+        np.concatenate([corner, corner + np.array([1e7, 0, 0])]), [[0, 1, 2], [3, 4, 5]], process=False
+    )
+    vertices, faces = simplified(mesh, np.zeros(3), 100)
+    assert np.array_equal(vertices[faces], mesh.triangles)
+    assert len(MeshEdges(mesh, np.zeros(3), 100).edges) == 6
+    K = torch.tensor([[100.0, 0, 31.5], [0, 100, 31.5], [0, 0, 1]], dtype=torch.float64)
+    T = torch.eye(4, dtype=torch.float64)[None]
+    T[0, 2, 3] = 2e7
+    points = MeshContours(mesh).points(T, K[None], 64)
+    assert bool(points.model.isfinite().all())

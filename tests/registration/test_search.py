@@ -61,12 +61,12 @@ def test_motion_is_the_frobenius_norm_of_the_relative_transform_in_radii():
 class Peak:
     """A matcher that knows the best view: the nearer a view is to it, in angle and distance, the better."""
 
-    def __init__(self, bank: Any, azimuth: float, elevation: float, distance: float) -> None:
+    def __init__(self, bank: Any, truth: Tensor, distance: float) -> None:
         self.bank, self.compared = bank, []
-        self.truth, self.distance = rotation_from_viewpoint(azimuth, elevation), distance
+        self.truth, self.distance = truth, distance
 
     def scores(self, views: Any) -> Tensor:
-        angle = rotation_error(views.rotations, self.truth)
+        angle = rotation_error(views.rotations, self.truth.float())
         return -(angle.square()) / 100.0 - (views.distance - self.distance).square()
 
     def compare_views(self, _: Any, views: Any) -> Tensor:
@@ -74,34 +74,54 @@ class Peak:
         return self.scores(views)
 
 
-def searched(*truth: float, camera: str = "perspective") -> tuple[Tensor, Tensor, Any]:
-    """Rotation and distance that the search finds on a bank of neighbouring views, and the matcher."""
-    views = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
-    bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, image_size=32, camera=camera, progress=False)
-    matcher: Any = Peak(bank, *truth)
+def searched(
+    *truth: float, camera: str = "perspective", frame: str = "own", allowed: tuple[float, float] = (0.0, 360.0)
+) -> tuple[float, float, Any]:
+    """Error of the rotation in degrees and distance in radii that the search finds on a bank of neighbours, some
+    of which are allowed, and the matcher."""
+    mesh = trimesh.creation.box((1, 2, 3))
+    pipeline = Pipeline(views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera))
+    turn = principal_rotation(mesh) if frame == "principal" else torch.eye(3).double()
+    grid = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
+    views = grid.in_frame(turn)
+    bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
+    azimuth, elevation, distance = truth
+    R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
+    matcher: Any = Peak(bank, R, distance)
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
-    ranking: Any = type("Ranking", (), {"order": order, "allowed": None})()
-    rotation, distance = search.search(matcher, None, ranking)
-    return rotation, distance / (0.5 * 14**0.5), matcher
+    inside = ((grid.azimuth >= allowed[0]) & (grid.azimuth <= allowed[1]))[None]
+    ranking: Any = type("Ranking", (), {"order": order, "allowed": inside})()
+    rotation, found = search.search(matcher, None, ranking)
+    return float(rotation_error(rotation, R)), float(found) / (0.5 * 14**0.5), matcher
 
 
 def test_search_looks_between_the_least_and_greatest_angles_and_distances():
-    rotation, distance, matcher = searched(207.0, 0.0, 3.7)
+    error, distance, matcher = searched(207.0, 0.0, 3.7)
     first = matcher.compared[0]
     assert sorted(set(first.azimuth.round().tolist())) == [200, 205, 210, 215, 220]
     assert sorted(set(first.distance.tolist())) == [3.0, 3.25, 3.5, 3.75, 4.0, 4.25, 4.5]
-    assert float(rotation_error(rotation, rotation_from_viewpoint(207.0, 0.0).double())) < 2.0
-    assert float(distance) == pytest.approx(3.7, abs=0.1)
+    assert error < 2.0
+    assert distance == pytest.approx(3.7, abs=0.1)
+
+
+def test_search_is_between_allowed_views():
+    _, _, matcher = searched(207.0, 0.0, 3.7, allowed=(240.0, 300.0))
+    assert float(matcher.compared[0].azimuth.min()) >= 240.0 - 1e-3
+
+
+def test_search_is_in_the_frame_of_the_views():
+    error, _, matcher = searched(207.0, 0.0, 3.7, frame="principal")
+    assert error < 2.1
+    assert len(matcher.compared) > 1
 
 
 def test_search_stops_by_the_motion(monkeypatch):
     rounds, errors = [], []
     for stop in (1e9, 0.2, 0.05):
         monkeypatch.setattr(search, "STOP_MOTION", stop)
-        rotation, distance, matcher = searched(207.0, 0.0, 3.7)
+        error, distance, matcher = searched(207.0, 0.0, 3.7)
         rounds.append(len(matcher.compared))
-        angle = float(rotation_error(rotation, rotation_from_viewpoint(207.0, 0.0).double()))
-        errors.append((angle, abs(float(distance) - 3.7)))
+        errors.append((error, abs(distance - 3.7)))
     assert rounds == [1, 2, 4]
     assert errors == [pytest.approx(e, abs=1e-4) for e in ((2.0, 0.05), (0.5, 0.05), (0.5, 0.0125))]
 
@@ -110,7 +130,7 @@ def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
     _, distance, matcher = searched(207.0, 20.0, 3.0, camera="orthographic")
     assert set(matcher.compared[0].distance.tolist()) == {3.0}
     assert sorted(set(matcher.compared[0].elevation.round().tolist()))[:3] == [0, 5, 10]  # three directions
-    assert float(distance) == pytest.approx(3.0)
+    assert distance == pytest.approx(3.0)
 
 
 def paper_registrar(**changes: Any) -> Registrar:

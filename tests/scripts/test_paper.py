@@ -1,22 +1,31 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
+import json
+import sys
+from dataclasses import replace
+from importlib import util
+from itertools import pairwise
+from unittest.mock import Mock
+
+import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint, sample_views
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
+from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from scripts.paper import tables
+from scripts.paper import measure, printed, reproduce_paper, staircase, tables
+from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
+from scripts.paper.measures import bootstrap, points_within
 from tests._support.scenes import write_photo
 
 SETTINGS = BankSettings(image_size=64)
-VIEWS = sample_views(azimuth_step=30, elevations=[0, 30])
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory):
-    """Two photographs of one object, at views of the bank."""
+def root(tmp_path_factory):
+    """Two photographs of one object, at views of the corrected bank."""
     root = tmp_path_factory.mktemp("web")
     folder = root / "thing"
     folder.mkdir()
@@ -34,40 +43,156 @@ def cases(tmp_path_factory):
         write_photo(folder / f"{i}.png", image)
         lines.append(f"{i}.png,{','.join(f'{v:g}' for v in box.tolist())},{azimuth},{elevation},0,")
     folder.joinpath("views.csv").write_text("\n".join(lines) + "\n")
-    return tables.find_cases("web", root)
+    return root
 
 
-def test_curve_table_peaks_at_the_true_view(cases, tmp_path):
-    table = tables.curve_table(cases, SETTINGS, 1.5, progress=False)
-    assert [row[0] for row in table.rows] == list(range(-100, 100, 5))
-    for k, name in enumerate(table.columns):
-        if name in ("MFC", "MCS", "IG"):
-            best = max(table.rows, key=lambda row: row[k])
-            assert abs(best[0]) <= 5, name
-            assert best[k] > 0.5, name
-    names = {path.name for path in tables.write_table(table, tmp_path)}
-    assert {"curve.csv", "curve.md"} == names
-    assert "N = 2" in (tmp_path / "curve.md").read_text()
+@pytest.fixture(scope="module")
+def views(root):
+    """Records of rankings."""
+    found = measure.measure_views(find_cases("web", root), SETTINGS, "upright")
+    return [{"category": "thing", "cad": "thing", **record} for record in found]
 
 
-def test_rank_tables_find_the_true_view(cases):
-    rankings = tables.rank_views(cases, VIEWS, SETTINGS, progress=False)
-    assert rankings.errors.amin(1).max() < 0.1, "the truth is in the bank"
-    precision = tables.precision_table(rankings)
-    assert precision.rows[1][precision.columns.index("CS/MFC")] == 1.0
-    table = tables.rank_table(rankings)
-    assert [row[0] for row in table.rows] == [1, 3, 5, 10, 20]
-    for column in list(zip(*table.rows, strict=True))[1:]:
-        assert list(column) == sorted(column), "precision grows with k"
-    angles = tables.angle_table(rankings)
-    row = dict(zip(angles.columns, angles.rows[0], strict=True))
-    assert row["azimuth Clo."] == row["elevation Clo."] == pytest.approx(0, abs=1e-3)
+def test_points_of_the_true_view_are_repeated_most(root):
+    records = measure.measure_points(find_cases("web", root), SETTINGS)
+    assert {name.upper() for name in DETECTORS} == set(records[0]["points"])
+    for record in records:
+        for name in ("MFC", "MCS", "IG"):
+            best = int(np.argmax(record["curve"][name]))
+            assert abs(measure.CURVE_OFFSETS[best]) <= 5, name
+            assert record["curve"][name][20] == pytest.approx(record["repeatability"][f"CS/{name}"])
+        assert record["ip"]["MCS"] > 2 * record["ip"]["chance"]
+        assert record["sensitivity"]["MCS 0.04 2"] == pytest.approx(record["ip"]["MCS"])
+        for share in (0.01, 0.08):
+            of_eps = [record["sensitivity"][f"MCS {share:g} {eps:g}"] for eps in measure.EPS]
+            assert of_eps == sorted(of_eps)
+        assert 10 < record["points"]["MCS"] <= 0.04 * 64 * 64 + 1
+        assert 0 < record["hausdorff"]["MCS"] < 90
 
 
-def test_detector_tables(cases):
-    ip, hausdorff, points = tables.detector_tables(cases, SETTINGS, 2.0, progress=False)
-    assert set(DETECTORS) <= {name.lower() for name in ip.columns}
-    column = ip.columns.index("MFC")
-    assert ip.rows[1][column] > 2 * ip.rows[1][ip.columns.index("chance")]
-    assert 10 < points.rows[1][column] <= 0.04 * 64 * 64 + 1
-    assert 0 < hausdorff.rows[1][column] < 64
+def test_tables_rank_by_the_terms_of_the_paper_alone():
+    for pipeline in measure.variants("upright").values():
+        assert [term.name for term in pipeline.terms] == ["hog", "repeatability"]
+        assert pipeline.terms[0].whitening == "paper"
+        assert (pipeline.box_jitter, pipeline.search, pipeline.contours) == (0.0, True, False)
+    assert measure.variants("any")["literal"] == PRESETS["paper"]
+    assert measure.variants("any")["corrected"].views == ViewPolicy("any")
+
+
+def test_rankings_find_the_true_view(views):
+    for record in views:
+        assert max(record["corrected"]["limit"][:3]) < 1e-2, "the truth is in the bank"
+        assert record["literal"]["limit"][0] > 1.0, "and not in the paper's"
+        assert np.isnan(record["corrected"]["limit"][3]), "the distance is unknown"
+        assert len(record["literal"]["CS/MFC"]["top"]) == 20
+        top = record["corrected"]["CS/MCS"]["top"]
+        assert min(top[:20]) < 30.0
+    records = tables.Records(views, "two photographs")
+    for table in tables.rank_tables(records):
+        for row in table.rows:
+            means = [cell.mean for cell in row[1:]]
+            assert means == sorted(means), "precision grows with k"
+
+
+def test_closest_is_that_of_the_retrieved_views(views):
+    for record in views:
+        for pair in measure.PAIRS:
+            found = record["corrected"][pair]
+            assert len(found["est"]) == len(found["clo"]) == 4
+            least = min(found["top"][:3])
+            apart = [np.radians(x) for x in found["clo"][:3]]
+            assert max(np.degrees(apart)) >= least / 3.0 - 1e-3, "not closer than the closest of the three"
+
+
+def test_a_mesh_is_rendered_once():
+    renderer = measure.Remembered(example_mesh())
+    renderer._inner = Mock(wraps=renderer._inner)
+    T = torch.eye(4)[None].repeat(2, 1, 1).double()
+    T[:, 2, 3] = torch.tensor([1.0, 2.0]).double()
+    K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]).double().expand(2, 3, 3)
+    first = renderer.render(T, K, (64, 64))
+    second = renderer.render(T, K, (64, 64))
+    assert torch.equal(first, second)
+    assert renderer._inner.render.call_count == 1
+    assert not torch.equal(renderer.render(T, K, (64, 64), orthographic=True), first)
+    assert renderer._inner.render.call_count == 2
+
+
+def test_bootstrap_resamples_cads():
+    values = [0.0] * 10 + [1.0] * 10
+    alone = bootstrap(values, [str(i) for i in range(20)])
+    together = bootstrap(values, ["a"] * 10 + ["b"] * 10)
+    assert (alone.mean, alone.n) == (together.mean, together.n) == (0.5, 20)
+    assert 0.2 < alone.low < alone.mean < alone.high < 0.8
+    assert (together.low, together.high) == (0.0, 1.0)
+    assert bootstrap([np.nan, 2.0], ["a", "b"]).n == 1
+    assert bootstrap([np.nan], ["a"]).n == 0
+    assert str(bootstrap([16.5] * 3, ["a"] * 3)) == "16.5 (16.5 to 16.5)"
+
+
+def test_points_within_a_radius():
+    photo, view = torch.zeros(9, 9, dtype=torch.bool), torch.zeros(9, 9, dtype=torch.bool)
+    photo[4, 4] = photo[4, 8] = view[4, 1] = True
+    assert points_within(photo, view, (2.0, 3.0, 7.0)) == [0.0, 0.5, 1.0]
+    assert points_within(photo, torch.zeros_like(view), (9.0,)) == [0.0]
+    assert np.isnan(points_within(torch.zeros_like(photo), view, (9.0,))[0])
+
+
+def test_printed_numbers_are_the_means_of_the_papers_rows():
+    assert printed.PRECISION["CS/MFC"] == pytest.approx(0.837)
+    assert printed.IP["MFC"] == pytest.approx(0.46)
+    assert printed.WEB_IP["PCI"] == pytest.approx(0.449)
+    assert printed.HAUSDORFF["FUZZY"] == pytest.approx(98.5)
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["reproduce_paper.py", *map(str, words)])
+    return reproduce_paper.main()
+
+
+def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
+    page = tmp_path / "paper.md"
+    page.write_text("# Page\n\n<!-- paper:begin -->\n<!-- paper:end -->\n")
+    words = ["repeatability", "web", root, "--out", tmp_path, "--image-size", "64", "--quiet", "--page", page]
+    assert run(monkeypatch, *words) == 0
+    text = (tmp_path / "repeatability.md").read_text()
+    assert "N = 2 (1 CADs)" in text
+    assert text in page.read_text()
+    assert (tmp_path / "repeatability.csv").read_text().startswith(",MFC,MFC low,MFC high,MFC N")
+    (record,) = (tmp_path / "records").iterdir()
+    assert len(json.loads(record.read_text())) == 2
+    monkeypatch.setattr(reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again")))
+    assert run(monkeypatch, "curve", *words[1:]) == 0
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert len((tmp_path / "curve_all.csv").read_text().splitlines()) == 41
+    with pytest.raises(AssertionError, match="measured again"):
+        run(monkeypatch, "precision", *words[1:])
+
+
+@pytest.mark.parametrize(("module", "package"), [("skimage", "scikit-image"), ("matplotlib", "matplotlib")])
+def test_a_missing_package_is_named(root, tmp_path, monkeypatch, capsys, module, package):
+    find_spec = util.find_spec
+    monkeypatch.setattr(util, "find_spec", lambda name: None if name == module else find_spec(name))
+    assert run(monkeypatch, "curve", "web", root, "--out", tmp_path) == 2
+    assert f"{package} is not installed; pip install 'curvireg_torch[paper]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pose", ["any", "upright"])
+def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(pose):
+    steps = list(staircase.pipelines(pose))
+    assert steps[0][1] == PRESETS["paper"]
+    assert steps[-1][1] == Pipeline().with_pose_prior(pose)
+    for (_, before), (name, after) in pairwise(steps):
+        assert before != after, name
+        names = ("views", "bank", "field", "terms", "box_jitter", "search")
+        parts = [part for part in names if getattr(before, part) != getattr(after, part)]
+        assert len(parts) <= 1, name
+    assert replace(steps[-2][1], hypotheses=5, contours=True) == steps[-1][1]
+
+
+def test_the_staircase_shows_what_is_known():
+    row = {"set": "lm", "step": "2", "n": "8", "right": "0.625", "median": "12.3", "commit": "abc"}
+    text = staircase.table([row, {**row, "step": "0", "right": "0"}])
+    assert "| change | `lm`, N 8 |" in text
+    assert "| 2. S_rep monotone | 0.62, 12° |" in text
+    assert "| 13. contour fit of five hypotheses: the default | - |" in text

@@ -43,6 +43,18 @@ def test_ledoit_wolf_equals_scikit_learn(count):
     torch.testing.assert_close(mean, x.mean(dim=0))
 
 
+@pytest.mark.parametrize("count", [5, 30, 2000])
+def test_precision_solves_with_the_shrunk_covariance(count):
+    x, y = sample(count, 24), sample(7, 24)
+    mean, covariance = terms.ledoit_wolf(x)
+    precision = terms.Precision(x)
+    torch.testing.assert_close(precision.mean, mean)
+    expected = torch.linalg.solve(covariance.double(), y.double().T).T.float()
+    torch.testing.assert_close(precision(y), expected, rtol=2e-3, atol=1e-4)
+    with pytest.raises(InvalidInputError, match="look alike"):
+        terms.Precision(torch.ones(count, 24))
+
+
 def test_matcher_ranks_by_whitened_correlation(bank):
     images, boxes = [scene(0)[0]], scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)

@@ -70,13 +70,13 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
         files.check_writable(tmp_path / "file", "--out")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_write_file_keeps_the_old_content_if_interrupted(
     number: signal.Signals, code: int, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: files.write_file(path, NEW))
-    before = signal.getsignal(signal.SIGTERM)
+    before = [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]
     ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for jobs in the background
     try:
         with pytest.raises(SystemExit, match=str(code)):
@@ -84,7 +84,17 @@ def test_write_file_keeps_the_old_content_if_interrupted(
     finally:
         signal.signal(signal.SIGINT, ignored)
     assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)] == before
+
+
+def test_a_command_below_nohup_outlives_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with files.terminable():
+            signal.raise_signal(signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) -> None:

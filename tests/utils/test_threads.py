@@ -54,6 +54,75 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
     assert threads.map_on_threads(job, []) == []
 
 
+def test_threads_that_start_during_jobs_keep_the_number_of_the_process() -> None:
+    """A thread takes torch's number for the process over with its first call of torch, and keeps it."""
+    found: list[int] = []
+
+    def on_a_new_thread() -> None:
+        thread = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+        thread.start()
+        thread.join()
+
+    def job(level: int) -> int:
+        on_a_new_thread()
+        if level:  # pools within jobs
+            with threads.single_threaded_pool() as pool:
+                assert list(pool.map(job, [level - 1, level - 1])) == [1, 1]
+            on_a_new_thread()
+        return torch.get_num_threads()
+
+    assert threads.map_on_threads(job, [2, 0, 1]) == [1, 1, 1]
+    on_a_new_thread()
+    assert set(found) == {2}
+    assert torch.get_num_threads() == 2
+
+
+def test_the_caller_keeps_a_number_of_its_own() -> None:
+    """Not the one that another thread set for the process since."""
+    thread = threading.Thread(target=lambda: torch.set_num_threads(3))
+    thread.start()
+    thread.join()
+    assert set(threads.map_on_threads(lambda _: torch.get_num_threads(), range(4))) == {1}
+    assert torch.get_num_threads() == 2
+
+
+def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, calls = threading.Thread.start, []
+
+    def refuse_the_third(thread: threading.Thread) -> None:
+        calls.append(thread)
+        if len(calls) == 3:  # the second of the pool, after the one that reads torch's number
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", refuse_the_third)
+    with pytest.raises(RuntimeError, match="can't start"):
+        threads.map_on_threads(lambda number: number, range(2))
+    monkeypatch.undo()
+    assert threads.map_on_threads(lambda _: torch.get_num_threads(), range(2)) == [1, 1]
+    assert torch.get_num_threads() == 2
+
+
+def test_jobs_that_have_not_started_are_cancelled_after_an_error() -> None:
+    done: list[int] = []
+
+    def job(number: int) -> None:
+        if number == 0:
+            raise ValueError("zero")
+        time.sleep(0.01)
+        done.append(number)
+
+    with pytest.raises(ValueError, match="zero"):
+        threads.map_on_threads(job, range(200))
+    assert len(done) < 100
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_jobs_record_gradients_as_their_caller_does(gradients: bool) -> None:
+    with torch.set_grad_enabled(gradients):
+        assert threads.map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [gradients] * 3
+
+
 def test_jobs_share_few_threads_on_many_cores() -> None:
     torch.set_num_threads(16)  # the fixture undoes it
     assert threads.available_threads() == threads.MAX_THREADS

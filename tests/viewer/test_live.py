@@ -1,11 +1,14 @@
 import itertools
 import json
+import re
 import threading
 import time
 import urllib.error
 import urllib.request
 import webbrowser
+from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -74,7 +77,8 @@ def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
             raise KeyboardInterrupt
         return call(self, *arguments)
 
-    def open_browser(address):
+    def open_browser(page):
+        (address,) = {*re.findall(r"http://[^\"]+", Path(urlsplit(page).path).read_text())}
         threads.append(threading.Thread(target=watch, args=(address,)))
         threads[0].start()
 

@@ -183,7 +183,7 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     folder, rows = rig
     header = HEADER.replace(",".join(CAMERA), "camera")
     written(tmp_path / "rig.csv", header, *([*row[:5], "cam.json", *row[9:]] for row in rows))
-    calibration = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1], "dist": [-0.2, 0, 0, 0]}
+    calibration = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1], "dist": [-0.2, 0, 0, 0, 0]}
     (tmp_path / "cam.json").write_text(json.dumps(calibration))
     session = send(workspace, folder, "0.png")
     send(workspace, tmp_path, "rig.csv")
@@ -198,7 +198,7 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
     assert session.options.camera is None
     search(workspace)
-    assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0]
+    assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0, 0]
     asyncio.run(workspace.open_rig(None))
     assert [shot.is_undistorted for shot in session.shots] == [False, False, False]
 

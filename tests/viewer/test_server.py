@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen
+from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, print_address
 
 
 async def page(scope, _, send):
@@ -20,7 +20,7 @@ async def page(scope, _, send):
         await send({"type": "http.response.body", "body": b"page"})
 
 
-def answer(site, kind="http", **headers):
+def answer(site, kind="http", also=None, **headers):
     """The first message that answers a request to a site for one host."""
     pairs = [(name.encode(), value.encode()) for name, value in {"host": "127.0.0.1:8080", **headers}.items()]
     scope = {"type": kind, "path": "/", "method": "GET", "headers": pairs}
@@ -33,7 +33,8 @@ def answer(site, kind="http", **headers):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guarded(page, site)(scope, receive, send))
+    hosts = [site] if also is None else [site, also]
+    asyncio.run(guarded(page, *hosts)(scope, receive, send))
     return sent[0]
 
 
@@ -54,6 +55,49 @@ def test_a_page_answers_to_its_own_names_and_origins_only():
     for host in ("192.168.1.7:80", "[fe80::1]:80", "bench"):
         assert status("0.0.0.0", host) == 200
     assert (status("bench.lan", "BENCH.lan:80"), status("bench.lan", "192.168.1.7")) == (200, 400)
+
+
+def test_ipv6_addresses_are_hosts_in_any_spelling():
+    for host in ("fe80::1", "FE80:0::1", "[fe80::1]", "fe80::1%eth0"):
+        assert status(host, "[fe80::1]:8080") == status(host, "[fe80:0:0::1]") == 200, host
+        for other in ("[fe80::2]:8080", "fe80", "[fe80::1", "fe80::1", "[]", "127.0.0.1", "[::1]"):
+            assert status(host, other) == 400, other
+    assert status("::1", "[::1]:8080") == status("0:0::1", "localhost:9") == 200
+    assert status("::1", "evil.example") == 400
+    for host in ("::", "0::0", "[::]"):
+        assert status(host, "bench:80") == 200
+
+
+def test_a_host_header_is_a_name_and_a_port_alone():
+    for header in ("evil@127.0.0.1", "127.0.0.1/x", "127.0.0.1:80:80", "127.0.0.1?", "127.0.0.1#", "127.0.0.1:x"):
+        assert status("127.0.0.1", header) == 400, header
+
+
+@pytest.mark.parametrize(
+    ("host", "shown", "is_warned"),
+    [
+        ("127.0.0.1", "127.0.0.1", False),
+        ("localhost", "localhost", False),
+        ("127.1", "127.1", False),
+        ("::1", "[::1]", False),
+        ("[::1]", "[::1]", False),
+        ("0.0.0.0", socket.gethostname(), True),
+        ("0", socket.gethostname(), True),
+        ("::", socket.gethostname(), True),
+    ],
+)
+def test_the_printed_address_names_the_host(capsys, host, shown, is_warned):
+    with listen(host, 0) as listener:
+        bound, port = listener.getsockname()[:2]
+        address = print_address(listener, host, "/secret")
+    assert address == f"http://{shown}:{port}/secret/"
+    printed = capsys.readouterr()
+    assert printed.out == f"curvireg: {address}   (Ctrl-C ends it)\n"
+    assert ("everyone who reaches this machine" in printed.err) is is_warned
+    own = f"[{bound}]" if ":" in bound else bound
+    for header in (f"{shown}:{port}", f"{own}:{port}"):
+        assert answer(host, also=bound, host=header)["status"] == 200, header
+    assert answer(host, also=bound, host="evil.example")["status"] == (200 if is_warned else 400)
 
 
 def test_every_answer_has_the_security_headers():

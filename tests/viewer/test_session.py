@@ -13,10 +13,11 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
+from curvireg_torch.data.pose_files import read_pose
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
-from curvireg_torch.evaluation.opening import RegisterOptions, read_start
+from curvireg_torch.evaluation.opening import WITHIN, RegisterOptions
 from curvireg_torch.evaluation.store import to_json
-from curvireg_torch.geometry import Camera, rotation_error, undistorted
+from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpoint, undistorted
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module
@@ -107,9 +108,9 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     folder = registered[1]
     session.shot.choose(1)
     (folder / "chosen.json").write_text(to_json(session.document()))
-    start, confidence = read_start(folder / "chosen.json")
-    assert start == tuple(map(tuple, session.shot.answer.pose.transform.tolist()))
-    assert confidence is None
+    start = read_pose(folder / "chosen.json")
+    assert torch.equal(start.T, session.shot.answer.pose.transform.double())
+    assert start.confidence is None
     scene = trimesh.load(io.BytesIO(session.shot.glb()), file_type="glb")
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     assert np.allclose(flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5)
@@ -358,3 +359,15 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     assert seen(moved, K, right)[1] > seen(T, K, right)[1]
     with pytest.raises(InvalidInputError, match="touch the camera"):
         result.scaled(T, 1000.0)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 45.0, 90.0, 135.0, 180.0, 200.0, 315.0])
+@pytest.mark.parametrize("elevation", [-30.0, 0.0, 60.0])
+def test_a_hint_is_the_side_from_which_the_model_is_seen(azimuth, elevation):
+    """The camera of that viewpoint stands where the hint was taken, in the frame of limits."""
+    R = rotation_from_viewpoint(*(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation, 0.0)))
+    position = R.mT @ torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64)
+    session = Session(RegisterOptions(limits={"front": "x"}))
+    session.hint_direction(position.tolist())
+    assert session.options.limits["viewpoint"] == pytest.approx((azimuth, elevation, 0.0), abs=0.06)
+    assert (session.options.limits["within"], session.options.limits["front"]) == (WITHIN, "x")

@@ -1,13 +1,16 @@
 """What the page works on outlives it, and what files it receives; no browser is needed."""
 
 import asyncio
+import errno
 import json
+import os
 import secrets
 import struct
 import threading
 import warnings
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -15,7 +18,7 @@ import pytest
 import torch
 import trimesh
 
-from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
+from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, OutputError
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.workspace import show_warning, unpack
@@ -59,7 +62,7 @@ def test_uploads_find_their_place(workspace, scene):
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
     assert (names(workspace), sorted(stored(workspace))) == (["b.png"], ["b.png", "part.PLY"])
-    calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0]}
+    calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0, 0]}
     asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
     assert session.shot.photo.notes == ("undistorted",)
     asyncio.run(workspace.remove_photo())
@@ -316,3 +319,87 @@ def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monk
     refused({f"{k}.txt": b"" for k in range(3)}, "more than 2 files")
     monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # the directory is not even read
     refused({f"{k:0200}.txt": b"" for k in range(20)}, "more than 2 files")
+
+
+class FullDisk:
+    """A file on a disk that has no room."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return False
+
+    def write(self, _):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
+    message = r"^a\.png: cannot be stored \(No space left on device\); make room on the machine"
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", lambda *_, **__: FullDisk())
+        with pytest.raises(OutputError, match=message):
+            asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
+    with monkeypatch.context() as patch:
+        patch.setattr(module.tempfile, "mkdtemp", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        with pytest.raises(OutputError, match=message):
+            asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
+    assert (list(workspace.folder.iterdir()), workspace.receiving) == ([], {})
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
+    pack(scene / "a.zip", {"a.ply": b""})
+    asyncio.run(upload(workspace, scene / "a.zip"))
+    assert workspace.messages["mesh"].startswith("a.zip: cannot be stored (No space left on device); make room")
+    assert stored(workspace) == []
+
+
+def test_messages_have_no_temporary_folders(workspace):
+    inside = workspace.folder / "upload-ab_c1"
+    for text, shown in (
+        (f"{inside}/rig.csv: row 1: {inside}/parts/b/a.mtl", "rig.csv: row 1: b/a.mtl"),
+        (f"{workspace.folder}/other", "other"),
+        (f"[Errno 36] File name too long: '{inside}/x'", "[Errno 36] File name too long: 'x'"),
+        (f"{inside}", ""),
+        (f"{workspace.folder}-not/x", f"{workspace.folder}-not/x"),
+        ("a/parts/b", "a/parts/b"),
+    ):
+        asyncio.run(workspace.run("mesh", Mock(side_effect=InvalidInputError(text))))
+        assert workspace.messages["mesh"] == shown
+        asyncio.run(workspace.run("mesh", Mock(side_effect=KeyError(text))))
+        assert str(workspace.folder) + "/" not in workspace.messages["mesh"]
+    asyncio.run(workspace.run("mesh", Mock(side_effect=OSError(36, "File name too long", f"{inside}/x"))))
+    assert workspace.messages["mesh"] == "File name too long; check the machine on which the page runs"
+
+
+def test_closing_ends_the_search_and_removes_the_uploads(workspace, scene, search):
+    async def work():
+        await upload(workspace, scene / "photo.png")
+        running = await begin(workspace, search)
+        workspace.close()
+        await asyncio.wait_for(running, 5)
+
+    asyncio.run(work())
+    assert (stored(workspace), workspace.messages) == ([], {"pose": "stopped"})
+
+
+def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatch):
+    monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 100)
+
+    async def work():
+        begun, released = asyncio.Event(), asyncio.Event()
+
+        async def slow():
+            begun.set()
+            await released.wait()
+            yield b"x" * 60
+
+        first = asyncio.create_task(workspace.receive("a.pdf", 60, slow()))
+        await begun.wait()
+        with pytest.raises(InvalidInputError, match=r"^b\.pdf: all files have more than 100 bytes"):
+            await upload(workspace, None, "b.pdf", b"x" * 41)
+        await upload(workspace, None, "c.pdf", b"x" * 40)
+        released.set()
+        await first
+
+    asyncio.run(work())
+    assert (stored(workspace), workspace.receiving) == ([], {})

@@ -88,3 +88,12 @@ def test_object_outside_the_picture_or_around_the_camera_draws_nothing_wrong():
     assert not drawn(box, beside).any()
     assert not drawn(box, placed(-5.0)).any(), "behind the camera"
     assert drawn(trimesh.creation.box((9.0, 9.0, 9.0)), placed(1.0)).shape == (SIZE, SIZE, 4)
+
+
+def test_the_outline_is_drawn_over_the_creases_that_end_at_it():
+    layer = drawn(roof(50), placed(5.0))
+    columns = slice(58, 62)  # of the crease
+    assert colour(layer, ORANGE)[40:80, columns].any(axis=1).all()
+    for rows in (slice(18, 22), slice(98, 102)):
+        assert colour(layer, GREEN)[rows, columns].any(axis=0).all(), "without a gap where the crease ends"
+        assert not colour(layer, ORANGE)[rows, columns][:2].all()

@@ -10,8 +10,9 @@ import torch
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import project_points
+from curvireg_torch.geometry import project_points, rotation_from_axis_angle
 from curvireg_torch.visualization import pose_glb
+from curvireg_torch.visualization.pose_glb import scene_glb
 from tests._support.scenes import CAMERA, SIZE, scene
 
 
@@ -82,3 +83,30 @@ def test_pose_glb_refuses_unusable_poses(z, message):
     T[2, 3] = z
     with pytest.raises(InvalidInputError, match=message):
         pose_glb(trimesh.creation.box(), T, CAMERA, torch.rand(3, *SIZE))
+
+
+def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
+    """Cameras beside each other that are turned, with pixels that are not square."""
+    image, _, T = scene(0)
+    mesh = trimesh.creation.box((0.1, 0.2, 0.05))
+    mesh.units = "mm"
+    K = CAMERA.clone()
+    K[1, 1] *= 1.25
+    poses = []
+    for degrees, shift in ((0.0, (0.1, 0.0, 0.0)), (25.0, (-0.2, 0.3, 0.1))):
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = rotation_from_axis_angle(torch.deg2rad(torch.tensor([0.1, 1.0, 0.3])) * degrees).double()
+        pose[:3, 3] = torch.tensor(shift)
+        poses.append(pose)
+    data = scene_glb(mesh, T, [(pose, K, image) for pose in poses])
+    tree, back = tree_of(data), trimesh.load(BytesIO(data), file_type="glb")
+    name = next(n for n in back.graph.nodes_geometry if len(back.geometry[back.graph[n][1]].faces) == 12)
+    world = trimesh.transform_points(back.geometry[back.graph[name][1]].vertices, back.graph[name][0])
+    nodes = [node for node in tree["nodes"] if "camera" in node]
+    assert [(node["name"], node["camera"]) for node in nodes] == [("photograph 0", 0), ("photograph 1", 1)]
+    corners = torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3)))
+    for node, pose in zip(nodes, poses, strict=True):
+        world_from_camera = np.array(node["matrix"]).reshape(4, 4).T  # glTF writes columns
+        seen = trimesh.transform_points(world, np.linalg.inv(world_from_camera))
+        np.testing.assert_allclose(project(seen, tree), project_points(corners, pose @ T, K).numpy(), atol=1e-2)
+        assert node["extras"]["T_cam_from_model"] == (pose @ T).tolist()

@@ -27,8 +27,10 @@ _YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _COUNTS = (4, 9, 12, 16)  # numbers of fx, fy, cx, cy; of a matrix of 3 x 3, 3 x 4 and 4 x 4
 
 
-def read_document(file: Path) -> Any:
+def read_document(file: Path, expected: str = EXPECTED) -> Any:
     """The values in a file; numbers alone are ``{"K": numbers}``, a line of COLMAP is ``{"colmap": words}``.
+
+    ``expected`` is what messages say about the kinds of files.
 
     Raises:
         InvalidInputError: it is damaged, or of no such kind. The message quotes nothing of its content.
@@ -36,7 +38,7 @@ def read_document(file: Path) -> Any:
     data = file.read_bytes()
     if data.startswith((b"PK\3\4", b"\x93NUMPY")):
         return _arrays(data)
-    text = _text(data)
+    text = _text(data, expected)
     if numbers := _numbers_alone(text):
         return {"K": numbers}
     try:
@@ -46,16 +48,16 @@ def read_document(file: Path) -> Any:
             return _xml(text)
     except (ValueError, RecursionError, ElementTree.ParseError) as error:
         raise InvalidInputError(f"damaged, or no calibration ({error}); write it again") from error
-    return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text)
+    return _colmap(text) if _COLMAP_LINE.search(text) else _yaml(text, expected)
 
 
-def _text(data: bytes) -> str:
+def _text(data: bytes, expected: str) -> str:
     encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
         message = "not a text file, and pickle is not read; save it as JSON: json.dump({'camera_matrix': K.tolist(), "
-        raise InvalidInputError(f"{message}'dist_coeffs': D.tolist()}}, file); expected {EXPECTED}") from error
+        raise InvalidInputError(f"{message}'dist_coeffs': D.tolist()}}, file); expected {expected}") from error
 
 
 def _numbers_alone(text: str) -> list[float]:
@@ -136,7 +138,7 @@ def _xml(text: str) -> Any:
     return {root.tag: value(root)}
 
 
-def _yaml(text: str) -> Any:
+def _yaml(text: str, expected: str) -> Any:
     """The first document with content. Tags say nothing here, and aliases, which can blow a file up, are refused."""
     text = re.sub(r"(?m)^%.*", "", text)  # OpenCV's "%YAML:1.0" is none of YAML's directives
     root: list[Any] = []
@@ -156,7 +158,7 @@ def _yaml(text: str) -> Any:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = "" if mark is None else f"line {mark.line + 1}: "
-        raise InvalidInputError(f"{place}expected 'key: value'; expected {EXPECTED}") from error
+        raise InvalidInputError(f"{place}expected 'key: value'; expected {expected}") from error
     return root[-1] if root else None
 
 

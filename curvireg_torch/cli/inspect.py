@@ -1,0 +1,88 @@
+"""The command ``curvireg inspect``."""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ..errors import InvalidInputError
+from ..evaluation.opening import whole_number
+from ..utils.choices import check_given
+from ..utils.files import write_file
+from .options import MESH, METHOD, add_command, add_options, input_files, register_options
+
+
+def add_inspect(commands: Any) -> None:
+    parser = add_command(
+        commands,
+        "inspect",
+        "curvireg inspect part.stl --unit mm --out out/inspect",
+        "curvireg inspect chair.glb --pose upright --no-camera --n 200 --out out/chair",
+        help="what to expect of photographs of MESH: symmetries, views that look alike, share of right answers",
+        description="Writes DIR/inspect.json and DIR/inspect.html, from generated photographs of the mesh.",
+        run=run_inspect,
+    )
+    parser.add_argument("mesh", type=Path, metavar="MESH")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the report")
+    add = parser.add_argument
+    add("--n", type=whole_number(0), default=60, metavar="N", help="generated photographs (default: 60; 0: none)")
+    add("--seed", type=int, default=0, help="of the photographs (default: 0)")
+    add("--no-camera", dest="with_camera", action="store_false", help="as if the camera were unknown")
+    add("--photo", type=Path, metavar="DIR", help="your own photographs without the object, as backgrounds")
+    add("--strict", action="store_true", help="exit code 3 for a mesh that cannot work")
+    add_options(parser, *MESH, *METHOD)
+
+
+def run_inspect(arguments: argparse.Namespace) -> int:
+    """Write the report and print it."""
+    check_given([], [arguments.mesh])
+    if arguments.mesh.suffix == ".safetensors":
+        raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    from tqdm import tqdm
+
+    from ..evaluation.lists import find_photographs
+    from ..evaluation.outputs import output_folder
+    from ..inspection import inspect
+    from ..inspection.facts import mesh_facts
+    from ..inspection.page import report_lines, report_page
+    from ..matching import cached_bank
+    from ..mesh import load_mesh
+    from ..registration import Registrar
+
+    backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
+    options = register_options(arguments)
+    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    with output_folder(arguments.out, "inspect", inputs=input_files(arguments, arguments.mesh, *backgrounds)):
+        pipeline = options.open_pipeline()
+        bar = tqdm(total=None, desc="photographs", unit="photograph", disable=not options.progress)
+
+        def report_progress(stage: str, done: int, total: int) -> None:
+            bar.desc = stage
+            bar.total = total
+            bar.update(done - bar.n)
+
+        registrar = None
+        if not mesh_facts(mesh).is_hopeless:
+            bank = cached_bank(
+                mesh,
+                pipeline=pipeline,
+                renderer=options.renderer,
+                device=options.device,
+                progress=report_progress,
+            )
+            registrar = Registrar(bank, mesh_is="exact", renderer=options.renderer)
+        report = inspect(
+            mesh if registrar is None else registrar,
+            n=arguments.n,
+            seed=arguments.seed,
+            with_camera=arguments.with_camera,
+            backgrounds=backgrounds,
+            progress=report_progress,
+        )
+        bar.close()
+        content = json.dumps(report.to_dict(), indent=2) + "\n"
+        write_file(arguments.out / "inspect.json", content.encode())
+        page = report_page(report, registrar, title=arguments.mesh.name)
+        write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
+    print("\n".join([f"{arguments.mesh}", *report_lines(report), f"see {arguments.out / 'inspect.html'}"]))
+    return 3 if arguments.strict and report.is_hopeless else 0

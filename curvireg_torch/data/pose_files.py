@@ -1,0 +1,214 @@
+"""Files of one pose: our own results, and those of other tools."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..errors import InvalidInputError, MissingFileError
+from ..geometry.cameras import transform
+from ..utils.checks import check_numbers, check_pose
+from ..utils.files import check_table_size, finite_numbers, split_name
+from .calibrations.documents import read_document
+from .calibrations.record import flattened, plain
+
+_README = "docs/guides/known-pose.md"
+_MATRICES = {plain(name) for name in ("T_cam_from_model", "T_cam_from_object", "cam_from_model", "T_cam_obj", "T_co")}
+_MATRICES |= {plain(name) for name in ("T", "pose", "matrix", "transform", "transform_matrix", "ob_in_cam", "K")}
+FORMATS = (
+    "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; scene_gt.json:IMAGE_ID "
+    "of BOP; pose.yaml of ROS"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFile:
+    """A pose that a file holds.
+
+    Attributes:
+        T: (4, 4) float64 model -> OpenCV camera.
+        unit: of the translation, "m" or "mm", where the format fixes it; None: that of the mesh.
+        confidence: of the pose, if the file has one.
+    """
+
+    T: Tensor
+    unit: str | None = None
+    confidence: float | None = None
+
+
+def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> PoseFile:
+    """Read the pose of an object in a camera.
+
+    Args:
+        path: ``FILE``, or ``FILE:NAME`` of one with several poses: the label of MegaPose, the image of BOP, or
+            ``IMAGE:INDEX`` where it shows several objects.
+        convention: "opengl" for poses whose camera looks along -z; x points right and y up.
+        mesh: name of the mesh's file without its ending, as ``obj_000001``: it chooses among the objects of an image.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        InvalidInputError: it holds no such pose, or several, or one that is not rigid.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "pose.txt")
+        >>> _ = file.write_text("1 0 0 0.1  0 1 0 0  0 0 1 0.5  0 0 0 1")
+        >>> read_pose(file).T[:3, 3].tolist()
+        [0.1, 0.0, 0.5]
+    """
+    file, name = split_name(path)
+    if not file.is_file():
+        raise MissingFileError(f"no such file; {_README} shows the layout", subject=path)
+    check_table_size(file)
+    try:
+        found = _pose_of(read_document(file, FORMATS), name, mesh)
+        check_pose(found.T, "rotation, translation")
+    except RecursionError:
+        raise InvalidInputError("nested too deeply; write it again", subject=path) from None
+    except InvalidInputError as error:
+        raise error.with_subject(path) from error
+    if convention == "opencv":
+        return found
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    return PoseFile(flip @ found.T, found.unit, found.confidence)
+
+
+def _pose_of(content: Any, name: str, mesh: str) -> PoseFile:
+    content = _named(content, name, mesh)
+    if not isinstance(content, dict):
+        raise InvalidInputError(f"expected {FORMATS}")
+    keys = {plain(key): key for key in content}
+    reader = next((read for key, read in _READERS.items() if key in keys), None)
+    if reader is not None:
+        return reader(content)
+    matrices = [flattened(content[key]) for name, key in keys.items() if name in _MATRICES]
+    if numbers := next((values for values in matrices if len(values) in (12, 16)), None):
+        return PoseFile(pose_matrix(numbers), None, _confidence(content))
+    return _rotation_and_translation(content)
+
+
+def _named(content: Any, name: str, mesh: str) -> Any:
+    """The part of a file with several poses that is meant."""
+    if isinstance(content, list) and all(isinstance(item, dict) for item in content) and content:
+        return _item(content, name, mesh)
+    if not isinstance(content, dict) or not any(isinstance(value, list) for value in content.values()):
+        return content
+    images = {key: value for key, value in content.items() if key.isdecimal() and isinstance(value, list)}
+    if len(images) < len(content):
+        return content
+    image, _, index = name.partition(":")
+    if not image and len(images) == 1:
+        (image,) = images
+    chosen = {key.lstrip("0"): value for key, value in images.items()}.get(image.lstrip("0"))
+    if chosen is None or not image:
+        listed = ", ".join(list(images)[:8]) + (", ..." if len(images) > 8 else "")
+        raise InvalidInputError(f"poses of several images; choose one as FILE:IMAGE_ID from {listed}")
+    return _item(chosen, index, mesh)
+
+
+def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
+    """The pose of a list with this label or index, or of the mesh's number; the only one without a name."""
+    number = re.search(r"obj_(\d+)$", mesh)
+    labels = [str(item.get("label", "")) if isinstance(item, dict) else "" for item in items]
+    if name:
+        chosen = [item for item, label in zip(items, labels, strict=True) if label == name]
+        chosen = chosen or ([items[int(name)]] if name.isdecimal() and int(name) < len(items) else [])
+    elif len(items) > 1 and number:
+        chosen = [item for item in items if isinstance(item, dict) and item.get("obj_id") == int(number[1])]
+    else:
+        chosen = [item for item, label in zip(items, labels, strict=True) if label and label == mesh] or list(items)
+    if len(chosen) != 1:
+        names = ", ".join(label or str(index) for index, label in enumerate(labels[:8]))
+        raise InvalidInputError(
+            f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: {names}"
+        )
+    return chosen[0]
+
+
+def pose_matrix(numbers: Sequence[Any]) -> Tensor:
+    """(4, 4) float64 of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1 in the last column
+    and the translation in the last row."""
+    values = check_numbers(list(numbers), "pose")
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    if len(values) == 12:
+        values = torch.cat([values, last])
+    T = values.view(4, 4)
+    by_column = torch.equal(T[:, 3], last) and not torch.equal(T[3], last)
+    T = T.T.contiguous() if by_column else T
+    if not torch.equal(T[3], last):
+        raise InvalidInputError("pose: expected a last row of 0 0 0 1; give T_cam_from_model row by row")
+    return T
+
+
+def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
+    if content.get("frame") == "world":
+        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
+        raise InvalidInputError(message)
+    if "rotation" in content and content.get("translation", ...) is None:
+        raise InvalidInputError(
+            "a result without a translation, as of a photograph without a camera; register with --camera first"
+        )
+    rotation, translation = (
+        next((content[key] for key in keys if key in content), None)
+        for keys in (("rotation", "R"), ("translation", "t"))
+    )
+    R = check_numbers(_flat(rotation), "rotation", 9).view(3, 3)
+    return PoseFile(transform(R, check_numbers(_flat(translation), "translation", 3)), None, _confidence(content))
+
+
+def _flat(values: Any) -> Any:
+    return flattened(values) if isinstance(values, list) else values
+
+
+def _confidence(content: Mapping[str, Any]) -> float | None:
+    numbers = finite_numbers([content.get("confidence")], 1)
+    return numbers[0] if numbers else None
+
+
+def _bop(content: Mapping[str, Any]) -> PoseFile:
+    """An entry of scene_gt.json: millimetres."""
+    R = check_numbers(_flat(content.get("cam_R_m2c")), "cam_R_m2c", 9).view(3, 3)
+    return PoseFile(transform(R, check_numbers(_flat(content.get("cam_t_m2c")), "cam_t_m2c", 3)), "mm")
+
+
+def _megapose(content: Mapping[str, Any]) -> PoseFile:
+    """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the world."""
+    numbers = check_numbers(flattened(content.get("TWO")), "TWO", 7)
+    if "TWC" in content:
+        raise InvalidInputError("TWO: in the world of TWC; give the pose in the camera, TWC^-1 TWO, without TWC")
+    return PoseFile(transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
+
+
+def _ros(content: Mapping[str, Any]) -> PoseFile:
+    """A PoseStamped, as ``--format ros`` writes it: metres."""
+    pose = content.get("pose")
+    while isinstance(pose, dict) and "pose" in pose:  # with a covariance beside it
+        pose = pose["pose"]
+    place, turn = (pose.get(name) if isinstance(pose, dict) else None for name in ("position", "orientation"))
+    if not isinstance(place, dict) or not isinstance(turn, dict):
+        raise InvalidInputError("pose: expected position and orientation; or a matrix of 4 x 4 numbers")
+    t = check_numbers([place.get(axis) for axis in "xyz"], "position", 3)
+    q = check_numbers([turn.get(axis) for axis in "xyzw"], "orientation", 4)
+    return PoseFile(transform(_rotation(q, "orientation"), t), "m")
+
+
+def _rotation(quaternion: Tensor, name: str) -> Tensor:
+    """(3, 3) of x, y, z, w."""
+    if abs(float(quaternion.norm()) - 1.0) > 1e-2:
+        raise InvalidInputError(
+            f"{name}: expected a quaternion x, y, z, w of length 1, got {float(quaternion.norm()):.3g}"
+        )
+    return torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
+
+
+_READERS: dict[str, Callable[[Mapping[str, Any]], PoseFile]] = {
+    "camrm2c": _bop,
+    "two": _megapose,
+    "header": _ros,
+}
+"""Formats by a key, without case and punctuation, that only they have."""

@@ -1,0 +1,232 @@
+"""Two evaluations of one dataset, compared object by object."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binomtest
+
+from ..errors import InvalidInputError
+from ..utils.files import read_csv, read_json
+from .registry import DATASETS
+
+Array = NDArray[np.float64]
+Interval = tuple[float, float]
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000  # of the bootstrap
+SEED = 0
+ADVICE = "docs/evaluation.md; the same 'curvireg evaluate' again writes it without registering anything"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation: its folder, its settings, and the errors of each object by name."""
+
+    name: str
+    dataset: str
+    settings: Mapping[str, Any]
+    errors: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One score of two runs A and B over the ``n`` objects that both have.
+
+    Attributes:
+        score: its key in ``summary.json``.
+        a, b: its values.
+        a_interval, b_interval: 95 % intervals: Wilson's of a fraction, else by bootstrap over the objects.
+        difference: b - a, and its paired bootstrap interval.
+        wins, losses: objects at which B is better than A, and worse; the others are ties.
+        p: of the two-sided sign test.
+    """
+
+    score: str
+    n: int
+    a: float
+    b: float
+    a_interval: Interval
+    b_interval: Interval
+    difference: float
+    difference_interval: Interval
+    wins: int
+    losses: int
+    p: float
+
+
+def read_run(folder: Path) -> Run:
+    """Read what ``curvireg evaluate --out`` wrote into a folder.
+
+    Raises:
+        MissingFileError: no ``summary.json`` or ``errors.csv``.
+        InvalidInputError: files that are damaged, or not of an evaluation.
+    """
+    summary = read_json(folder / "summary.json", dict, ADVICE)
+    settings = summary.get("settings")
+    if not isinstance(settings, dict) or settings.get("dataset") not in DATASETS:
+        raise InvalidInputError("not of an evaluation", subject=folder / "summary.json")
+    path = folder / "errors.csv"
+    if not path.is_file():
+        read_json(path, dict, ADVICE)  # says that it is missing
+    header, *rows = read_csv(path) or [[]]
+    try:
+        errors = {row[0]: _numbers(header[2:], row[2:]) for row in rows}
+    except (ValueError, IndexError) as error:
+        raise InvalidInputError(f"damaged ({error}); {ADVICE}", subject=path) from error
+    return Run(str(folder), settings["dataset"], {**settings, "protocol": summary.get("protocol")}, errors)
+
+
+def _numbers(names: Sequence[str], cells: Sequence[str]) -> dict[str, float]:
+    return {name: float(cell or "nan") for name, cell in zip(names, cells, strict=True)}
+
+
+def compare(a: Run, b: Run) -> list[Comparison]:
+    """Compare the scores of two runs over the objects that both have.
+
+    Raises:
+        InvalidInputError: runs of different datasets, or without an object in common.
+    """
+    for name in ("dataset", "root", "split"):
+        if a.settings.get(name) != b.settings.get(name):
+            values = f"{a.settings.get(name)} and {b.settings.get(name)}"
+            raise InvalidInputError(f"compare: runs of different datasets: {name} {values}")
+    keys = [key for key in a.errors if key in b.errors]
+    if not keys:
+        raise InvalidInputError("compare: the runs have no object in common")
+    comparisons = []
+    measures = DATASETS[a.dataset].scored.measures
+    for score, (error, thresholds) in measures.items():
+        pair = _paired(a, b, keys, error)
+        successes = [np.mean([errors < threshold for threshold in thresholds], axis=0) for errors in pair]
+        comparisons.append(_compared(score, successes[0], successes[1], np.mean, is_fraction=len(thresholds) == 1))
+    medians = dict.fromkeys(error for error, _ in measures.values() if error in ("error_deg", "rotation"))
+    for error in medians:
+        first, second = _paired(a, b, keys, error)
+        comparisons.append(_compared("med_err_deg", first, second, np.median, lower_is_better=True))
+    return comparisons
+
+
+def _paired(a: Run, b: Run, keys: Sequence[str], error: str) -> tuple[Array, Array]:
+    """The errors (N,) of both runs, of objects whose truth is known."""
+    try:
+        both = np.array([[run.errors[key][error] for key in keys] for run in (a, b)])
+    except KeyError:
+        raise InvalidInputError(f"compare: no column {error} in errors.csv of both runs; {ADVICE}") from None
+    known = ~np.isnan(both).any(axis=0)
+    return both[0, known], both[1, known]
+
+
+def _compared(
+    score: str,
+    a: Array,
+    b: Array,
+    summarise: Callable[..., Any],
+    *,
+    is_fraction: bool = False,
+    lower_is_better: bool = False,
+) -> Comparison:
+    """Compare values (N,) of the same objects."""
+    better = a > b if lower_is_better else b > a
+    worse = a < b if lower_is_better else b < a
+    wins = int(better.sum())
+    losses = int(worse.sum())
+    p = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
+    if len(a) == 0:
+        unknown = (math.nan, math.nan)
+        return Comparison(score, 0, math.nan, math.nan, unknown, unknown, math.nan, unknown, 0, 0, p)
+    chosen = np.random.default_rng(SEED).integers(0, len(a), (RESAMPLES, len(a)))
+    with np.errstate(invalid="ignore"):  # a miss has an infinite error, and a median may be one
+        first = np.array([summarise(a[some]) for some in chosen])
+        second = np.array([summarise(b[some]) for some in chosen])
+        value_a = float(summarise(a))
+        value_b = float(summarise(b))
+        difference = value_b - value_a
+        differences = second - first
+    return Comparison(
+        score=score,
+        n=len(a),
+        a=value_a,
+        b=value_b,
+        a_interval=_wilson(a) if is_fraction else _quantiles(first),
+        b_interval=_wilson(b) if is_fraction else _quantiles(second),
+        difference=difference,
+        difference_interval=_quantiles(differences),
+        wins=wins,
+        losses=losses,
+        p=p,
+    )
+
+
+def _quantiles(values: Array) -> Interval:
+    tail = (1.0 - CONFIDENCE) / 2.0
+    low, high = np.quantile(values, [tail, 1.0 - tail], method="nearest")
+    return float(low), float(high)
+
+
+def _wilson(successes: Array) -> Interval:
+    interval = binomtest(int(successes.sum()), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
+    """The comparison as text: each score, then a Markdown and a LaTeX row of each run."""
+    only = [len(run.errors.keys() - other.errors.keys()) for run, other in ((a, b), (b, a))]
+    common = len(a.errors.keys() & b.errors.keys())
+    lines = [f"A {a.name}: {_how(a)}", f"B {b.name}: {_how(b)}"]
+    lines.append(f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count")
+    lines.append("")
+    for each in comparisons:
+        digits = _digits(each)
+        values = f"A {_value(each.a, each.a_interval, digits)}   B {_value(each.b, each.b_interval, digits)}"
+        difference = _value(each.difference, each.difference_interval, f"+{digits}")
+        signs = f"B wins {each.wins}, loses {each.losses}, p {each.p:.2g}"
+        lines.append(f"{each.score}: {values}   B - A {difference}   {signs}")
+    names = [each.score for each in comparisons]
+    lines += ["", "Markdown:", _markdown("run", "N", names), _markdown("---", "---", ["---"] * len(names))]
+    lines += [_markdown(*row) for row in _rows(a, b, comparisons)]
+    lines += ["", "LaTeX:", _latex("run", "N", names)]
+    lines += [_latex(*row) for row in _rows(a, b, comparisons)]
+    return "\n".join(lines) + "\n"
+
+
+def to_document(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
+    """The comparison as JSON."""
+    from .store import to_json
+
+    return to_json({"a": a.name, "b": b.name, "comparisons": [asdict(each) for each in comparisons]})
+
+
+def _how(run: Run) -> str:
+    return f"preset {run.settings.get('preset')}, {run.settings.get('protocol')}"
+
+
+def _rows(a: Run, b: Run, comparisons: Sequence[Comparison]) -> list[tuple[str, str, list[str]]]:
+    """Of each run its name, number of objects, and scores with intervals."""
+    count = str(max(each.n for each in comparisons))
+    first = [_value(each.a, each.a_interval, _digits(each)) for each in comparisons]
+    second = [_value(each.b, each.b_interval, _digits(each)) for each in comparisons]
+    return [(Path(a.name).name, count, first), (Path(b.name).name, count, second)]
+
+
+def _digits(comparison: Comparison) -> str:
+    """Format of a score: fractions, or degrees."""
+    return ".2f" if comparison.score.endswith("err_deg") else ".3f"
+
+
+def _value(value: float, interval: Interval, digits: str) -> str:
+    low, high = (format(end, digits) for end in interval)
+    return f"{value:{digits}} [{low}, {high}]"
+
+
+def _markdown(name: str, count: str, cells: Sequence[str]) -> str:
+    return f"| {' | '.join([name, count, *cells])} |"
+
+
+def _latex(name: str, count: str, cells: Sequence[str]) -> str:
+    escaped = [cell.replace("_", r"\_").replace("%", r"\%").replace("&", r"\&") for cell in (name, count, *cells)]
+    return f"{' & '.join(escaped)} \\\\"

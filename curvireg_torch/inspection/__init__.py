@@ -1,0 +1,4 @@
+"""What is to be expected of a mesh before a photograph is taken: its state, views that look alike, and a trial."""
+
+from .report import Inspection as Inspection
+from .report import inspect as inspect

@@ -1,0 +1,196 @@
+"""The state of a mesh: size, faces, parts, colours and symmetries, and what is wrong with it, in words."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..geometry import rotation_error
+from ..matching.describe import VIEW_FACES
+from ..mesh import has_colours, mesh_symmetries, mesh_unit, mesh_warnings
+from ..mesh.mesh import extreme_points, mesh_radius
+
+MANY_FACES = 200_000  # From which simplification is advised: reading and the first bank take longer than a photograph
+MANY_PARTS = 50
+THIN = 0.02  # Shortest side of the box, as a fraction of the longest, of a thin mesh
+# Area of the surface as a fraction of that of its convex hull, below which a mesh is a wire: a chair of tubes has 0.1
+WIRE_AREA = 0.02
+# Standard deviation of the distances from the middle, relative to their mean, below which a mesh is a sphere
+SPHERE_SPREAD = 0.03
+# Metres across between which a mesh is an object that someone photographs
+SMALLEST, LARGEST = 0.005, 20.0
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048}
+SYMMETRY_POINTS = 2_000
+CONTINUOUS_TURN = 15.0  # Degrees below which a symmetry is one of a body of revolution
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A rotation that maps a mesh to itself.
+
+    Attributes:
+        transform: (4, 4) float64 of the model frame.
+        angle: degrees.
+        deviation_percent: mean distance of the rotated surface from the surface, in percent of the diameter.
+    """
+
+    transform: Tensor
+    angle: float
+    deviation_percent: float
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "transform": self.transform.tolist(),
+            "angle_deg": self.angle,
+            "deviation_percent": self.deviation_percent,
+        }
+
+
+@dataclass(frozen=True)
+class MeshFacts:
+    """Numbers of a mesh that decide how well it can be registered.
+
+    Attributes:
+        unit: that of the mesh, None if unknown.
+        extents: (3,) sides of the box, in that unit.
+        diameter: twice the radius, in that unit.
+        faces, parts: numbers of faces, and of connected parts.
+        is_watertight: whether every edge has two faces.
+        doubled_faces: number of faces that exist twice.
+        area_of_hull: area of the surface as a fraction of that of the convex hull; a closed convex body has 1.
+        is_coloured: whether colours vary over the surface.
+        symmetries: rotations but the identity that leave the shape as it is.
+        warnings: what is wrong, in words.
+        is_hopeless: whether no photograph can show its pose.
+    """
+
+    unit: str | None
+    extents: tuple[float, float, float]
+    diameter: float
+    faces: int
+    parts: int
+    is_watertight: bool
+    doubled_faces: int
+    area_of_hull: float
+    is_coloured: bool
+    symmetries: tuple[Symmetry, ...]
+    warnings: tuple[str, ...]
+    is_hopeless: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values; symmetries and warnings are keys of the whole report."""
+        return {
+            "unit": self.unit,
+            "extents": list(self.extents),
+            "diameter": self.diameter,
+            "faces": self.faces,
+            "parts": self.parts,
+            "watertight": self.is_watertight,
+            "doubled_faces": self.doubled_faces,
+            "area_of_hull": self.area_of_hull,
+            "coloured": self.is_coloured,
+        }
+
+
+def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
+    """Examine a clean mesh (:func:`curvireg_torch.load_mesh`).
+
+    Example:
+        >>> facts = mesh_facts(trimesh.creation.box((1, 2, 3)))
+        >>> facts.faces, facts.is_watertight, len(facts.symmetries)
+        (12, True, 3)
+    """
+    unit = mesh_unit(mesh)
+    extents = np.ptp(mesh.vertices, axis=0)
+    hull = trimesh.convex.convex_hull(extreme_points(mesh).numpy())
+    area_of_hull = float(mesh.area / max(hull.area, 1e-300))
+    welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    welded.merge_vertices()  # files such as STL repeat the corners of each face
+    rows = np.sort(welded.faces, axis=1)
+    doubled_faces = len(rows) - len(trimesh.grouping.unique_rows(rows)[0])
+    corners = trimesh.graph.connected_component_labels(welded.edges_unique, node_count=len(welded.vertices))
+    parts = len(np.unique(corners[welded.faces]))
+    symmetries = measured_symmetries(mesh)
+    is_coloured = has_colours(mesh)
+    warnings = [warning.text for warning in mesh_warnings(mesh)]
+    warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
+    if len(mesh.faces) > MANY_FACES:
+        warnings.append(f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}; simplify it, and it loads faster")
+    if doubled_faces:
+        warnings.append(f"{doubled_faces:,} faces exist twice: harmless here, but other programs draw them flickering")
+    if parts > MANY_PARTS:
+        warnings.append(f"{parts:,} loose parts: leave out what no photograph shows, such as screws inside")
+    if extents.min() < THIN * extents.max():
+        warnings.append("thin: its pose is uncertain where it is seen from the edge")
+    is_sphere = _is_sphere(mesh)
+    is_wire = area_of_hull < WIRE_AREA
+    if is_sphere and not is_coloured:
+        warnings.append("a sphere: it looks the same from everywhere, so its rotation cannot be seen")
+    elif symmetries and not is_coloured:
+        warnings.append(_symmetry_warning(symmetries))
+    if is_wire:
+        warnings.append("hardly any surface, as of a wire: too thin for contours")
+    return MeshFacts(
+        unit=unit,
+        extents=(float(extents[0]), float(extents[1]), float(extents[2])),
+        diameter=2.0 * mesh_radius(mesh),
+        faces=len(mesh.faces),
+        parts=parts,
+        is_watertight=bool(welded.is_watertight),
+        doubled_faces=doubled_faces,
+        area_of_hull=area_of_hull,
+        is_coloured=is_coloured,
+        symmetries=symmetries,
+        warnings=tuple(warnings),
+        is_hopeless=is_wire or (is_sphere and not is_coloured),
+    )
+
+
+def measured_symmetries(mesh: trimesh.Trimesh) -> tuple[Symmetry, ...]:
+    """Rotations but the identity that leave the shape as it is, and how exactly they do."""
+    transforms = mesh_symmetries(mesh)
+    if len(transforms) == 1:
+        return ()
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 20 * SYMMETRY_POINTS, seed=0)[0])
+    tree = cKDTree(points)
+    diameter = 2.0 * mesh_radius(mesh)
+    sample = points[::20]
+    spacing = float(tree.query(sample, k=2)[0][:, 1].mean())  # of points on one and the same surface
+    angles = rotation_error(transforms[:, :3, :3], torch.eye(3, dtype=torch.float64)).tolist()
+    symmetries = []
+    for transform, angle in zip(transforms[1:], angles[1:], strict=True):
+        moved = sample @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
+        distance = max(float(tree.query(moved)[0].mean()) - spacing, 0.0)
+        symmetries.append(Symmetry(transform, angle, 100.0 * distance / diameter))
+    return tuple(symmetries)
+
+
+def _size_warnings(size: float, unit: str | None) -> list[str]:
+    """What is unusual about the size of the box's diagonal, and which unit would be usual."""
+    if unit is None:
+        fitting = [name for name in ("mm", "cm", "m") if SMALLEST < size * METRES[name] < LARGEST]
+        guess = " or ".join(fitting) or "none that is usual"
+        return [f"its unit is unknown: {size:.4g} across, which suggests {guess}; give --unit"]
+    metres = size * METRES.get(unit, 1.0)
+    if SMALLEST < metres < LARGEST:
+        return []
+    return [f"{metres:.3g} m across: is its unit really {unit}?"]
+
+
+def _is_sphere(mesh: trimesh.Trimesh) -> bool:
+    """Whether all points of the surface are about as far from its middle."""
+    points = np.asarray(trimesh.sample.sample_surface(mesh, SYMMETRY_POINTS, seed=0)[0])
+    distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    return bool(distance.std() < SPHERE_SPREAD * distance.mean())
+
+
+def _symmetry_warning(symmetries: tuple[Symmetry, ...]) -> str:
+    if any(symmetry.angle < CONTINUOUS_TURN for symmetry in symmetries):
+        return "a body of revolution without colours: its turn about the axis cannot be seen, and is not counted"
+    worst = max(symmetry.deviation_percent for symmetry in symmetries)
+    count = len(symmetries) + 1
+    return f"it looks the same in {count} orientations (up to {worst:.2g} % of its diameter): a pose is one of as many"

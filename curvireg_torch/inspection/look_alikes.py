@@ -1,0 +1,142 @@
+"""Pairs of views that the shape of a mesh does not tell apart."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
+from ..geometry.conversions import rotation_from_axis_angle
+from ..matching import ViewBank, ViewDescriber
+
+LOOKED_AT = 48  # Directions from which the mesh is looked at
+RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
+CANDIDATES = 3  # Views of the bank that are tried for each direction, beside its half turns about the mesh's axes
+TURNED = 2  # Candidates that are turned to come nearer
+# Degrees that a photograph resolves: poses look alike that differ by no more than a pose from itself, turned so far
+RESOLUTION = 3.0
+HALF_TURNS = torch.stack([2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()])
+STEPS = (6.0, 2.0)  # Degrees by which a candidate is turned to come nearer
+
+
+@dataclass(frozen=True)
+class LookAlike:
+    """Two views of a mesh.
+
+    Attributes:
+        rotation, rival: (3, 3) float64 model -> camera.
+        angle: degrees between them, up to the mesh's symmetries.
+        similarity: normalised correlation of their descriptors.
+        resolved: that of the first view and itself, turned by what a photograph resolves.
+    """
+
+    rotation: Tensor
+    rival: Tensor
+    angle: float
+    similarity: float
+    resolved: float
+
+    @property
+    def is_alike(self) -> bool:
+        """Whether a photograph of the first view does not tell the two apart."""
+        return self.similarity >= self.resolved
+
+    def to_dict(self) -> dict[str, Any]:
+        views = {}
+        for name, rotation in (("view", self.rotation), ("rival", self.rival)):
+            azimuth, elevation, theta = (float(angle) for angle in viewpoint_from_rotation(rotation))
+            views[name] = {"azimuth": azimuth, "elevation": elevation, "theta": theta}
+        numbers = {"angle_deg": self.angle, "similarity": self.similarity, "resolved": self.resolved}
+        return {**views, **numbers, "alike": self.is_alike}
+
+
+@torch.no_grad()
+def look_alikes(
+    bank: ViewBank, describer: ViewDescriber, symmetries: Tensor | None, *, elevations: tuple[float, float] = (-90, 90)
+) -> tuple[LookAlike, ...]:
+    """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the sphere.
+
+    Candidates are views of the bank, and half turns about the axes of the mesh; the best are turned until they are
+    most similar. Descriptors are those by which poses
+    are compared with photographs.
+
+    Args:
+        bank: views of the mesh, among which candidates are looked for.
+        describer: of the mesh, with the descriptor of fitted poses.
+        symmetries: (S, 4, 4) rotations that do not count; None for none.
+        elevations: degrees between which the mesh is looked at.
+    """
+    directions = uniform_views(LOOKED_AT).rotations.double()
+    elevation = viewpoint_from_rotation(directions)[1]
+    directions = directions[(elevation >= elevations[0]) & (elevation <= elevations[1])]
+    distance = bank.distances.median().double().cpu()
+    descriptors = _described(describer, directions, distance)
+    resolved = _resolved(describer, directions, distance, descriptors)
+    group = torch.eye(3, dtype=torch.float64)[None] if symmetries is None else symmetries[:, :3, :3].double()
+    views = bank.rotations.double().cpu()
+    coarse = F.normalize(bank.descriptors, dim=1)
+    matched = _matched(bank, describer, directions, distance)
+    similarity = (F.normalize(matched, dim=1) @ coarse.T).cpu()
+    pairs = []
+    for row, direction in enumerate(directions):
+        angle = _angle(views, direction, group)
+        scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + STEPS[0], -torch.inf)
+        best = scores.topk(min(CANDIDATES, len(scores))).indices
+        half_turns = direction @ HALF_TURNS
+        candidates = torch.cat([views[best[scores[best].isfinite()]], half_turns])
+        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + STEPS[0]]
+        if not len(candidates):
+            continue
+        rival, score = _nearest(describer, candidates, distance, descriptors[row])
+        pairs.append(LookAlike(direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]))
+    return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
+
+
+def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:
+    """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to a group (S, 3, 3)."""
+    return rotation_error(rotations[:, None], (rotation @ group)[None]).amin(dim=1)
+
+
+def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:
+    """(N, D) descriptors of unit length."""
+    return F.normalize(describer.descriptors(rotations, distance.expand(len(rotations))), dim=1)
+
+
+def _matched(bank: ViewBank, describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:
+    """(N, D) descriptors as the bank has them."""
+    return describer.with_settings(bank.settings).descriptors(rotations, distance.expand(len(rotations)))
+
+
+def _turns(degrees: float) -> Tensor:
+    """(6, 3, 3) turns about the three axes, in both directions."""
+    axes = torch.eye(3, dtype=torch.float64)
+    vectors = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64)) * torch.cat([axes, -axes])
+    return torch.stack([rotation_from_axis_angle(vector) for vector in vectors])
+
+
+def _resolved(describer: ViewDescriber, rotations: Tensor, distance: Tensor, descriptors: Tensor) -> list[float]:
+    """Of each rotation the mean similarity with itself, turned about the axes by what a photograph resolves."""
+    turned = _turns(RESOLUTION) @ rotations[:, None]
+    similar = _described(describer, turned.flatten(0, 1), distance).view(len(rotations), 6, -1)
+    values: list[float] = (similar * descriptors[:, None]).sum(dim=2).mean(dim=1).tolist()
+    return values
+
+
+def _nearest(
+    describer: ViewDescriber, candidates: Tensor, distance: Tensor, descriptor: Tensor
+) -> tuple[Tensor, float]:
+    """The candidate (3, 3) of (K, 3, 3) that comes nearest to a descriptor (D,) when turned, and its similarity."""
+    unturned = _described(describer, candidates, distance) @ descriptor
+    candidates = candidates[unturned.topk(min(TURNED, len(candidates))).indices.cpu()]
+    still = torch.eye(3, dtype=torch.float64)[None]
+    for degrees in STEPS:
+        turns = torch.cat([still, _turns(degrees)])
+        around = turns @ candidates[:, None]
+        similarity = (_described(describer, around.flatten(0, 1), distance) @ descriptor).view(len(candidates), -1)
+        best = similarity.argmax(dim=1).cpu()
+        candidates = around[torch.arange(len(candidates)), best]
+        highest = similarity.amax(dim=1)
+    winner = int(highest.argmax())
+    return candidates[winner], float(highest[winner])

@@ -1,0 +1,172 @@
+"""The report of a mesh as one HTML page with pictures, and as lines of text."""
+
+import base64
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..matching import ViewDescriber
+from ..registration import Registrar
+from ..visualization.contours import close_up, draw_window
+from ..visualization.encoding import jpeg, to_uint8
+from .facts import MeshFacts
+from .look_alikes import LookAlike
+from .report import Inspection
+from .trial import Expected, Outcome
+
+MOST_PAIRS = 6
+MOST_CONFUSIONS = 6
+PICTURE_SIDE = 224  # px
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>curvireg inspect: {title}</title><style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
+table {{ border-collapse: collapse }} td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left }}
+figure {{ display: inline-block; margin: .5rem; vertical-align: top; max-width: 29rem }}
+img {{ height: 14rem; background: #eee }} .warning {{ border-left: 4px solid #d90; padding-left: .6rem }}
+</style></head><body><h1>{title}</h1>
+{body}
+</body></html>
+"""
+
+
+def report_lines(report: Inspection) -> list[str]:
+    """The report as lines of text for a terminal."""
+    facts = report.facts
+    lines = [f"{name}: {value}" for name, value in _fact_rows(facts)]
+    if report.pairs:
+        lines.append(f"look-alikes: from {len(report.alike)} of {len(report.pairs)} directions")
+    if report.trial is not None:
+        lines.append(f"expected: {_in_words(report.trial.expected)}")
+        for name, (before, after) in report.trial.compared.items():
+            change = f"right {before.right:.2f} -> {after.right:.2f}, reliable {before.reliable:.2f} -> "
+            lines.append(f"  {name}: {change}{after.reliable:.2f} ({before.n} photographs)")
+    lines += [f"warning: {text}" for text in report.warnings]
+    return lines
+
+
+def report_page(report: Inspection, registrar: Registrar | None, *, title: str) -> str:
+    """The report as an HTML page.
+
+    Args:
+        report: of the mesh.
+        registrar: of the same mesh, which draws the pictures; None draws none.
+        title: name of the mesh.
+    """
+    parts = [_warnings(report.warnings), _table(_fact_rows(report.facts))]
+    if report.facts.symmetries:
+        parts += ["<h2>Symmetries</h2>", _symmetry_table(report.facts)]
+    if report.pairs:
+        parts += ["<h2>Views that look alike</h2>", _pairs(report, registrar)]
+    if report.trial is not None:
+        parts += ["<h2>What to expect</h2>", _expectation(report), _confusions(report.trial.outcomes, registrar)]
+    return _PAGE.format(title=html.escape(title), body="\n".join(parts))
+
+
+def _in_words(expected: Expected) -> str:
+    shares = (
+        f"right in {expected.right:.2f}, reliable in {expected.reliable:.2f}, median {expected.median_deg:.1f} degrees"
+    )
+    return f"{shares} (of {expected.n} generated photographs)"
+
+
+def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
+    unit = facts.unit or "units"
+    sides = " x ".join(f"{side:.4g}" for side in facts.extents)
+    closed = "closed" if facts.is_watertight else "open: edges without a second face"
+    colours = "vary: its print is used" if facts.is_coloured else "none, or one plain colour: only its shape is used"
+    return [
+        ("size", f"{sides} {unit}"),
+        ("faces", f"{facts.faces:,} in {facts.parts:,} parts, {closed}"),
+        ("colours", colours),
+        ("symmetries", f"{len(facts.symmetries) + 1} orientations look the same" if facts.symmetries else "none"),
+    ]
+
+
+def _table(rows: Sequence[tuple[Any, ...]]) -> str:
+    cells = ("".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) for row in rows)
+    return "<table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table>"
+
+
+def _warnings(warnings: Sequence[str]) -> str:
+    return "\n".join(f'<p class="warning">{html.escape(text)}</p>' for text in warnings)
+
+
+def _symmetry_table(facts: MeshFacts) -> str:
+    shown = sorted(facts.symmetries, key=lambda symmetry: symmetry.angle, reverse=True)[:12]
+    rows = [("turn", "surface moves by, % of the diameter")]
+    rows += [(f"{symmetry.angle:.0f}°", f"{symmetry.deviation_percent:.2f}") for symmetry in shown]
+    return _table(rows)
+
+
+def _pairs(report: Inspection, registrar: Registrar | None) -> str:
+    count = (
+        f"From {len(report.alike)} of {len(report.pairs)} directions another side looks alike: their edges differ by"
+    )
+    lines = [f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees.</p>"]
+    if registrar is None:
+        return lines[0]
+    for pair in report.pairs[:MOST_PAIRS]:
+        lines.append(_pair_figure(registrar.describer, registrar, pair))
+    return "\n".join(lines)
+
+
+@torch.no_grad()
+def _pair_figure(describer: ViewDescriber, registrar: Registrar, pair: LookAlike) -> str:
+    distance = registrar.bank.distances.median().cpu().expand(2)
+    pictures = describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
+    images = "".join(_image(_picture(picture)) for picture in pictures)
+    verdict = "alike" if pair.is_alike else "different"
+    caption = f"{pair.angle:.0f}° apart: {verdict} (similarity {pair.similarity:.2f}, resolved {pair.resolved:.2f})"
+    return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
+
+
+def _picture(shaded: Tensor) -> bytes:
+    """JPEG of a shaded view: (1, S, S) grey, or (4, S, S) grey and in colours."""
+    return jpeg(to_uint8(shaded[-3:] if len(shaded) > 1 else shaded.expand(3, -1, -1)), 85)
+
+
+def _image(content: bytes) -> str:
+    return f'<img alt="" src="data:image/jpeg;base64,{base64.b64encode(content).decode()}">'
+
+
+def _expectation(report: Inspection) -> str:
+    assert report.trial is not None
+    document = report.to_dict()["expected"]
+    camera = "known" if report.with_camera else "unknown"
+    header = ("photographs", "N", "right", "within 5°", "reliable", "reliable, wrong", "median")
+    rows = [header, _row(f"all, camera {camera}", report.trial.expected)]
+    for key, name in (("by_elevation_deg", "elevation {}°"), ("by_pixels_across", "{} px across")):
+        rows += [_row(name.format(interval), Expected(**values)) for interval, values in document[key].items()]
+    for name, (before, after) in report.trial.compared.items():
+        rows += [_row("the first of them", before), _row(name, after)]
+    note = "Right: within 30 degrees. Generated photographs are simpler than real ones: no clutter, nothing in front."
+    return f"{_table(rows)}<p>{note}</p>"
+
+
+def _row(name: str, expected: Expected) -> tuple[str, ...]:
+    shares = (expected.right, expected.within_5_deg, expected.reliable, expected.reliable_and_wrong)
+    return name, str(expected.n), *(f"{share:.2f}" for share in shares), f"{expected.median_deg:.1f}°"
+
+
+def _confusions(outcomes: Sequence[Outcome], registrar: Registrar | None) -> str:
+    wrong = [outcome for outcome in outcomes if not outcome.is_right and outcome.result is not None]
+    if registrar is None or not wrong:
+        return ""
+    figures = [_confusion_figure(outcome, registrar) for outcome in wrong[:MOST_CONFUSIONS]]
+    return "<h2>Typical confusions</h2>" + "\n".join(figures)
+
+
+def _confusion_figure(outcome: Outcome, registrar: Registrar) -> str:
+    assert outcome.result is not None
+    image = outcome.photograph.image
+    window = close_up(image.shape[-2:], outcome.photograph.box.tolist())
+    scale = PICTURE_SIDE / max(window[2] - window[0], window[3] - window[1])
+    drawn = draw_window(registrar.describer, outcome.result.projection, image, window, scale)
+    confidence = outcome.result.confidence
+    said = "" if confidence is None else f", confidence {int(100 * confidence) / 100:.2f}"
+    return f"<figure>{_image(jpeg(drawn, 85))}<figcaption>{outcome.error_deg:.0f}° off{said}</figcaption></figure>"

@@ -1,0 +1,168 @@
+"""``curvireg inspect``: one report of a mesh, before anyone takes a photograph."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import torch
+import trimesh
+from torch import Tensor
+
+from ..data import read_image
+from ..matching import cached_bank
+from ..mesh import has_colours
+from ..mesh.mesh import as_mesh
+from ..pipeline import Pipeline
+from ..registration import Registrar
+from ..utils.checks import check_integer
+from ..utils.threads import one_torch_thread
+from .facts import MeshFacts, mesh_facts
+from .look_alikes import LookAlike, look_alikes
+from .trial import SIZE, Trial, generate_photographs, run_trial
+
+ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.01)  # Borders of the ranges of the report, degrees
+PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, 1e4)
+UPRIGHT = (-10.0, 60.0)  # Elevations of an upright object, degrees
+MIN_RIGHT = 0.5  # Expected share of right answers below which a warning says so
+MANY_ALIKE = 0.1  # Share of directions with a look-alike from which a warning says so
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is to be expected of photographs of a mesh.
+
+    Attributes:
+        facts: the state of the mesh.
+        pairs: of each direction from which the mesh was looked at, the most similar other view, most similar first.
+        trial: generated photographs, registered; None for a mesh without hope, or where none were asked for.
+        seed: of the photographs.
+        with_camera: whether the camera was known.
+    """
+
+    facts: MeshFacts
+    pairs: tuple[LookAlike, ...]
+    trial: Trial | None
+    seed: int
+    with_camera: bool
+
+    @property
+    def alike(self) -> tuple[LookAlike, ...]:
+        """The pairs that a photograph does not tell apart."""
+        return tuple(pair for pair in self.pairs if pair.is_alike)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know before taking photographs, in words."""
+        warnings = list(self.facts.warnings)
+        share = len(self.alike) / max(len(self.pairs), 1)
+        if share >= MANY_ALIKE:
+            remedy = "give a hint (--azimuth, --side)" if self.facts.is_coloured else "give a texture or a hint"
+            warnings.append(f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}")
+        if self.trial is not None and self.trial.expected.right < MIN_RIGHT:
+            right = 100 * self.trial.expected.right
+            warnings.append(f"only {right:.0f} % of generated photographs were registered right: expect wrong answers")
+        return tuple(warnings)
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether this mesh cannot work."""
+        return self.facts.is_hopeless
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``inspect.json``; its keys are described in docs/guides/inspect.md."""
+        document: dict[str, Any] = {
+            "schema": 1,
+            "mesh": self.facts.to_dict(),
+            "symmetries": [symmetry.to_dict() for symmetry in self.facts.symmetries],
+            "look_alikes": {
+                "directions": len(self.pairs),
+                "alike": len(self.alike),
+                "pairs": [pair.to_dict() for pair in self.pairs],
+            },
+            "warnings": list(self.warnings),
+            "hopeless": self.is_hopeless,
+            "expected": None,
+        }
+        if self.trial is None:
+            return document
+        elevations = self.trial.by(lambda outcome: outcome.elevation, ELEVATIONS)
+        sizes = self.trial.by(lambda outcome: outcome.photograph.pixels_across, PIXELS_ACROSS)
+        compared = {
+            name: {"without": before.to_dict(), "with": after.to_dict()}
+            for name, (before, after) in self.trial.compared.items()
+        }
+        document["expected"] = {
+            **self.trial.expected.to_dict(),
+            "by_elevation_deg": {name: expected.to_dict() for name, expected in elevations.items()},
+            "by_pixels_across": {name: expected.to_dict() for name, expected in sizes.items()},
+            "compared": compared,
+            "with_camera": self.with_camera,
+            "seed": self.seed,
+        }
+        return document
+
+
+def inspect(
+    mesh: Any,
+    *,
+    n: int = 60,
+    seed: int = 0,
+    with_camera: bool = True,
+    compare: bool = True,
+    pipeline: Pipeline | None = None,
+    backgrounds: Sequence[Any] = (),
+    progress: Callable[[str, int, int], object] | None = None,
+) -> Inspection:
+    """Examine a mesh, look for views that are alike, and register generated photographs of it.
+
+    Args:
+        mesh: a mesh (:func:`curvireg_torch.load_mesh`), its path, or a :class:`Registrar` of it.
+        n: photographs; 0 leaves them out.
+        seed: of the photographs.
+        with_camera: whether the camera is known.
+        compare: also register a quarter of the photographs under other conditions.
+        pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in their file.
+        backgrounds: (3, H, W) pictures or paths, instead of generated ones.
+        progress: called with ("bank" or "photographs", done, total); to cancel, it may raise.
+
+    Returns:
+        the report; ``to_dict()`` is the content of ``inspect.json``.
+
+    Raises:
+        InvalidInputError: a mesh that cannot be read, or a number below 0.
+
+    Example:
+        >>> report = inspect(trimesh.creation.box((1, 2, 3)), n=0)
+        >>> report.facts.is_watertight, len(report.facts.symmetries)
+        (True, 3)
+    """
+    check_integer(n, "n", least=0)
+    registrar = mesh if isinstance(mesh, Registrar) else None
+    clean: trimesh.Trimesh = as_mesh(mesh) if registrar is None else registrar.bank.mesh
+    facts = mesh_facts(clean)
+    if facts.is_hopeless:
+        return Inspection(facts, (), None, seed, with_camera)
+    with one_torch_thread():
+        if registrar is None:
+            bank = cached_bank(clean, pipeline=pipeline, progress=progress or False)
+            registrar = Registrar(bank, mesh_is="exact")
+        upright = registrar.pipeline.views.pose == "upright"
+        symmetries = None if has_colours(clean) else registrar.symmetries_of(exact=True)
+        elevations = UPRIGHT if upright else (-90.0, 90.0)
+        pairs = look_alikes(registrar.bank, registrar.describer, symmetries, elevations=elevations)
+        if n == 0:
+            return Inspection(facts, pairs, None, seed, with_camera)
+        pictures = [_background(picture) for picture in backgrounds]
+        photographs = generate_photographs(clean, n, seed=seed, upright=upright, backgrounds=pictures)
+        report = None if progress is None else partial(progress, "photographs")
+        trial = run_trial(registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report)
+    return Inspection(facts, pairs, trial, seed, with_camera)
+
+
+def _background(picture: Any) -> Tensor:
+    """(3, H, W) float of the generated photographs' size."""
+    image = picture if isinstance(picture, Tensor) else read_image(picture)
+    pixels = image.float() / 255.0 if image.dtype == torch.uint8 else image.float()
+    resized = torch.nn.functional.interpolate(pixels[None], SIZE, mode="area")[0]
+    return resized.expand(3, *SIZE)

@@ -1,0 +1,185 @@
+"""Crops of datasets in batches of torch's own loader, their targets, and habits of the datasets that they wrap."""
+
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, Subset
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset, ObjectDataset, Pascal3DPlus, PoseFolder, crops
+from curvireg_torch.data.crops import UNKNOWN_CLASS, _viewpoint_of, viewpoint_bins
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry.crops import crop_images
+from tests._support.miniature import write_bop, write_pascal3d, write_web
+
+
+@pytest.fixture(params=["pascal", "bop", "web"])
+def dataset(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectDataset:
+    write, make = {
+        "pascal": (write_pascal3d, Pascal3DPlus),
+        "bop": (write_bop, lambda root: BOPDataset(root, targets=False)),
+        "web": (write_web, PoseFolder),
+    }[request.param]
+    write(tmp_path)
+    return make(tmp_path)
+
+
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_default_collate_takes_the_crops(dataset: ObjectDataset, workers: int) -> None:
+    cropped = cr.data.crops(dataset, 32)
+    context = "spawn" if workers else None
+    loader = DataLoader(cropped, len(cropped), num_workers=workers, multiprocessing_context=context)
+    batch = next(iter(loader))
+    assert len(cropped) >= 3
+    assert {name: (x.dtype, x.shape[1:]) for name, x in batch.items()} == {
+        "image": (torch.float32, (3, 32, 32)),
+        "rotation": (torch.float32, (3, 3)),
+        "viewpoint_bins": (torch.int64, (3,)),
+        "class_id": (torch.int64, ()),
+    }
+    assert float(batch["image"].min()) >= 0.0
+    assert float(batch["image"].max()) <= 1.0
+
+
+def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> None:
+    write_pascal3d(tmp_path)
+    dataset = Pascal3DPlus(tmp_path)
+    cropped = crops(dataset, 24, margin=0.25, bins=(8, 6, 4))
+    assert cropped.classes == ["car", "sofa"]
+    for index in range(len(dataset)):
+        sample, crop = dataset[index], cropped[index]
+        expected, _ = crop_images(sample["image"][None], sample["box"][None], size=24, margin=0.25)
+        assert torch.equal(crop["image"], expected[0])
+        assert torch.equal(crop["rotation"], sample["rotation"])
+        assert cropped.classes[int(crop["class_id"])] == sample["category"]
+        azimuth, elevation, theta = sample["viewpoint"].tolist()
+        bins = [azimuth // 45, (elevation + 90) // 30, ((theta + 180) % 360) // 90]
+        assert crop["viewpoint_bins"].tolist() == bins
+
+
+def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(tmp_path: Path) -> None:
+    write_bop(tmp_path)
+    dataset = BOPDataset(tmp_path, targets=False)
+    cropped = crops(dataset, 16)
+    unknown = sum(bool(dataset.annotation(i)["box"].isnan().any()) for i in range(len(dataset)))
+    assert unknown == 1
+    assert len(cropped) == len(dataset) - 1
+    assert cropped.skipped["unknown_box"] == 1
+    assert cropped.skipped["missing_image"] == dataset.skipped["missing_image"] > 0
+    assert cropped.classes == ["1", "2"]
+    assert [cropped.classes[int(crop["class_id"])] for crop in cropped] == [
+        str(dataset.annotation(i)["obj_id"]) for i in range(len(cropped))
+    ]
+
+
+def test_numbers_of_objects_are_ordered_by_value(tmp_path: Path) -> None:
+    write_bop(tmp_path)
+    dataset = BOPDataset(tmp_path, targets=False)
+    for item, number in zip(dataset._items, (10, 9, 100, 9), strict=False):
+        item["obj_id"] = number
+    assert crops(dataset, 16).classes == ["9", "10", "100"]
+
+
+def test_unknown_poses_have_no_bin(tmp_path: Path) -> None:
+    write_web(tmp_path)
+    dataset = PoseFolder(tmp_path)
+    known = [not bool(dataset.annotation(i)["rotation"].isnan().any()) for i in range(len(dataset))]
+    assert known.count(False) == 2
+    for crop, pose in zip(crops(dataset, 16), known, strict=True):
+        assert (crop["viewpoint_bins"] >= 0).tolist() == [pose] * 3
+    logits = torch.zeros(2, 24)
+    ignored = torch.tensor([3, UNKNOWN_CLASS])
+    assert float(torch.nn.functional.cross_entropy(logits, ignored)) == pytest.approx(math.log(24))
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "expected"),
+    [
+        ((0.0, 0.0, 0.0), [0, 6, 12]),
+        ((14.99, -0.01, -0.01), [0, 5, 11]),
+        ((15.0, 15.0, 15.0), [1, 7, 13]),
+        ((30.0, 30.0, -30.0), [2, 8, 10]),
+        ((359.99, 89.0, 179.0), [23, 11, 23]),
+        ((345.0, -89.0, -180.0), [23, 0, 0]),
+        ((-15.0, 45.0, 180.0), [23, 9, 0]),
+        ((0.0, 90.0, 0.0), [0, 11, 12]),
+    ],
+)
+def test_viewpoint_bins(viewpoint: tuple[float, float, float], expected: list[int]) -> None:
+    """Borders belong to the upper bin, whatever the rounding of the rotation."""
+    assert viewpoint_bins(torch.tensor(viewpoint), (24, 12, 24)).tolist() == expected
+    rotation = rotation_from_viewpoint(*viewpoint)
+    assert rotation.dtype == torch.float32
+    if abs(viewpoint[1]) < 90.0:  # there azimuth and theta are one angle
+        assert viewpoint_bins(_viewpoint_of({"rotation": rotation}), (24, 12, 24)).tolist() == expected
+
+
+def test_crops_transform_and_split(tmp_path: Path) -> None:
+    write_pascal3d(tmp_path)
+    dataset = Pascal3DPlus(tmp_path, transform=lambda image: 0.5 * image)
+    plain = crops(Pascal3DPlus(tmp_path), 16)
+    torch.testing.assert_close(crops(dataset, 16)[0]["image"], 0.5 * plain[0]["image"])
+    grey = crops(Pascal3DPlus(tmp_path), 16, transform=lambda crop: crop.mean(dim=0, keepdim=True))
+    torch.testing.assert_close(grey[0]["image"], plain[0]["image"].mean(dim=0, keepdim=True))
+    part = Subset(plain, [1, 0])
+    assert torch.equal(part[1]["image"], plain[0]["image"])
+    assert repr(plain) == f"ObjectCrops({plain.dataset!r}, size=16, {len(plain)} crops)"
+    assert len(pickle.loads(pickle.dumps(plain))) == len(plain)
+
+
+def test_crops_refuse_wrong_options(tmp_path: Path) -> None:
+    write_pascal3d(tmp_path)
+    dataset = Pascal3DPlus(tmp_path)
+    for arguments, options, message in (
+        (([1, 2],), {}, "dataset: expected one of curvireg_torch.data, got list"),
+        ((dataset, 0), {}, "size: expected an integer >= 1"),
+        ((dataset, 16), {"margin": -0.1}, "margin"),
+        ((dataset, 16), {"bins": (24, 12)}, "bins: expected a number for each of azimuth, elevation, theta"),
+        ((dataset, 16), {"bins": 24}, "bins: expected a number for each"),
+        ((dataset, 16), {"bins": (24, 0, 24)}, "bins of elevation: expected an integer >= 1"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            crops(*arguments, **options)
+
+
+def test_datasets_transform_images_and_targets(dataset: ObjectDataset) -> None:
+    make = type(dataset)
+    options = {"targets": False} if make is BOPDataset else {}
+    changed = make(
+        dataset.root,
+        transform=lambda image: image.mean(),
+        target_transform=lambda sample: {"pose": sample["rotation"], "had_image": "image" in sample},
+        **options,
+    )
+    sample, plain = changed[0], dataset[0]
+    assert set(sample) == {"image", "pose", "had_image"}
+    assert torch.equal(sample["image"], plain["image"].mean())
+    assert torch.equal(sample["pose"], plain["rotation"])
+    assert not sample["had_image"]
+    assert torch.equal(changed.annotation(0)["box"], dataset.annotation(0)["box"]), "annotations are not transformed"
+
+
+def test_datasets_say_what_they_are(dataset: ObjectDataset) -> None:
+    name = type(dataset).__name__
+    split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[name]
+    assert repr(dataset) == f"{name}(root={str(dataset.root)!r}{split}, {len(dataset)} objects)"
+
+
+def test_datasets_take_whole_numbers_only(dataset: ObjectDataset) -> None:
+    count = len(dataset)
+    assert dataset[np.int64(-1)]["image_path"] == dataset[count - 1]["image_path"]
+    assert dataset.annotation(torch.tensor(0))["image_path"] == dataset[0]["image_path"]
+    message = r"expected a whole number, got .*; take several by torch.utils.data.Subset"
+    for wrong in (slice(0, 2), 1.0, "0", None, [0, 1]):
+        for get in (dataset.__getitem__, dataset.annotation):
+            with pytest.raises(TypeError, match=message):
+                get(wrong)
+    for outside in (count, -count - 1):
+        with pytest.raises(IndexError, match=f"has {count} objects, got index {outside}"):
+            dataset[outside]
+    assert len(list(dataset)) == count, "iteration ends"

@@ -1,0 +1,210 @@
+"""What is said of a mesh before a photograph is taken."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.cli import main
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.inspection.facts import mesh_facts
+from curvireg_torch.inspection.look_alikes import look_alikes
+from curvireg_torch.inspection.page import report_lines, report_page
+from curvireg_torch.inspection.trial import Expected, Outcome, Photograph, generate_photographs, run_trial
+from curvireg_torch.matching import ViewBank
+from curvireg_torch.mesh.mesh import as_mesh
+from curvireg_torch.registration import Registrar
+from curvireg_torch.synthetic import example_mesh
+from tests._support.scenes import truck_bank
+
+
+def plate(size, at):
+    box = trimesh.creation.box(size)
+    box.apply_translation(at)
+    return box
+
+
+def hollow_box() -> trimesh.Trimesh:
+    """A box of 60 x 40 x 30 without a bottom, of which one half is solid: only from below is its sides' difference
+    seen."""
+    walls = [
+        plate((60, 40, 2), (0, 0, 14)),
+        plate((60, 2, 30), (0, 19, 0)),
+        plate((60, 2, 30), (0, -19, 0)),
+        plate((2, 40, 30), (29, 0, 0)),
+        plate((2, 40, 30), (-29, 0, 0)),
+        plate((30, 40, 30), (15, 0, 0)),
+    ]
+    return trimesh.util.concatenate(walls)
+
+
+@pytest.fixture(scope="module")
+def registrar() -> Registrar:
+    return Registrar(truck_bank(), mesh_is="exact")
+
+
+def test_facts_of_a_closed_body_and_of_its_triangles_apart():
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.units = "m"
+    apart = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+    apart.units = "m"
+    for mesh in (box, apart):
+        facts = mesh_facts(mesh)
+        assert facts.is_watertight
+        assert (facts.faces, facts.parts, facts.doubled_faces) == (12, 1, 0)
+        assert facts.area_of_hull == pytest.approx(1.0)
+        assert len(facts.symmetries) == 3
+        assert max(symmetry.deviation_percent for symmetry in facts.symmetries) < 0.2
+        assert not facts.is_hopeless
+        assert any("4 orientations" in text for text in facts.warnings)
+
+
+def test_open_doubled_and_loose_faces_are_counted():
+    box = trimesh.creation.box((1, 2, 3))
+    twice = trimesh.Trimesh(box.vertices, np.concatenate([box.faces[:-1], box.faces[:3]]), process=False)
+    other = plate((0.2, 0.2, 0.2), (3, 0, 0))
+    facts = mesh_facts(trimesh.util.concatenate([twice, other]))
+    assert (facts.parts, facts.doubled_faces) == (2, 3)
+    assert not facts.is_watertight
+    assert any("3 faces exist twice" in text for text in facts.warnings)
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "text"),
+    [(80.0, None, "suggests mm or cm"), (80.0, "m", "really m?"), (0.3, "mm", "really mm?"), (0.3, "m", None)],
+)
+def test_unit_is_doubted_by_size(size, unit, text):
+    mesh = trimesh.creation.box((size, 0.7 * size, 0.5 * size))
+    if unit:
+        mesh.units = unit
+    warnings = [warning for warning in mesh_facts(mesh).warnings if "unit" in warning]
+    assert (text is None) == (not warnings)
+    assert text is None or text in warnings[0]
+
+
+def test_a_sphere_and_a_wire_are_hopeless():
+    assert mesh_facts(trimesh.creation.icosphere(3)).is_hopeless
+    assert not mesh_facts(trimesh.creation.cylinder(1.0, 2.0)).is_hopeless
+    rods = [plate((1, 0.001, 0.001), (0.5, 0, 0)), plate((0.001, 1, 0.001), (0, 0.5, 0))]
+    wire = trimesh.util.concatenate([*rods, plate((0.001, 0.001, 1), (0, 0, 0.5))])
+    facts = mesh_facts(wire)
+    assert facts.is_hopeless
+    assert any("wire" in text for text in facts.warnings)
+
+
+def test_symmetry_deviation_grows_with_the_asymmetry():
+    cubes = [
+        trimesh.util.concatenate([trimesh.creation.box((1, 2, 3)), plate((s, s, s), (0, 0.9, 1.5))]) for s in (0.1, 0.2)
+    ]
+    first, second = (mesh_facts(mesh).symmetries for mesh in cubes)
+    assert first
+    assert second
+    assert max(s.deviation_percent for s in second) > max(s.deviation_percent for s in first)
+
+
+@pytest.mark.slow
+def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
+    mesh = as_mesh(hollow_box())
+    bank = ViewBank.build(mesh, progress=False)
+    registrar = Registrar(bank, mesh_is="exact")
+    assert registrar.symmetries_of(exact=True).shape[0] == 1
+    pairs = look_alikes(bank, registrar.describer, None)
+    elevation = torch.tensor([float(cr.viewpoint_from_rotation(pair.rotation)[1]) for pair in pairs])
+    alike = torch.tensor([pair.is_alike for pair in pairs])
+    angle = torch.tensor([pair.angle for pair in pairs])
+    assert bool(alike[elevation > 30].all())
+    assert float(alike[elevation < -40].double().mean()) == 0.0
+    assert bool((angle[elevation > 30] > 170).all()), "half a turn away"
+
+
+def test_look_alikes_leave_out_symmetries():
+    box = as_mesh(trimesh.creation.box((1, 2, 3)))
+    bank = ViewBank.build(box, cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60]), progress=False)
+    registrar = Registrar(bank, mesh_is="exact")
+    symmetries = registrar.symmetries_of(exact=True)
+    counted = look_alikes(bank, registrar.describer, None)
+    left_out = look_alikes(bank, registrar.describer, symmetries)
+    assert np.mean([pair.is_alike for pair in counted]) > 0.8
+    assert np.mean([pair.is_alike for pair in left_out]) < 0.3
+    assert min(pair.angle for pair in left_out) > 30.0
+
+
+def test_photographs_depend_on_seed_and_number_alone():
+    mesh = example_mesh()
+    three = generate_photographs(mesh, 3, seed=5, upright=False)
+    two = generate_photographs(mesh, 2, seed=5, upright=False)
+    assert torch.equal(three[1].image, two[1].image)
+    assert torch.equal(three[1].truth, two[1].truth)
+    assert not torch.equal(three[1].truth, generate_photographs(mesh, 2, seed=6, upright=False)[1].truth)
+
+
+def test_upright_photographs_are_seen_from_the_side():
+    photographs = generate_photographs(example_mesh(), 6, seed=0, upright=True)
+    elevations = [float(cr.viewpoint_from_rotation(p.truth[:3, :3])[1]) for p in photographs]
+    assert min(elevations) > -25.0
+    assert max(elevations) < 75.0
+
+
+def test_trial_counts_right_and_reliable(registrar):
+    photographs = generate_photographs(registrar.bank.mesh, 2, seed=1, upright=True)
+    calls = []
+    trial = run_trial(registrar, photographs, compare=False, report_progress=lambda *progress: calls.append(progress))
+    assert calls == [(1, 2), (2, 2)]
+    assert trial.expected.n == 2
+    assert not trial.compared
+
+
+def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
+    photograph = Photograph(torch.zeros(3, 4, 4), torch.tensor([0.0, 0, 200, 100]), torch.eye(4, dtype=torch.float64))
+    return Outcome(photograph, None, error, elevation)
+
+
+def test_expected_shares():
+    expected = Expected.of([outcome(error) for error in (1.0, 4.0, 20.0, 170.0)])
+    assert (expected.n, expected.right, expected.within_5_deg) == (4, 0.75, 0.5)
+    assert (expected.reliable, expected.reliable_and_wrong) == (0.0, 0.0)
+    assert expected.median_deg == 4.0
+
+
+def test_report_of_a_hopeless_mesh_registers_nothing(tmp_path, capsys):
+    trimesh.creation.icosphere(2, 10.0).export(tmp_path / "ball.stl")
+    command = ["inspect", str(tmp_path / "ball.stl"), "--unit", "mm", "--out", str(tmp_path / "out")]
+    assert main([*command, "--strict"]) == 3
+    assert "rotation cannot be seen" in capsys.readouterr().out
+    document = json.loads((tmp_path / "out" / "inspect.json").read_text())
+    assert document["hopeless"]
+    assert document["expected"] is None
+    assert main(command) == 0
+
+
+def test_command_writes_report_and_page(tmp_path, capsys):
+    example_mesh().export(tmp_path / "truck.ply")
+    command = ["inspect", str(tmp_path / "truck.ply"), "--unit", "m", "--pose", "upright", "--n", "4", "--out"]
+    assert main([*command, str(tmp_path / "out")]) == 0
+    document = json.loads((tmp_path / "out" / "inspect.json").read_text())
+    assert {"n", "right", "reliable", "median_deg"} <= document["expected"].keys()
+    assert document["expected"]["n"] == 4
+    assert document["symmetries"] == []
+    assert isinstance(document["warnings"], list)
+    assert set(document["expected"]["compared"]) == {
+        "without a camera",
+        "with a hint: azimuth within 45 degrees",
+        "with a second photograph from another side",
+    }
+    page = (tmp_path / "out" / "inspect.html").read_text()
+    assert page.count("data:image/jpeg") >= 12, "six pairs of views"
+    assert "expected: right in" in capsys.readouterr().out
+
+
+def test_number_below_zero_is_refused():
+    with pytest.raises(InvalidInputError, match="n"):
+        cr.inspect(trimesh.creation.box((1, 2, 3)), n=-1)
+
+
+def test_page_escapes_names(registrar):
+    report = cr.inspect(registrar, n=0)
+    assert "<b>" not in report_page(report, registrar, title="<b>x").replace("<body>", "")
+    assert any(line.startswith("size:") for line in report_lines(report))

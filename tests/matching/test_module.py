@@ -1,0 +1,171 @@
+"""ViewMatcher and Registrar as PyTorch users expect: autocast, devices, dtypes, copies, hooks."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from curvireg_torch import Registrar, ViewBank, ViewMatcher, terms
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.features import LearnedCurvilinearSaliency
+from curvireg_torch.registration import Follower
+from curvireg_torch.terms import Correlation, QueryFeatures
+from tests._support.scenes import CAMERA, scene, sequence
+
+
+@pytest.fixture(scope="module")
+def matcher(small_bank: ViewBank) -> ViewMatcher:
+    return ViewMatcher(small_bank)
+
+
+def scores(matcher: ViewMatcher) -> torch.Tensor:
+    image, box, _ = scene(0)
+    return matcher(image[None], box[None]).scores
+
+
+def test_matcher_computes_in_full_precision_under_autocast(small_bank: ViewBank, matcher: ViewMatcher) -> None:
+    image, box, _ = scene(0)
+    query = matcher.query(image[None], box[None])
+    similarity = matcher.similarity(query)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(scores(matcher), scores(ViewMatcher(small_bank)))
+        assert torch.equal(matcher.similarity(query), similarity)
+        assert torch.equal(matcher.features(query.crops).descriptors, matcher.features(query.crops).descriptors.float())
+        autocast = scores(matcher)
+    assert torch.equal(autocast, scores(matcher))
+
+
+def test_matcher_whitens_in_full_precision_under_autocast(bank: ViewBank) -> None:
+    pipeline = replace(bank.pipeline, terms=(Correlation(whitening="bank"),))
+    expected = scores(ViewMatcher(bank, pipeline=pipeline))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(scores(ViewMatcher(bank, pipeline=pipeline)), expected)
+
+
+def _boxed(registrar: Registrar) -> torch.Tensor:
+    image, box, _ = scene(0)
+    return registrar([image], box[None], CAMERA)[0].transform
+
+
+def _detected(registrar: Registrar) -> torch.Tensor:
+    return registrar([scene(0)[0]], None, CAMERA)[0].transform
+
+
+def _refined(registrar: Registrar) -> torch.Tensor:
+    image, _, T = scene(0)
+    return registrar.refine([image], CAMERA, T[None])[0].transform
+
+
+def _together(registrar: Registrar) -> torch.Tensor:
+    image, box, _ = scene(0)
+    cameras = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    return registrar.register_views([image, image], box.expand(2, 4), CAMERA, cameras).transform
+
+
+def _followed(registrar: Registrar) -> torch.Tensor:
+    frames = sequence(2)
+    follow = Follower(registrar, CAMERA)
+    follow.start(frames[0][0], frames[0][2])
+    return follow(frames[1][0]).transform
+
+
+@pytest.mark.parametrize("register", [_boxed, _detected, _refined, _together, _followed])
+def test_registrar_computes_in_full_precision_under_autocast(
+    small_bank: ViewBank, register: Callable[[Registrar], torch.Tensor]
+) -> None:
+    expected = register(Registrar(small_bank))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(register(Registrar(small_bank)), expected)
+
+
+@pytest.mark.parametrize("convert", ["half", "bfloat16", "double"])
+def test_matcher_refuses_other_dtypes_and_stays_as_it_was(matcher: ViewMatcher, convert: str) -> None:
+    before = scores(matcher)
+    with pytest.raises(InvalidInputError, match="ViewMatcher: computes in float32, got torch"):
+        getattr(matcher, convert)()
+    with pytest.raises(InvalidInputError, match="float32"):
+        torch.nn.Sequential(matcher).to(getattr(torch, convert, torch.float64))
+    assert matcher.float() is matcher
+    assert torch.equal(scores(matcher), before)
+
+
+def test_matcher_moves_bank_terms_and_networks(small_bank: ViewBank) -> None:
+    """The meta device needs no GPU. It has no values to dilate points with."""
+    pipeline = small_bank.pipeline.with_term("repeatability", weight=0)
+    matcher = ViewMatcher(small_bank, pipeline=pipeline)
+    scores(matcher)
+    before = matcher.describer
+    moved = torch.nn.Sequential(matcher).to("meta")[0]
+    assert moved is matcher
+    assert {x.device.type for x in matcher.bank.tensors.values()} == {"meta"}
+    assert small_bank.device.type == "cpu", "the caller's bank is not changed"
+    assert {p.device.type for p in matcher.parameters()} == {"meta"}
+    assert matcher.describer is not before
+    empty = torch.zeros(1, 1, small_bank.descriptors.shape[1], device="meta")
+    query: Any = QueryFeatures(empty, empty, empty, empty, torch.zeros(1, device="meta"))
+    for _, compare in matcher._terms:
+        assert compare(query).device.type == "meta"
+
+
+def test_matcher_keeps_its_terms_where_it_already_is(matcher: ViewMatcher) -> None:
+    compared = matcher._terms
+    assert matcher.to("cpu")._terms is compared
+
+
+@pytest.mark.cuda
+def test_matcher_ranks_on_a_gpu_and_back(small_bank: ViewBank) -> None:
+    matcher = ViewMatcher(small_bank)
+    expected = scores(matcher)
+    torch.testing.assert_close(scores(matcher.to("cuda")).cpu(), expected, atol=0.02, rtol=0.0)
+    assert scores(matcher).is_cuda
+    torch.testing.assert_close(scores(matcher.to("cpu")), expected, atol=1e-3, rtol=0.0)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))])
+def test_matcher_can_be_copied_and_pickled(small_bank: ViewBank, copied: Callable[[ViewMatcher], ViewMatcher]) -> None:
+    matcher = ViewMatcher(small_bank)
+    expected = scores(matcher)
+    _ = matcher.describer  # renderers cannot be pickled
+    other = copied(matcher)
+    assert torch.equal(scores(other), expected)
+    other.bank.descriptors.zero_()
+    assert torch.equal(scores(matcher), expected), "a bank of its own"
+    assert str(other.pipeline) == str(matcher.pipeline)
+    _ = other.describer
+
+
+def test_hooks_of_the_field_run(small_bank: ViewBank) -> None:
+    field = LearnedCurvilinearSaliency()
+    matcher = ViewMatcher(small_bank, field=field)
+    image, box, _ = scene(0)
+    plain = matcher.query(image[None], box[None])
+    calls: list[str] = []
+
+    def after(*arguments: Any) -> torch.Tensor:
+        calls.append("after")
+        return 2.0 * arguments[-1]
+
+    before = field.register_forward_pre_hook(lambda *_: calls.append("before"))
+    handles = [before, field.register_forward_hook(after)]
+    hooked = matcher.query(image[None], box[None])
+    assert calls == ["before", "after"]
+    torch.testing.assert_close(hooked.field, 2.0 * plain.field)
+    assert hooked.mask is not None
+    assert plain.mask is not None
+    torch.testing.assert_close(hooked.mask, plain.mask)
+    for handle in handles:
+        handle.remove()
+    assert torch.equal(matcher.query(image[None], box[None]).field, plain.field)
+
+
+@pytest.mark.parametrize("register", ["register_module_forward_hook", "register_module_forward_pre_hook"])
+def test_hooks_of_all_modules_see_the_field(register: str) -> None:
+    field, seen = LearnedCurvilinearSaliency(), []
+    handle = getattr(torch.nn.modules.module, register)(lambda module, *_: seen.append(module))
+    terms.photograph_field(field, torch.rand(1, 3, 32, 32))
+    handle.remove()
+    assert field in seen

@@ -1,0 +1,37 @@
+import pytest
+import torch
+
+from curvireg_torch.utils import threads
+from curvireg_torch.utils.precision import full_precision, in_full_precision
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_autocast_is_off_within_and_as_before_afterwards(dtype: torch.dtype) -> None:
+    a = torch.rand(3, 3)
+
+    @in_full_precision
+    def product(x: torch.Tensor, *, y: torch.Tensor) -> torch.Tensor:
+        """Of matrices."""
+        return x @ y
+
+    with torch.autocast("cpu", dtype=dtype):
+        assert (a @ a).dtype == dtype
+        assert product(a, y=a).dtype == torch.float32
+        with full_precision():
+            assert (a @ a).dtype == torch.float32
+        with pytest.raises(RuntimeError):
+            product(a, y=torch.rand(2, 2))
+        assert (a @ a).dtype == dtype
+    assert product.__doc__ == "Of matrices."
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_jobs_compute_without_autocast_on_one_thread_and_on_several(count: int) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            dtypes = threads.map_on_threads(lambda _: (torch.eye(2) @ torch.eye(2)).dtype, range(3))
+    finally:
+        torch.set_num_threads(before)
+    assert dtypes == [torch.float32] * 3

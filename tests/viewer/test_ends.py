@@ -1,0 +1,74 @@
+"""How the page begins and ends: its address is no argument of the browser, and no signal leaves the uploads behind."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("nicegui", reason="nicegui is not installed")
+
+from tests._support.scenes import scene, write_photo
+
+BROWSER = """#!/bin/sh
+printf '%s' "$*" > "$SEEN.new"
+mv "$SEEN.new" "$SEEN"
+"""
+
+
+def wait(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not (found := condition()):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return found
+
+
+def post(address, name, content):
+    request = urllib.request.Request(f"{address}upload", content, {"x-file-name": name}, method="POST")
+    with urllib.request.urlopen(request) as answer:
+        return answer.status
+
+
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+@pytest.mark.parametrize(
+    ("host", "number"),
+    [("::1", signal.SIGHUP), pytest.param("127.0.0.1", signal.SIGTERM, marks=pytest.mark.slow)],
+)
+def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_path, host, number):
+    browser = tmp_path / "browser"
+    browser.write_text(BROWSER)
+    browser.chmod(0o700)
+    seen = tmp_path / "seen"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment |= {"BROWSER": f"{browser} %s", "SEEN": str(seen), "TMPDIR": str(tmp_path)}
+    environment |= {"PYTHONPATH": str(Path.cwd()), "CURVIREG_CACHE": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "curvireg_torch", "view", "--host", host]
+    with (tmp_path / "log").open("w") as log:
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True)
+    try:
+        address = re.search(r"http://\S+", process.stdout.readline())[0]
+        wait(seen.is_file)
+        (page,) = tmp_path.glob("curvireg-view-*/*.html")
+        assert seen.read_text() == page.as_uri()
+        assert page.stat().st_mode & 0o777 == 0o600
+        assert page.parent.stat().st_mode & 0o777 == 0o700
+        assert re.findall(r"http://[^\"<]+", page.read_text()) == [address, address]
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+        write_photo(tmp_path / "a.png", scene(0)[0])
+        assert post(address, "a.png", (tmp_path / "a.png").read_bytes()) == 204
+        assert list(tmp_path.glob("curvireg-view-*/upload-*/a.png"))
+        process.send_signal(number)
+        process.wait(20)
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    assert not list(tmp_path.glob("curvireg-view-*"))
+    assert (tmp_path / "log").read_text() == ""
