@@ -4,7 +4,7 @@ All derive from :class:`CurviregError`, so ``except CurviregError`` catches them
 built-in error that fits, so ``except ValueError`` works too. A message is one line: what is wrong and what to do.
 
 Input files are untrusted: a file beyond one of the limits below is refused with an error that names the limit. Readers
-use no network, and open only the named file and, for meshes, files that it names in its folder.
+use no network, and open only the named file and, for meshes, files that it names in its folder or a given one.
 """
 
 from copy import copy

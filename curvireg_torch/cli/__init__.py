@@ -22,14 +22,18 @@ __all__ = ["build_parser", "main", "parse"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run one command; without any, print the help.
 
     Returns:
         The exit code: 0; 2 for input that cannot be used; 130 after Ctrl-C; 141 when the reader of a pipe has gone.
     """
     try:
         try:
-            return _run(parse(sys.argv[1:] if argv is None else argv))
+            words = sys.argv[1:] if argv is None else argv
+            if not words:
+                build_parser().print_help()
+                return 0
+            return _run(parse(words))
         except KeyboardInterrupt:
             print("curvireg: interrupted", file=sys.stderr)
             return 130

@@ -80,16 +80,17 @@ def build_bank(arguments: argparse.Namespace) -> None:
 
 
 def add_cache(commands: Any) -> None:
-    text, examples = "list or clear the banks cached on disk", ("curvireg cache", "curvireg cache --clear")
+    text, examples = "list or clear the banks cached on disk", ("curvireg cache list", "curvireg cache clear")
     parser = add_command(commands, "cache", *examples, help=text, run=show_cache)
-    parser.add_argument("--clear", action="store_true", help="remove them all")
+    parser.add_argument("action", nargs="?", choices=("list", "clear"), default="list", help="default: list")
+    parser.add_argument("--clear", action="store_true", help="the same as clear")
 
 
 def show_cache(arguments: argparse.Namespace) -> None:
     """List the cached banks, or remove them."""
     from ..matching import cache_folder, clear_cache, list_cache
 
-    if arguments.clear:
+    if arguments.clear or arguments.action == "clear":
         print(f"{cache_folder()}: {clear_cache()} banks removed")
         return
     banks = list_cache()
@@ -183,7 +184,7 @@ def add_view(commands: Any) -> None:
     parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
     add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
     add_limits(parser)
-    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0, everyone"
+    hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0 or ::, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
     parser.add_argument("--port", type=whole_number(0, 65535), default=0, help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")

@@ -33,8 +33,7 @@ class BOPModels:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        matches = ((re.fullmatch(r"obj_(\d{1,9})\.ply", path.name), path) for path in sorted(folder.glob("obj_*.ply")))
-        self.files = {int(match[1]): path for match, path in matches if match}
+        self.files = model_files(folder)
         self._hulls: dict[int, Tensor | None] = {}
         table = folder / "models_info.json"
         if table.is_file():
@@ -100,6 +99,12 @@ class BOPModels:
                     f"{message}scale the models to mm, as the poses are", subject=self.files[number]
                 )
             return
+
+
+def model_files(folder: Path) -> dict[int, Path]:
+    """obj_id -> file, of a folder that need not exist."""
+    matches = ((re.fullmatch(r"obj_(\d{1,9})\.ply", path.name), path) for path in sorted(folder.glob("obj_*.ply")))
+    return {int(match[1]): path for match, path in matches if match}
 
 
 def read_models_info(path: Path) -> dict[int, dict[str, Any]]:

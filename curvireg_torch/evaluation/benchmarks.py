@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..data import BOPDataset, Pascal3DPlus, PoseFolder
-from ..data.bop_models import read_models_info
+from ..data.bop_models import model_files, read_models_info
 from ..errors import InvalidInputError
 from ..geometry import Camera, symmetry_transforms, viewpoint_from_rotation
 from ..geometry.cameras import transform
@@ -358,8 +358,10 @@ class BOPBenchmark(Benchmark):
 
     def __init__(self, dataset: BOPDataset, protocol: Protocol) -> None:
         super().__init__(dataset, protocol)
-        infos = dataset.root / "models_eval" / "models_info.json"
-        self._infos = read_models_info(infos) if infos.is_file() else {}
+        folder = dataset.root / "models_eval"
+        infos = folder / "models_info.json"
+        self._scored_files = model_files(folder)
+        self._scored_infos = read_models_info(infos) if infos.is_file() else {}
         if protocol.views > 1:
             for group in same_instances(self.samples):
                 views = [self._views(i, group) for i in group]
@@ -413,11 +415,11 @@ class BOPBenchmark(Benchmark):
     def _scored_model(self, sample: Row) -> tuple[Path, Row]:
         """The model that errors are of, with its diameter and symmetries: that of ``models_eval``, as the BOP challenge
         has it, where there is one."""
-        path = self.dataset.root / "models_eval" / Path(sample["model_path"]).name
+        number = sample["obj_id"]
         info: Row = sample["model_info"]
-        if not path.is_file():
+        if number not in self._scored_files:
             return Path(sample["model_path"]), info
-        return path, self._infos.get(sample["obj_id"], info)
+        return self._scored_files[number], self._scored_infos.get(number, info)
 
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
         """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD, and ``ar_rgb``, the

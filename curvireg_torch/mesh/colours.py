@@ -17,6 +17,7 @@ SAMPLES = 20_000  # Points of the surface at which colours are compared
 # Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a word on a box is
 # more, noise of a JPEG less
 VARIED_FRACTION, VARIED_BY = 0.002, 12
+LARGE = 1 << 25  # Pixels of a texture that is reduced in its own mode first
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
@@ -193,6 +194,8 @@ def _texture(image: Any) -> NDArray[np.uint8]:
         raise ValueError(f"the format {image.format} is not read")
     if image.width * image.height > MAX_IMAGE_PIXELS:
         raise ValueError(f"{image.width} x {image.height} px are too many")
+    if image.width * image.height > LARGE and image.mode in ("L", "RGB", "RGBA"):
+        image = image.reduce(4)  # before it is converted, which takes four times the memory
     rgba = np.asarray(image.convert("RGBA"), np.uint8)
     shrink = TEXTURE_SIDE / max(rgba.shape[:2])
     if shrink < 1:

@@ -51,9 +51,8 @@ def stray_warning(mesh: trimesh.Trimesh, stray: NDArray[np.bool_]) -> MeshWarnin
     fraction = float(area[stray].sum() / area.sum())
     centre = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[stray]].mean(axis=(0, 1))
     place = ", ".join(f"{value:.4g}" for value in centre)
-    faces = f"{count:,} face{'s' * (count != 1)} of {len(stray):,}"
-    text = f"{faces} near ({place}) lie apart from the rest with {fraction:.2g} of the area: left out, as left over"
-    return MeshWarning("stray", text)
+    faces = f"of {len(stray):,} faces {count:,} near ({place}), with {fraction:.2g} of the area"
+    return MeshWarning("stray", f"{faces}, apart from the rest: left out")
 
 
 def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:

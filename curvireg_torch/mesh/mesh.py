@@ -259,6 +259,7 @@ def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
     return torch.from_numpy(T)
 
 
+@cached_in_mesh
 def principal_rotation(mesh: trimesh.Trimesh) -> Tensor:
     """(3, 3) float64 rotation of :func:`normalization_transform`."""
     R = normalization_transform(mesh)[:3, :3]

@@ -204,6 +204,8 @@ def _colours(
             names = ", ".join(spellings(name)[0] for name in lost[:3])
             text = f"its MTL files lack the material {names[:100]}; its faces are shown in white"
             source.warn("material", text)
+    if point_colours is None and not any(name in library for name in lines.materials):
+        return None
     colours = SurfaceColours.plain(len(faces))
     corners = colours.corners.copy() if point_colours is None else point_colours[faces]
     uv, texture = colours.uv, colours.texture

@@ -13,6 +13,7 @@ from .colours import SurfaceColours
 from .polygons import triangles_of_faces
 from .source import MeshSource, Pixels, ReadMesh, spellings
 
+MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
 _COLOURS = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
@@ -21,6 +22,11 @@ _COLOURS = (
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("s_tex", "t_tex"))
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _TEXTURE_FILE = re.compile(rb"^comment[ \t]+TextureFile[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
+# A name by which trimesh would look for the texture coordinates of triangles, and one that it does not know
+_CORNERS, _OWN_CORNERS = (
+    re.compile(rb"^(property[ \t]+list[ \t]+\w+[ \t]+\w+[ \t]+)texcoord\b", re.MULTILINE),
+    "corner_uv",
+)
 _REMARK = re.compile(rb"^(?:comment|obj_info)[^\n]*\n", re.MULTILINE)
 
 
@@ -30,10 +36,13 @@ def read_ply(source: MeshSource) -> ReadMesh:
     header, end, body = data.partition(b"end_header")
     if not end or not header.startswith(b"ply"):
         raise ValueError("not a PLY file, or its header ends too early")
+    if max(header.count(b"property"), header.count(b"element")) > MAX_COLUMNS:
+        raise ValueError(f"more than {MAX_COLUMNS:,} kinds of rows or columns")
     names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
     if b"ascii" in header[:100] and max(body.count(b"\n"), body.count(b"\r")) > MAX_MESH_LINES:
         raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
     plain = _REMARK.sub(b"", header.replace(b"\r\n", b"\n")).decode("ascii", errors="replace").encode()
+    plain = _CORNERS.sub(rb"\1" + _OWN_CORNERS.encode(), plain)
     body = body.removeprefix(b"\r") if b"ascii" not in header[:100] else body
     raw = trimesh.exchange.ply.load_ply(BytesIO(plain + end + body), skip_materials=True, fix_texture=False)
     elements: dict[str, dict[str, Any]] = raw["metadata"]["_ply_raw"]
@@ -159,8 +168,8 @@ def _coordinates(
     places: NDArray[np.int64],
 ) -> NDArray[np.float32] | None:
     """(T, 3, 2) texture coordinates, of the faces' corners or of the vertices."""
-    if "texcoord" in polygons.names:
-        rows = polygons.lists("texcoord")
+    if _OWN_CORNERS in polygons.names:
+        rows = polygons.lists(_OWN_CORNERS)
         starts = np.cumsum([0, *map(len, rows)])
         values = np.concatenate([np.asarray(row, np.float64) for row in rows]) if len(rows) else np.zeros(0)
         at = starts[:-1][owner][:, None] + 2 * places

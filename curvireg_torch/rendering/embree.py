@@ -16,7 +16,7 @@ from torch import Tensor
 from ..mesh.edges import encloses_volumes
 from ..mesh.mesh import box_corners, extreme_points, mesh_centre, mesh_radius
 from ..utils.threads import for_each
-from .depth import NEAREST, check_render_arguments
+from .renderer import NEAREST, check_render_arguments
 
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves

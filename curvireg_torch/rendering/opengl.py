@@ -15,7 +15,7 @@ from torch import Tensor
 from ..errors import InvalidInputError, RenderingError
 from ..geometry.conversions import opencv_from_opengl
 from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
-from .depth import NEAREST, check_render_arguments
+from .renderer import NEAREST, check_render_arguments
 
 _lock = threading.Lock()
 # The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none survives a fork

@@ -24,6 +24,10 @@ PICTURE_STARTS = {
 """First bytes of the formats that are decoded, by Pillow's names; SECURITY.md lists the same formats."""
 
 PICTURE_NAMES = "JPEG, PNG, TIFF, WebP, BMP, PBM, PGM, PPM"
+MAX_PPM_HEADER = 4096  # bytes of the sizes at the start of a PBM, PGM or PPM file, with comments
+_COMMENT = re.compile(rb"#[^\r\n]*")
+_NUMBER = rb"(?:\s|#[^\r\n]*[\r\n])+\d{1,10}"
+_PPM_HEADER = re.compile(rb"P(?:[14](?:%b){2}|[2356](?:%b){3})\s" % (_NUMBER, _NUMBER))
 _TOO_MANY_PIXELS = f"more than {MAX_IMAGE_PIXELS:,} pixels; scale it down"
 _SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
 
@@ -56,6 +60,8 @@ def open_picture(data: bytes) -> "Image":
     name = picture_format(data)
     if name == "JPEG":
         _check_scans(data)
+    if name == "PPM":
+        data = _without_comments(data)
     try:
         image = Image.open(BytesIO(data), formats=[name])
     except Exception as error:  # Pillow raises errors of any kind for damaged files
@@ -80,6 +86,17 @@ def damaged_picture(error: Exception) -> ImageError:
     if isinstance(error, UnidentifiedImageError) or not reason:
         return ImageError("damaged or truncated, or of a kind that is not read; convert it to JPEG or PNG")
     return ImageError(f"damaged or truncated ({reason}); fetch or save the file again")
+
+
+def _without_comments(data: bytes) -> bytes:
+    """A PBM, PGM or PPM file without what Pillow reads byte by byte, or with a copy of the rest for each comment."""
+    header = _PPM_HEADER.match(data[:MAX_PPM_HEADER])
+    if header is None:
+        raise ImageError("damaged or truncated, or with a long header; convert it to JPEG or PNG")
+    start = header.end()
+    head = _COMMENT.sub(b"", data[:start])
+    is_text = data[:2] in (b"P1", b"P2", b"P3")
+    return head + (_COMMENT.sub(b"", data[start:]) if is_text else data[start:])
 
 
 def _check_scans(data: bytes) -> None:

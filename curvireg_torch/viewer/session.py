@@ -24,7 +24,7 @@ from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
-from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up
+from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up, mesh_warnings
 from ..registration import Registrar, Registration
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
@@ -234,8 +234,7 @@ class Session:
         else:
             mesh = self.options.load_mesh(path)
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
-            colours = "in its colours" if has_colours(mesh) else "in grey"
-            facts = f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered {colours}"
+            facts = f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered {_colours_in_words(mesh)}"
         self.mesh_path, self.mesh, self.mesh_facts = path, mesh, facts
         for shot in self.shots:
             shot.result = None
@@ -439,6 +438,16 @@ class Session:
         if self._registrar is None or self._registrar[0] != key:
             self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
         return self._registrar[1]
+
+
+def _colours_in_words(mesh: trimesh.Trimesh) -> str:
+    """How a mesh is rendered, and what it lacks."""
+    is_incomplete = any(warning.kind in ("texture", "material") for warning in mesh_warnings(mesh))
+    words = "in its colours" if has_colours(mesh) else "in grey"
+    if is_incomplete:
+        words = words.replace("its", "some of its")
+        return f"{words}: materials or textures are missing; send it with them in a zip archive"
+    return words
 
 
 def _key(photo: Path) -> str:

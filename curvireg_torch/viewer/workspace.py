@@ -2,9 +2,7 @@
 
 import asyncio
 import errno
-import os
 import shutil
-import struct
 import tempfile
 import time
 import traceback
@@ -13,6 +11,7 @@ import zipfile
 from collections.abc import AsyncIterator, Callable
 from contextvars import ContextVar
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from ..utils.pictures import PICTURE_NAMES
 from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
+MAX_ARCHIVE_DEPTH = 32  # folders around a file in a zip archive
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
 SAMPLE_CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
@@ -264,20 +264,40 @@ def cannot_store(name: str, error: OSError) -> OutputError:
     return OutputError(f"{name}: cannot be stored ({error.strerror or error}); {advice}")
 
 
+class _Archive(FileIO):
+    """A zip archive of which no more than ``most`` bytes are read at a time, while ``zipfile`` reads its directory:
+    several records tell its size, and it becomes many times as large in memory."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.path = path
+        self.most: int | None = MAX_ARCHIVE_FILES * DIRECTORY_BYTES
+
+    def read(self, size: int | None = -1) -> bytes:
+        """As of any file."""
+        if self.most is None:
+            return super().read(size) or b""
+        wanted = self.most + 1 if size is None or size < 0 else min(size, self.most + 1)
+        content = super().read(wanted) or b""
+        if len(content) > self.most:
+            message = f"more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts"
+            raise InvalidInputError(f"{self.path.name}: {message}")
+        return content
+
+
 def unpack(archive: Path, folder: Path) -> Path:
     """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
     name = archive.name
     try:
-        with archive.open("rb") as file:
-            file.seek(-min(archive.stat().st_size, 1 << 16), os.SEEK_END)
-            end = file.read()  # before zipfile reads the whole directory
-        if struct.unpack_from("<I", end, end.rindex(b"PK\5\6") + 12)[0] > MAX_ARCHIVE_FILES * DIRECTORY_BYTES:
-            raise InvalidInputError(f"{name}: more than {MAX_ARCHIVE_FILES:,} files; pack only the mesh and its parts")
-        with zipfile.ZipFile(archive) as content:
+        with _Archive(archive) as file, zipfile.ZipFile(file) as content:
+            file.most = None
             members = content.infolist()
             if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:
                 limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
                 raise InvalidInputError(f"{name}: more than {limits}; pack only the mesh and its parts")
+            if any(member.filename.count("/") > MAX_ARCHIVE_DEPTH for member in members):
+                message = f"folders in more than {MAX_ARCHIVE_DEPTH} folders; pack only the mesh and its parts"
+                raise InvalidInputError(f"{name}: {message}")
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
         raise

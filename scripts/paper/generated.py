@@ -8,7 +8,11 @@ Meshes are scaled to a radius of 100 mm.
 """
 
 import argparse
+import sys
 from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY))  # with an installed wheel, scripts is not a package that Python finds
 
 import cv2
 import torch

@@ -43,7 +43,6 @@ CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")
 EPS, SHARES = (1.0, 2.0, 3.0, 4.0), (0.01, 0.02, 0.04, 0.08)
 RANKS = (1, 3, 5, 10, 20)
-GRIDS = (4, 8, 16)
 BEST_PAIR = "CS/MFC"
 
 
@@ -164,7 +163,8 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
         limit = errors.argmin(dim=1)
         for b, case in enumerate(cases):
             records[b][variant]["limit"] = _pose_errors(bank.rotations[limit[b]], case, truths[b], describe)
-        for grid in GRIDS:
+            records[b][variant]["grid 8"] = records[b][variant][BEST_PAIR]["top"][0]
+        for grid in (4, 16):
             given = replace(pipeline, bank=replace(bank_settings, grid=grid))
             bank = ViewBank.build(mesh, pipeline=given, renderer=renderer, progress=False)
             matcher = ViewMatcher(bank, renderer=renderer, field=fields["MFC"])

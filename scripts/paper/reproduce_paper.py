@@ -38,7 +38,7 @@ sys.path.insert(0, str(REPOSITORY))  # with an installed wheel, scripts is not a
 import torch
 from tqdm import tqdm
 
-from curvireg_torch.errors import CurviregError, MissingDependencyError
+from curvireg_torch.errors import CurviregError, InvalidInputError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.evaluation.runner import POSE_SOURCES
 from curvireg_torch.pipeline import BankSettings
@@ -73,7 +73,8 @@ def measure(phase: str, cases: list[Case], settings: BankSettings, pose: str) ->
     start = time.process_time()
     found = measure_points(cases, settings) if phase == "points" else measure_views(cases, settings, pose)
     seconds = (time.process_time() - start) / len(cases)
-    names = [{"category": case.category, "cad": case.mesh_path, "seconds": seconds} for case in cases]
+    same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
+    names = [{"category": case.category, **same} for case in cases]
     return [{**name, **record} for name, record in zip(names, found, strict=True)]
 
 
@@ -90,6 +91,8 @@ def run(arguments: argparse.Namespace) -> None:
         if not chosen:
             continue
         records = collect(phase, cases, settings, pose, arguments)
+        if not records:
+            raise InvalidInputError(f"{arguments.out}: holds no records of {phase} yet; run it without --partial")
         for name in chosen:
             for table in makers[name](paper.Records(records, what)):
                 table.write(arguments.out)
@@ -106,14 +109,17 @@ def collect(
 ) -> list[dict[str, Any]]:
     """The records of all cases; those of each mesh are stored when they are known."""
     code = code_digest(*POSE_SOURCES) + own_digest()
-    groups = list(by_mesh(cases))
+    # In a fixed random order: the part that an interrupted run has measured is a fair one.
+    groups = sorted(by_mesh(cases), key=lambda group: text_digest(Path(group[0].mesh_path).name + group[0].category))
     paths = []
     for group in groups:
         files = [file_digest(Path(name)) for name in (group[0].mesh_path, *(case.image_path for case in group))]
         request = json.dumps([phase, str(settings), pose, code, files, [case.key for case in group]])
         paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
+    if arguments.partial:
+        paths = [path for path in paths if path.exists()]
     missing = [k for k, path in enumerate(paths) if not path.exists()]
-    done = sum(len(group) for group, path in zip(groups, paths, strict=True) if path.exists())
+    done = len(cases) - sum(len(groups[k]) for k in missing)
     options = [phase] * len(missing), [groups[k] for k in missing], [settings] * len(missing), [pose] * len(missing)
     with tqdm(total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet) as bar:
         if arguments.jobs == 1 or len(missing) < 2:
@@ -175,9 +181,27 @@ def write_page(folder: Path, page: Path) -> None:
     """Replace the part of a page between its markers by the tables of a folder."""
     from scripts._shared import update_page
 
-    parts = [folder / f"{name}.md" for name in ON_PAGE]
-    found = [path.read_text(encoding="utf-8") for path in parts if path.exists()]
-    update_page(page, "paper", "\n".join([f"Measured at commit {commit()}.", "", *found]))
+    records = [json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()]
+    commits = sorted({record["commit"] for some in records for record in some})
+    found = []
+    for name in ON_PAGE:
+        path = folder / f"{name}.md"
+        if path.exists():
+            found.append(path.read_text(encoding="utf-8"))
+        if name == "curve" and (folder / "curve.png").exists():
+            found.append(f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n")
+    update_page(page, "paper", "\n".join([f"Measured at commit {', '.join(commits)}.", "", *found]))
+
+
+def _picture(folder: Path, page: Path) -> str:
+    """The plot of the curve beside a page; returns its path from there."""
+    from PIL import Image
+
+    name = "images/paper-curve.webp"
+    target = page.parent / name
+    target.parent.mkdir(exist_ok=True)
+    Image.open(folder / "curve.png").convert("RGB").save(target, quality=80)
+    return name
 
 
 def main() -> int:
@@ -187,6 +211,7 @@ def main() -> int:
     parser.add_argument("root", type=Path, metavar="ROOT")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
+    parser.add_argument("--partial", action="store_true", help="tables of what is measured so far; measures nothing")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
     parser.add_argument("--pose", choices=("upright", "any"), help="corrected views (default: the dataset's)")

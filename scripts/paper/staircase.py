@@ -16,6 +16,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(REPOSITORY))  # with an installed wheel, scripts is not a package that Python finds
+
 import torch
 
 from curvireg_torch.data import BOPDataset, Pascal3DPlus

@@ -53,8 +53,20 @@ def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypat
     assert listed.count("truck.ply") == 1
     assert "damaged" in listed
     assert "2 banks" in listed
-    assert main(["cache", "--clear"]) == 0
-    assert list((tmp_path / "banks").iterdir()) == []
+    assert main(["cache", "list"]) == 0
+    assert capsys.readouterr().out == listed
+    for words in (["--clear"], ["clear"]):
+        (tmp_path / "banks" / f"bank-{'0' * 32}.safetensors").write_bytes(b"cut")
+        assert main(["cache", *words]) == 0
+        assert list((tmp_path / "banks").iterdir()) == []
+
+
+def test_without_a_command_the_help_is_printed(capsys):
+    assert main([]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("usage: curvireg")
+    assert "register" in printed.out
+    assert printed.err == ""
 
 
 def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
 
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from curvireg_torch.evaluation.lists import list_photographs, read_list
 from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.pipeline import PRESETS
+from tests._support.exif import exif
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written
 from tests._support.scenes import scene, truck_bank
 
@@ -233,3 +235,24 @@ def test_paths_of_windows_and_boxes_in_fractions_in_lists(folder):
     assert good.name == "photos\\0.png"
     assert good.box == pytest.approx([x0, y0, x1, y1])
     assert "no such file" in missing.error
+
+
+def test_photographs_of_telephones_in_folders_and_alone(folder, register, tmp_path, monkeypatch):
+    encoder = pytest.importorskip("pillow_heif")
+    pytest.importorskip("pi_heif")
+    pixels = np.ascontiguousarray(cv2.imread(str(folder / "photos" / "0.png"))[..., ::-1])
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    heic = encoder.from_bytes("RGB", pixels.shape[1::-1], pixels.tobytes())
+    heic.save(shots / "IMG_2.HEIC", quality=95, exif=exif(1, 38))
+    cv2.imwrite(str(shots / "IMG_1.JPG"), pixels[..., ::-1])
+    assert register(shots, folder / "truck.safetensors", "--box", *box_of(0)) == 0
+    assert [(row["inputs"]["photo"][-10:], row["status"]) for row in lines(tmp_path / "out")] == [
+        ("/IMG_1.JPG", "ok"),
+        ("IMG_2.HEIC", "ok"),
+    ]
+    monkeypatch.setitem(sys.modules, "pi_heif", None)  # counted, not left out, where there is no decoder
+    assert register(shots, folder / "truck.safetensors", "--box", *box_of(0), out="without") == 0
+    jpeg, missing = lines(tmp_path / "without")
+    assert jpeg["status"] == "ok"
+    assert "HEIC needs pi-heif: pip install 'curvireg_torch[heic]'" in missing["message"]

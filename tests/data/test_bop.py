@@ -196,3 +196,11 @@ def test_bop_dataset_without_scene_gt_info_skips_what_is_behind_the_camera(tree)
     scene.write_text(scene.read_text().replace("400.0", "-400.0"))
     before = tree[1]["bad_box"]
     assert BOPDataset(tree[0], targets=False).skipped["bad_box"] == before + 1
+
+
+@pytest.mark.parametrize("box", [[4, 4, 0, 20], [4, 4, 30, 0], [-1, -1, -1, -1]])
+def test_bop_dataset_skips_boxes_without_area(tree, box):
+    before = BOPDataset(tree[0], targets=False)
+    edit(tree, "scene_gt_info.json", lambda content: content["0"][0].update(bbox_obj=box))
+    after = BOPDataset(tree[0], targets=False)
+    assert (len(after), after.skipped["bad_box"]) == (len(before) - 1, before.skipped["bad_box"] + 1)

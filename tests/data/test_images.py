@@ -206,3 +206,19 @@ def test_sixteen_bits_that_are_used_are_not_stretched(tmp_path):
     cv2.imwrite(str(tmp_path / "colour.tif"), np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16))
     (note,) = read_photo(tmp_path / "colour.tif").notes
     assert note == "16 bits, of which the lower ones are used: 16 levels remain; save it as PNG"
+
+
+@pytest.mark.parametrize("count", [1, 2, images.MAX_THUMBNAILS - 1])
+def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count):
+    pages = [Image.new("L", (4, 4), 10 * page) for page in range(count)]
+    for page in pages:
+        page.encoderinfo = {"tiffinfo": {254: 1}}
+    picture = Image.new("L", (8, 6), 200)
+    picture.encoderinfo = {"tiffinfo": {}}
+    pages[0].save(tmp_path / "a.tif", tiffinfo={254: 1}, save_all=True, append_images=[*pages[1:], picture])
+    assert read_photo(tmp_path / "a.tif").image.shape == (3, 6, 8)
+    pages.append(pages[0].copy())
+    pages[-1].encoderinfo = {"tiffinfo": {254: 1}}
+    pages[0].save(tmp_path / "b.tif", tiffinfo={254: 1}, save_all=True, append_images=pages[1:])
+    with pytest.raises(ImageError, match="holds thumbnails only"):
+        read_photo(tmp_path / "b.tif")

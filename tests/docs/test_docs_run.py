@@ -22,6 +22,8 @@ from curvireg_torch.synthetic import example_mesh, synthesize_photograph
 from .._support import miniature
 from .._support.exif import exif, with_exif
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
+from .._support.peers import write_peers
+from ..mesh.step import step_file
 
 # Commands that are not run here, and the reason
 SKIPPED = {
@@ -37,7 +39,13 @@ SKIPPED = {
 # Trees with every defect that datasets/verify.py must report
 DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
 AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
-SLOW = {DOCS / "evaluation.md", DOCS / "guides" / "several.md"}  # 30 s and more on one core
+SLOW = {
+    DOCS / "evaluation.md",
+    *(DOCS / "guides" / name for name in ("several.md", "coming-from.md", "boxes.md")),
+}  # 30 s and more on one core
+
+
+PHOTO_CAMERA = cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)
 
 
 def pose(azimuth: float) -> torch.Tensor:
@@ -69,7 +77,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (table,) = re.findall(r"```\n(image,.*?)```", (DOCS / "datasets.md").read_text("utf-8"), flags=re.DOTALL)
     kettle.joinpath("views.csv").write_text(table)
     mesh.export(kettle / "mesh.stl")
+    write_peers(folder, folder / "photo.jpg", mesh, pose(AZIMUTHS["photo.jpg"]), PHOTO_CAMERA)
     mesh.apply_scale(1000.0).export(folder / "part.stl")
+    folder.joinpath("part.step").write_text(step_file(mesh.extents.tolist(), "mm"))
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
     folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
     miniature.write_image(folder / "photo.png", (128, 128))

@@ -46,10 +46,12 @@ def test_evaluate_pascal3d(pascal, tmp_path):
 
 def test_evaluate_bop(bop, tmp_path):
     summary = run(BOPBenchmark(bop, Protocol(pose="any")), tmp_path / "out")
-    assert (summary["n"], summary["failed"]) == (3, 0)
-    assert summary["skipped"]["unknown_box"] == 1, "without scene_gt_info there is no box"
-    detected = run(BOPBenchmark(bop, Protocol(pose="any", box=None)), tmp_path / "detected")
-    assert "unknown_box" not in detected["skipped"]
+    assert (summary["n"], summary["failed"]) == (4, 1), "one photograph is of one colour"
+    benchmark = BOPBenchmark(bop, Protocol(pose="any"))
+    nowhere = {**benchmark.samples[3], "box": torch.full((4,), torch.nan)}
+    benchmark.entries[3] = benchmark._entry(nowhere)
+    assert run(benchmark, tmp_path / "unknown")["skipped"]["unknown_box"] == 1
+    assert not BOPBenchmark(bop, Protocol(pose="any", box=None))._entry(nowhere).error
     table = bop_poses(tmp_path / "out" / "predictions.csv")
     assert len(table) == 3
     assert all(row["t"][2] > 0 for row in table)
@@ -65,7 +67,7 @@ def test_objects_fail_alone(bop, tmp_path):
     assert "square pixels" in rows[first.key]["message"]
     assert "entirely outside" in rows[second.key]["message"]
     assert "rotation" in rows[third.key]
-    assert summary["failed"] == 2
+    assert summary["failed"] == 3, "and a photograph of one colour"
 
 
 def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path, threads):
@@ -154,6 +156,12 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
     settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
     assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
+
+
+def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate):
+    settings = evaluate("pascal3d", pascal.root, "--categories", "car", "--limit", "1", "--preset", "paper")["settings"]
+    assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
+    assert (settings["pipeline"]["views"]["pose"], settings["pipeline"]["views"]["frame"]) == ("paper", "principal")
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):

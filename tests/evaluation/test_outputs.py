@@ -100,6 +100,9 @@ def test_results_of_another_source_would_be_lost(tmp_path):
         (tmp_path / "results.csv").write_text("")
     with pytest.raises(InvalidInputError, match=r"holds results of b\.jpg, which would be lost"):
         output_folder(tmp_path, "register several", source=["a.jpg", "c.jpg"]).__enter__()
+    with output_folder(tmp_path, "register several"):
+        pass
+    assert marked(tmp_path)["register several"]["source"] == ["a.jpg", "b.jpg"], "where none is given, it stays"
     with output_folder(tmp_path, "register several", source=["c.jpg", "b.jpg", "a.jpg"]):
         pass
     assert marked(tmp_path)["register several"]["source"] == ["c.jpg", "b.jpg", "a.jpg"]

@@ -81,3 +81,19 @@ def test_camera_of_a_resized_photograph():
         RADIAL.at((90, 160))
     with pytest.raises(InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"):
         RADIAL.at((160, 120))
+
+
+def test_sides_are_scaled_on_their_own_when_a_resized_picture_is_rounded():
+    camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], size=(480, 640))
+    small = camera.at((7, 9))  # 6.75 x 9, or 7 x 9.33
+    x, y = 9 / 640, 7 / 480
+    expected = [[500 * x, 0, 320 * x - 0.5], [0, 500 * y, 240 * y - 0.5], [0, 0, 1]]
+    torch.testing.assert_close(small.matrix, torch.tensor(expected, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("calibrated", "size"), [((10, 1000), (50, 4996)), ((1000, 10), (4996, 50))])
+def test_one_side_may_be_rounded_by_what_the_other_is_many_pixels_of(calibrated, size):
+    camera = Camera([[500.0, 0, 4.5], [0, 500, 4.5], [0, 0, 1]], size=calibrated)
+    assert camera.at(size).size == size  # 50 x 5000 within a pixel of the short side, not of the long one
+    with pytest.raises(InvalidInputError, match="another aspect ratio"):
+        camera.at((size[0] + 2, size[1] + 2))

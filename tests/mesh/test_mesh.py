@@ -1,3 +1,4 @@
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -120,3 +121,51 @@ def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
     T[0, 2, 3] = 2e7
     points = MeshContours(mesh).points(T, K[None], 64)
     assert bool(points.model.isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("size", "warns"), [(99.0, False), (101.0, True), (900.0, True), (0.0051, False), (0.0049, True)]
+)
+def test_load_mesh_warns_of_the_size(tmp_path: Path, size: float, warns: bool) -> None:
+    trimesh.creation.box(np.full(3, size / 3**0.5)).export(tmp_path / "a.ply")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cr.load_mesh(tmp_path / "a.ply")
+    assert ["m across; if that is wrong, give the unit" in str(one.message) for one in caught] == [True] * warns
+
+
+def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:
+    """A part moved along x below a node that turns x to y: products in the other order put it elsewhere."""
+    quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
+    scene = trimesh.Scene()
+    scene.graph.update("turned", "world", matrix=quarter)
+    moved = trimesh.transformations.translation_matrix([10.0, 0.0, 0.0])
+    scene.add_geometry(
+        trimesh.creation.box((3.0, 2.0, 1.0)), node_name="part", parent_node_name="turned", transform=moved
+    )
+    expected = [[-1.0, 8.5, -0.5], [1.0, 11.5, 0.5]]
+    np.testing.assert_allclose(as_mesh(scene).bounds, expected, atol=1e-9)
+    scene.export(tmp_path / "a.glb")
+    np.testing.assert_allclose(cr.load_mesh(tmp_path / "a.glb").bounds, expected, atol=1e-6)
+
+
+def test_a_degenerate_face_takes_no_colours_away(tmp_path: Path) -> None:
+    points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+    (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 0 1\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{points}usemtl a\nf 1 1 2\nf 1 2 3\nusemtl b\nf 2 4 3\n")
+    mesh = cr.load_mesh(tmp_path / "a.obj")
+    assert cr.mesh.has_colours(mesh)
+    assert mesh.metadata["colours"].corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
+
+
+def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("curvireg_torch.mesh.source.MAX_MESH_BYTES", 1000)
+    names = [f"{k}.mtl" for k in range(3)]
+    for name in names:
+        (tmp_path / name).write_text(f"newmtl m{name}\n# {'x' * 330}\n")
+    path = tmp_path / "a.obj"
+    path.write_text(f"mtllib {' '.join(names[:2])}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert len(cr.load_mesh(path).faces) == 1
+    path.write_text(path.read_text().replace("1.mtl", "1.mtl 2.mtl"))
+    with pytest.raises(MeshError, match="the files that it names hold more than 1,000 bytes"):
+        cr.load_mesh(path)

@@ -88,6 +88,7 @@ def searched(
     azimuth, elevation, distance = truth
     R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
     matcher: Any = Peak(bank, R, distance)
+    matcher.turn = turn
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
     inside = ((grid.azimuth >= allowed[0]) & (grid.azimuth <= allowed[1]))[None]
     ranking: Any = type("Ranking", (), {"order": order, "allowed": inside})()
@@ -112,7 +113,9 @@ def test_search_is_between_allowed_views():
 def test_search_is_in_the_frame_of_the_views():
     error, _, matcher = searched(207.0, 0.0, 3.7, frame="principal")
     assert error < 2.1
-    assert len(matcher.compared) > 1
+    azimuth, elevation, _ = viewpoint_from_rotation(matcher.compared[0].rotations.double() @ matcher.turn.T)
+    assert sorted(set(azimuth.round().tolist())) == [200, 205, 210, 215, 220]
+    assert set(elevation.round().abs().tolist()) == {0}
 
 
 def test_search_stops_by_the_motion(monkeypatch):

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
-from curvireg_torch.rendering import make_renderer, render_colour
-from curvireg_torch.rendering.depth import shade
+from curvireg_torch.rendering import make_renderer, render_colour, shade
 
 COLOURS = [(230, 20, 20), (20, 220, 30), (30, 40, 240), (240, 230, 10), (10, 230, 230), (220, 20, 230)]
 SIZE = (72, 96)

@@ -101,13 +101,13 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
 
 def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     used: list[int] = []
-    lengths = contours_module._Level.seen
+    lengths = contours_module._Level.lengths_in_crop
 
     def watched(level: Any, *arguments: Any) -> Any:
         used.append(len(level.edges.faces))
         return lengths(level, *arguments)
 
-    monkeypatch.setattr(contours_module._Level, "seen", watched)
+    monkeypatch.setattr(contours_module._Level, "lengths_in_crop", watched)
     contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))  # 20 480 faces
     T = torch.eye(4, dtype=torch.float64)[None]
     T[0, 2, 3] = 4.0

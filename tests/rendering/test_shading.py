@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from curvireg_torch.rendering.depth import AMBIENT, LIT, shade
+from curvireg_torch.rendering.shading import AMBIENT, LIT, shade
 
 from .conftest import pixel_grid
 

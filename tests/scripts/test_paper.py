@@ -1,20 +1,26 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
 import json
+import subprocess
 import sys
 from dataclasses import replace
 from importlib import util
 from itertools import pairwise
+from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 
-from curvireg_torch.geometry import camera_matrix, rotation_from_viewpoint
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.geometry import camera_matrix, projected_boxes, rotation_from_viewpoint, transform
+from curvireg_torch.matching import ViewDescriber
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from scripts.paper import measure, printed, reproduce_paper, staircase, tables
+from scripts._shared import commit
+from scripts.paper import generated, measure, printed, reproduce_paper, staircase, tables
 from scripts.paper.cases import find_cases
 from scripts.paper.detectors import DETECTORS
 from scripts.paper.measures import bootstrap, points_within
@@ -158,12 +164,17 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     text = (tmp_path / "repeatability.md").read_text()
     assert "N = 2 (1 CADs)" in text
     assert text in page.read_text()
+    assert f"Measured at commit {commit()}." in page.read_text()
     assert (tmp_path / "repeatability.csv").read_text().startswith(",MFC,MFC low,MFC high,MFC N")
     (record,) = (tmp_path / "records").iterdir()
     assert len(json.loads(record.read_text())) == 2
+    assert run(monkeypatch, "precision", *words[1:], "--partial") == 2  # no records of views
     monkeypatch.setattr(reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again")))
+    assert run(monkeypatch, *words, "--partial") == 0
     assert run(monkeypatch, "curve", *words[1:]) == 0
     assert (tmp_path / "curve.png").stat().st_size > 1000
+    assert "(images/paper-curve.webp)" in page.read_text()
+    assert (tmp_path / "images" / "paper-curve.webp").stat().st_size > 1000
     assert len((tmp_path / "curve_all.csv").read_text().splitlines()) == 41
     with pytest.raises(AssertionError, match="measured again"):
         run(monkeypatch, "precision", *words[1:])
@@ -175,6 +186,31 @@ def test_a_missing_package_is_named(root, tmp_path, monkeypatch, capsys, module,
     monkeypatch.setattr(util, "find_spec", lambda name: None if name == module else find_spec(name))
     assert run(monkeypatch, "curve", "web", root, "--out", tmp_path) == 2
     assert f"{package} is not installed; pip install 'curvireg_torch[paper]'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reproduce_paper", "staircase", "generated"])
+def test_scripts_run_beside_an_installed_package(name, tmp_path):
+    script = Path(reproduce_paper.__file__).with_name(f"{name}.py")
+    done = subprocess.run([sys.executable, "-I", str(script), "--help"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--out DIR" in done.stdout
+
+
+def test_generated_photographs_are_a_bop_set(tmp_path, monkeypatch):
+    meshes = [tmp_path / f"{name}.ply" for name in ("one", "two")]
+    for mesh in meshes:
+        example_mesh().export(mesh)
+    words = ["generated.py", *map(str, meshes), "--count", "3", "--up", "z", "--out", str(tmp_path / "set")]
+    monkeypatch.setattr(sys, "argv", words)
+    generated.main()
+    dataset = BOPDataset(tmp_path / "set")
+    assert len(dataset) == 3
+    sample = dataset[0]
+    renderer = ViewDescriber(load_mesh(sample["model_path"], unit="mm"), SETTINGS)
+    T = transform(sample["rotation"].double(), sample["translation"].double())[None]
+    box = projected_boxes(renderer.hull, T, sample["camera_matrix"].double()[None])[0]
+    torch.testing.assert_close(box, sample["box"].double(), rtol=0, atol=1.5)
 
 
 @pytest.mark.parametrize("pose", ["any", "upright"])

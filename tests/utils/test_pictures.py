@@ -3,6 +3,7 @@
 import io
 import re
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from PIL import EpsImagePlugin, Image
 from curvireg_torch.errors import MAX_IMAGE_PIXELS, ImageError
 from curvireg_torch.utils import pictures
 from curvireg_torch.utils.pictures import PICTURE_NAMES, PICTURE_STARTS, check_pixels, open_picture, picture_format
+from tests._support.doubling import check_linear
 
 SECURITY = Path(__file__).parents[2] / "SECURITY.md"
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n%%EOF\n"
@@ -109,3 +111,51 @@ def test_messages_of_damaged_pictures_are_one_line_and_say_what_to_do(monkeypatc
     monkeypatch.setattr(pictures, "MAX_IMAGE_PIXELS", 63)
     with pytest.raises(ImageError, match="pixels; scale it down"):
         check_pixels(image)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"P3 2 1 255 1 2 3 4 5 6",
+        b"P3 # a\n# b\r\n2\t1 #c\n255\n1 2 3 # red\n4 5 6#",
+        b"P3\n2 1\n255\n1 2#x\n3 4 5 6\n",
+        b"P6 2#\n1\n#d\n255\n\1\2\3\4\5\6",
+        b"P6\n2 1\n255\n\1\2\3\4\5\6",
+    ],
+)
+def test_comments_of_ppm_are_left_out(content):
+    assert list(open_picture(content).tobytes()) == [1, 2, 3, 4, 5, 6]
+
+
+def test_bytes_of_binary_ppm_are_no_comments():
+    assert open_picture(b"P5 3 1 255\n#\n#").tobytes() == b"#\n#"
+    assert open_picture(b"P4 8 1\n#").tobytes() == open_picture(b"P1 8 1\n0 0 1 0 0 0 1 1").tobytes()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda n: b"P3 90 90 255 " + b"#\n" * n,
+        lambda n: b"P2 90 90 255 " + b"1#\n" * n,
+        lambda n: b"P1 90 90 " + b"#\n1" * n,
+        lambda n: b"P6 #" + b"x" * n + b"\n 3 3 255 aaa",
+        lambda n: b"P6 " + b" " * n,
+        lambda n: b"P6 " + b"#\n" * n,
+        lambda n: b"P6 3 3" + b"\n" * n,
+        lambda n: b"P6 " + b"1" * n,
+    ],
+)
+def test_ppm_is_read_in_linear_time(make):
+    def read(data):
+        with suppress(Exception):  # Pillow's own of what is cut
+            open_picture(data).load()
+
+    check_linear(read, make, 100_000)
+
+
+def test_a_long_header_of_ppm_is_refused():
+    room = pictures.MAX_PPM_HEADER - len(b"P6 1 1 255\n")
+    assert open_picture(b"P6 " + b" " * room + b"1 1 255\nabc").tobytes() == b"abc"
+    for header in (b"P6 " + b" " * (room + 1) + b"1 1 255\n", b"P5 1 1", b"P5 1 1 x ", b"P5 1 12345678901 255 "):
+        with pytest.raises(ImageError, match="long header; convert it to JPEG or PNG"):
+            open_picture(header + b"abc")

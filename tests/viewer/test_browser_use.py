@@ -215,6 +215,16 @@ def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(bro
     parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
+    small = """
+        const all = [...document.querySelectorAll('button, .button, summary, [role=combobox], input:not([type=file])')];
+        const seen = all.filter(e => e.checkVisibility() && !e.closest('.preview') && !e.matches('.q-field input'));
+        return seen.filter(e => {
+            const {width, height} = e.getBoundingClientRect();
+            return width < 44 || height < 44;
+        }).map(e => e.outerHTML.slice(0, 200))"""
+    for fold in ("options", "camera", "command-line", "model"):
+        browser.unfold(fold)
+    assert browser.driver.execute_script(small) == [], "fingers need 44 px"
     browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
     browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")

@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import io
 import json
 import os
 import secrets
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, OutputError
 from curvireg_torch.evaluation.opening import RegisterOptions
@@ -101,6 +103,34 @@ def test_uploads_are_bounded_and_not_larger_than_announced(workspace, scene, mon
     asyncio.run(upload(workspace, scene / "photo.png"))
     with pytest.raises(InvalidInputError, match=r"^x\.png: all files have more than"):
         asyncio.run(upload(workspace, scene, "x.png", b"0"))
+
+
+def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
+    mesh = b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\n"
+    mesh += b"f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\nf 2/1 3/2 4/3\n"
+    material = b"newmtl m\nKd 0.8 0.1 0.1\nmap_Kd a.png\n"
+    facts = "rendered in grey: materials or textures are missing; send it with them in a zip archive"
+    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material})
+    for path, content in (("a.obj", mesh), ("a.zip", None)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.showwarning = show_warning
+            asyncio.run(upload(workspace, tmp_path / path, content=content))
+        assert workspace.session.mesh_facts.endswith(facts)
+        assert "missing" in workspace.messages["mesh"]
+        assert str(tmp_path) not in workspace.messages["mesh"]
+    picture = io.BytesIO()
+    Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(picture, "PNG")
+    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material, "a.png": picture.getvalue()})
+    asyncio.run(upload(workspace, tmp_path / "a.zip"))
+    assert workspace.session.mesh_facts.endswith("rendered in its colours")
+    assert workspace.messages == {}
+    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = show_warning
+        asyncio.run(upload(workspace, tmp_path / "a.zip"))
+    assert workspace.session.mesh_facts.endswith(facts)
 
 
 def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
@@ -403,3 +433,29 @@ def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatc
 
     asyncio.run(work())
     assert (stored(workspace), workspace.receiving) == ([], {})
+
+
+def test_unpack_reads_no_directory_that_is_larger_than_it_says(tmp_path, monkeypatch):
+    """Two records at the end of an archive tell the size of its directory, and a third one may lie in the last."""
+    monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # it would be read by then
+    content = pack(tmp_path / "a.zip", {f"{k:0200}.txt": b"" for k in range(6000)}).read_bytes()
+    end = content.rindex(b"PK\5\6")
+    size, start = struct.unpack_from("<II", content, end + 12)
+    assert size > 1000 * module.DIRECTORY_BYTES
+    record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 6000, 6000, size, start)
+    record += struct.pack("<IIQI", 0x07064B50, 0, end, 1)
+    small = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 6000, 6000, 100, start, 0)
+    inner = struct.pack("<4sHHHHIIH", b"PK\5\6", *struct.unpack("<HH", b"PK\5\6"), 6000, 6000, size, 100, 0)
+    for ends in (content[end:], record + small, inner):
+        (tmp_path / "a.zip").write_bytes(content[:end] + ends)
+        with pytest.raises(InvalidInputError, match=r"^a\.zip: more than 1,000 files"):
+            unpack(tmp_path / "a.zip", tmp_path / "parts")
+
+
+def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
+    mesh = trimesh.creation.box().export(file_type="ply")
+    deep = "a/" * module.MAX_ARCHIVE_DEPTH
+    assert unpack(pack(tmp_path / "a.zip", {f"{deep}a.ply": mesh}), tmp_path / "parts").is_file()
+    with pytest.raises(InvalidInputError, match=r"^a\.zip: folders in more than 32 folders; pack only"):
+        unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
+    assert not (tmp_path / "more").exists()

@@ -1,0 +1,36 @@
+"""What a renderer is, and what all of them check."""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..errors import InvalidInputError
+from ..utils.checks import check_camera_matrix, check_pose, check_tensor
+
+NEAREST = 1e-3  # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
+
+
+class DepthRenderer(Protocol):
+    """Depth images of one mesh. Both sides of every face are visible; textures are ignored."""
+
+    name: str
+
+    def render(
+        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+    ) -> Tensor:
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth."""
+        ...
+
+
+def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Rigid poses (N, 4, 4) and cameras (N, 3, 3), checked, as float64 on the CPU."""
+    check_tensor(T, "T_cam_from_model", (None, 4, 4))
+    if len(size) != 2 or min(size) < 1:
+        raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
+    check_camera_matrix(K)
+    if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
+        raise InvalidInputError(f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}")
+    check_pose(T, "T_cam_from_model")
+    T = T.detach().to("cpu", torch.float64)
+    return T, K.detach().to("cpu", torch.float64).expand(T.shape[0], 3, 3)

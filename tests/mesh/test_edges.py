@@ -1,0 +1,80 @@
+"""Creases, smooth edges and the simplification of a mesh."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from curvireg_torch.mesh.edges import MAX_EDGE_FACES, MeshEdges, simplified
+
+
+def edges_of(vertices: object, faces: object) -> MeshEdges:
+    mesh = trimesh.Trimesh(np.array(vertices, float), np.array(faces), process=False)
+    return MeshEdges(mesh, np.zeros(3), max_faces=10_000)
+
+
+def at(edges: MeshEdges, a: tuple[float, ...], b: tuple[float, ...]) -> int:
+    """The number of the edge between two places."""
+    places = [tuple(place) for place in edges.vertices.round(6).tolist()]
+    wanted = {places.index(a), places.index(b)}
+    (found,) = [k for k, edge in enumerate(edges.edges.tolist()) if set(edge) == wanted]
+    return found
+
+
+def fan(angles: list[float]) -> MeshEdges:
+    """Pages of a book, open by these angles in degrees, around the z axis."""
+    outer = [(np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.5) for angle in angles]
+    faces = [[0, 1, 2 + k] if k % 2 else [1, 0, 2 + k] for k in range(len(angles))]
+    return edges_of([(0, 0, 0), (0, 0, 1), *outer], faces)
+
+
+SPINE = ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("angles", "is_crease", "is_smooth"),
+    [
+        ([0, 180], False, True),
+        ([0, 170], False, True),  # bent by 10 degrees
+        ([0, 150], True, True),
+        ([0, 120], True, False),
+        ([0, 1], True, False),
+        ([0, 180, 90], True, False),  # three pages, two of them in one plane
+        ([0, 180, 179, 181], True, False),
+        ([0, 180, 90, 270, 45], True, False),  # more than are looked at
+        ([0], False, False),  # a boundary
+    ],
+)
+def test_what_an_edge_is(angles: list[float], is_crease: bool, is_smooth: bool) -> None:
+    edges = fan(angles)
+    spine = at(edges, *SPINE)
+    assert (bool(edges.is_crease[spine]), bool(edges.is_smooth[spine])) == (is_crease, is_smooth)
+
+
+@pytest.mark.parametrize(("azimuth", "expected"), [(45.0, False), (-45.0, False), (135.0, False), (-135.0, False)])
+def test_the_faces_of_an_edge_are_all_looked_at(azimuth: float, expected: bool) -> None:
+    """Four pages, every quarter turn: from nowhere do all of them lie on one side of the spine. The first two do."""
+    assert MAX_EDGE_FACES >= 4
+    edges = fan([0.0, 90.0, 180.0, 270.0])
+    eye = np.array([[np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.1]]) * 9.0
+    all_same, _ = edges.sides(eye)
+    assert bool(all_same[0, at(edges, *SPINE)]) == expected
+
+
+def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side() -> None:
+    edges = fan([10.0, 30.0, 50.0, 80.0])
+    seen = [np.degrees(azimuth) for azimuth in np.radians(np.arange(0, 360, 5) + 2.5)]
+    eyes = np.array([[np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.1] for azimuth in seen]) * 9.0
+    all_same, _ = edges.sides(eyes)
+    found = {azimuth for azimuth, same in zip(seen, all_same[:, at(edges, *SPINE)], strict=True) if same}
+    # all pages lie to the left or right of the line from the camera through the spine
+    expected = {azimuth for azimuth in seen if 80 < azimuth < 190 or not 10 < azimuth < 260}
+    assert found == expected
+
+
+def test_simplification_keeps_the_number_of_faces_that_is_asked_for() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=5)
+    for most in (1000, 5000):
+        vertices, faces = simplified(sphere, np.zeros(3), most)
+        assert 0.9 * most <= len(faces) <= 1.02 * most
+        assert np.abs(np.linalg.norm(vertices, axis=1) - 1.0).max() < 0.02
+    assert len(simplified(sphere, np.zeros(3), len(sphere.faces))[1]) == len(sphere.faces)

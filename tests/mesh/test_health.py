@@ -1,0 +1,162 @@
+"""Left-over parts far away, rounded coordinates, and colours that do not vary."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.mesh import has_colours, mesh_centre, mesh_radius, mesh_symmetries, mesh_warnings
+from curvireg_torch.mesh.colours import SurfaceColours
+from curvireg_torch.mesh.health import stray_faces
+from curvireg_torch.mesh.mesh import as_mesh
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+SIDES = (60.0, 40.0, 30.0)
+
+
+def joined(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    whole: trimesh.Trimesh = trimesh.util.concatenate(list(meshes))
+    return whole
+
+
+def triangle(size: float, at: tuple[float, float, float]) -> trimesh.Trimesh:
+    corners = np.array([[0, 0, 0], [size, 0, 0], [0, size, 0]]) + at
+    return trimesh.Trimesh(corners, [[0, 1, 2]], process=False)
+
+
+def box(at: tuple[float, float, float] = (0.0, 0.0, 0.0), sides: tuple[float, ...] = SIDES) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(sides)
+    mesh.apply_translation(at)
+    return mesh
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("at", [(300.0, 0.0, 0.0), (0.0, -120.0, 0.0), (0.0, 0.0, 1e6), (80.0, 80.0, 80.0)])
+def test_left_over_parts_do_not_set_the_box(scale: float, at: tuple[float, float, float]) -> None:
+    whole = joined(triangle(1.0, at), box(), triangle(1.0, (at[0], at[1] + 3.0, at[2])))
+    whole.apply_scale(scale)
+    mesh = as_mesh(whole)
+    assert len(mesh.faces) == 12
+    np.testing.assert_allclose(mesh.extents, np.array(SIDES) * scale)
+    assert mesh_radius(mesh) == pytest.approx(0.5 * float(np.linalg.norm(SIDES)) * scale)
+    assert float(mesh_centre(mesh).abs().max()) < 1e-9 * scale
+    (warning,) = mesh_warnings(mesh)
+    assert warning.kind == "stray"
+    assert "of 14 faces 2 near" in warning.text
+    assert mesh_warnings(as_mesh(mesh)) == (warning,), "told once"
+
+
+def test_colours_stay_with_their_faces() -> None:
+    whole = joined(triangle(1.0, (300.0, 0.0, 0.0)), box())
+    colours = np.arange(39, dtype=np.uint8).reshape(13, 3) * 6
+    whole.visual = trimesh.visual.ColorVisuals(whole, face_colors=colours)
+    found = as_mesh(whole).metadata["colours"]
+    np.testing.assert_array_equal(found.corners[:, 0], colours[1:])
+
+
+@pytest.mark.parametrize(
+    "whole",
+    [
+        joined(box(), box((100.0, 0.0, 0.0), (10.0, 10.0, 10.0))),  # 4 % of the area
+        joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),  # a thin mast on the top
+        joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),  # a chip near the surface
+        joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),  # a knob above a plate's middle
+        joined(box(), box(sides=(200.0, 200.0, 200.0))),
+        joined(*(triangle(5.0, (float(k * k), float(k), 0.0)) for k in range(60))),  # a soup of loose triangles
+        trimesh.creation.icosphere(2),
+        triangle(1.0, (0.0, 0.0, 0.0)),
+        box(sides=(1000.0, 1.0, 1.0)),
+    ],
+    ids=["body", "mast", "chip", "knob", "inside", "soup", "sphere", "triangle", "rod"],
+)
+def test_parts_that_belong_to_the_object_stay(whole: trimesh.Trimesh) -> None:
+    assert not stray_faces(whole).any()
+    mesh = as_mesh(whole)
+    assert (len(mesh.faces), mesh_warnings(mesh)) == (len(whole.faces), ())
+
+
+def test_a_tiny_part_inside_the_box_stays() -> None:
+    ring = trimesh.creation.annulus(90.0, 100.0, 10.0)
+    inside = triangle(1.0, (0.0, 0.0, 0.0))
+    far = triangle(1.0, (0.0, 0.0, 900.0))
+    mesh = as_mesh(joined(ring, inside, far))
+    assert len(mesh.faces) == len(ring.faces) + 1
+
+
+def test_the_warning_of_a_file_names_it(tmp_path: Path, load: Load) -> None:
+    joined(box(), triangle(1.0, (300.0, 0.0, 0.0))).export(tmp_path / "scan.ply")
+    mesh, (text,) = load(tmp_path / "scan.ply", unit="mm")
+    assert text.startswith(f"{tmp_path / 'scan.ply'}: of 13 faces 1 near (300.3, 0.3333, 0)")
+    assert mesh.extents.tolist() == list(SIDES)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
+def test_coordinates_of_maps(tmp_path: Path, load: Load, suffix: str) -> None:
+    """Text keeps the digits, single precision does not, and says so."""
+    offset = np.array([4.4e6, 5.1e5, 4.6e6])
+    sphere = trimesh.creation.icosphere(3, 40.123)
+    sphere.apply_translation(offset)
+    sphere.export(tmp_path / f"a.{suffix}")
+    mesh, texts = load(tmp_path / f"a.{suffix}", unit="mm")
+    if suffix == "obj":
+        assert not texts
+        np.testing.assert_allclose(mesh.vertices[mesh.faces] - offset, sphere.triangles - offset, atol=1e-6)
+    else:
+        assert "rounded to steps of 0.5" in texts[0]
+        assert [warning.kind for warning in mesh_warnings(mesh)] == ["precision"]
+    near = trimesh.creation.icosphere(3, 40.123)
+    near.export(tmp_path / f"b.{suffix}")
+    assert not load(tmp_path / f"b.{suffix}", unit="mm")[1]
+
+
+def coloured(**visual: object) -> trimesh.Trimesh:
+    mesh = trimesh.creation.cylinder(30.0, 100.0, sections=96)
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, **visual)
+    return as_mesh(mesh)
+
+
+def test_colours_that_do_not_vary_are_none() -> None:
+    faces = len(trimesh.creation.cylinder(30.0, 100.0, sections=96).faces)
+    for shade in (0, 100, 255):
+        mesh = coloured(face_colors=np.full((faces, 3), shade, np.uint8))
+        assert not has_colours(mesh)
+        assert len(mesh_symmetries(mesh)) == 72
+    noise = np.random.default_rng(0).integers(0, 8, (faces, 3), np.uint8) + 100
+    assert not has_colours(coloured(face_colors=noise))
+    one = np.full((faces, 3), 100, np.uint8)
+    one[:3, 2] = 130  # 3 faces, 1 % of the surface
+    assert has_colours(coloured(face_colors=one))
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.0005, 0.01, 0.5])
+def test_a_texture_counts_if_a_word_of_it_differs(fraction: float) -> None:
+    side = 400
+    texture = np.full((side, side, 3), 200, np.uint8)
+    width = round(side * fraction**0.5)
+    texture[:width, :width, 1] = 90
+    mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)
+    corners = np.full((2, 3, 3), 255, np.uint8)
+    mesh.metadata["colours"] = SurfaceColours(corners, uv, np.zeros(2, np.int32), (texture,))
+    assert has_colours(mesh) == (fraction > 0.002)
+
+
+def test_notes_reach_the_result(tmp_path: Path) -> None:
+    scene = cr.synthetic.demo_scene()
+    stray = triangle(0.001 * mesh_radius(scene.mesh), (9.0 * mesh_radius(scene.mesh), 0.0, 0.0))
+    mesh = as_mesh(joined(trimesh.Trimesh(scene.mesh.vertices, scene.mesh.faces, process=False), stray))
+    views = cr.sample_views(azimuth_step=60, elevations=[20])
+    bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
+    bank.save(tmp_path / "bank.safetensors")
+    for one in (bank, cr.ViewBank.load(tmp_path / "bank.safetensors")):
+        registrar = cr.Registrar(one, pipeline=replace(one.pipeline, contours=False, search=False))
+        result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        (text,) = result.to_dict()["warnings"]
+        assert "apart from the rest: left out" in text
+        assert result.notes == (text,)
+        assert result.warnings == (), "the pose is no less reliable"
+        assert text in repr(result)

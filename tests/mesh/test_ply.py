@@ -1,0 +1,157 @@
+"""PLY files as scanners write them."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.mesh import has_colours, surface_colours
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
+SHADES = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (51, 102, 153)]
+
+
+def header(vertex: str, face: str, *, count: int = 2, comments: str = "", kind: str = "ascii") -> str:
+    columns = "".join(f"property float {axis}\n" for axis in "xyz") + vertex
+    text = f"ply\nformat {kind} 1.0\n{comments}element vertex 4\n{columns}element face {count}\n"
+    return f"{text}property list uchar int vertex_indices\n{face}end_header\n"
+
+
+def rows(extra: list[str]) -> str:
+    return "".join(f"{x} {y} {z} {more}\n" for (x, y, z), more in zip(POINTS, extra, strict=True))
+
+
+@pytest.mark.parametrize("prefix", ["", "diffuse_"])
+@pytest.mark.parametrize("short", [False, True])
+@pytest.mark.parametrize("kind", ["uchar", "float", "ushort"])
+def test_colours_under_every_name(tmp_path: Path, load: Load, prefix: str, short: bool, kind: str) -> None:
+    names = [f"{prefix}{name[0] if short and not prefix else name}" for name in ("red", "green", "blue")]
+    vertex = "".join(f"property {kind} {name}\n" for name in names)
+    scale = 1 / 255 if kind == "float" else 1
+    extra = [" ".join(f"{shade * scale:g}" for shade in shades) for shades in SHADES]
+    (tmp_path / "a.ply").write_text(header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n")
+    mesh, texts = load(tmp_path / "a.ply")
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert not texts
+    np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
+
+
+def pictures(folder: Path) -> list[np.ndarray]:
+    found = [np.random.default_rng(k).integers(0, 255, (8, 8, 3), np.uint8) for k in range(2)]
+    for k, pixels in enumerate(found):
+        Image.fromarray(pixels).save(folder / f"{k}.png")
+    return found
+
+
+def test_two_textures_are_read_or_named(tmp_path: Path, load: Load) -> None:
+    pixels = pictures(tmp_path)
+    comments = "comment TextureFile 0.png\ncomment TextureFile 1.png\n"
+    face = "property list uchar float texcoord\n"
+    faces = "3 0 1 2 6 0 0 1 0 1 1 {}\n3 0 2 3 6 0 0 1 1 0 .5 {}\n"
+    text = header("", face + "property int texnumber\n", comments=comments) + rows([""] * 4) + faces.format(1, 0)
+    (tmp_path / "a.ply").write_text(text)
+    mesh, texts = load(tmp_path / "a.ply")
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert not texts
+    for k, number in enumerate(colours.texture):
+        np.testing.assert_array_equal(colours.textures[number], pixels[1 - k])
+    assert colours.uv.tolist() == [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 0.5]]]
+    text = header("", face, comments=comments) + rows([""] * 4) + faces.format("", "")
+    (tmp_path / "a.ply").write_text(text)
+    mesh, texts = load(tmp_path / "a.ply")
+    assert "names 2 textures and does not say which face has which" in texts[0]
+    assert has_colours(mesh)
+    text = header("", "", comments=comments) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n"
+    (tmp_path / "a.ply").write_text(text)
+    assert "has no texture coordinates" in load(tmp_path / "a.ply")[1][0]
+
+
+@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
+def test_texture_coordinates_of_vertices(tmp_path: Path, load: Load, names: tuple[str, str]) -> None:
+    (pixels, _) = pictures(tmp_path)
+    vertex = "".join(f"property float {name}\n" for name in names)
+    text = header(vertex, "", count=1, comments="comment TextureFile 0.png\n")
+    (tmp_path / "a.ply").write_text(text + rows(["0 0", "1 0", "1 1", "0 1"]) + "4 0 1 2 3\n")
+    mesh, texts = load(tmp_path / "a.ply")
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert not texts
+    np.testing.assert_array_equal(colours.textures[0], pixels)
+    np.testing.assert_allclose(colours.uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / [4, 2], atol=1e-6)
+
+
+def test_concave_faces_keep_their_texture_coordinates(tmp_path: Path, load: Load) -> None:
+    pictures(tmp_path)
+    text = header("", "property list uchar float texcoord\n", comments="comment TextureFile 0.png\n")
+    points = "0 0 0\n1 2 0\n0 1 0\n-1 2 0\n"
+    (tmp_path / "a.ply").write_text(f"{text}{points}4 0 1 2 3 8 0 0 .1 .2 0 .1 .9 .2\n3 0 1 2 6 0 0 .1 .2 0 .1\n")
+    mesh, _ = load(tmp_path / "a.ply")
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert (len(mesh.faces), mesh.area) == (3, pytest.approx(1.5))
+    expected = np.array([[0, 0], [0.1, 0.2], [0, 0.1], [0.9, 0.2]])
+    corner = [[POINT.index(tuple(p)) for p in one] for one in mesh.triangles.round().astype(int).tolist()]
+    np.testing.assert_allclose(colours.uv, expected[corner], atol=1e-6)
+
+
+POINT = [(0, 0, 0), (1, 2, 0), (0, 1, 0), (-1, 2, 0)]
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "gbk", "utf-8", "utf-8-sig"])
+def test_remarks_in_any_encoding(tmp_path: Path, load: Load, encoding: str) -> None:
+    name = "外壳" if encoding == "gbk" else "Gehäuse"
+    pixels = pictures(tmp_path)
+    Image.fromarray(pixels[0]).save(tmp_path / f"{name}.png")
+    comments = f"comment made for {name}\nobj_info {name}\ncomment TextureFile {name}.png\n"
+    vertex = "property float s\nproperty float t\n"
+    text = header(vertex, "", comments=comments) + rows(["0 0", "1 0", "1 1", "0 1"]) + "3 0 1 2\n3 0 2 3\n"
+    (tmp_path / "a.ply").write_bytes(text.encode(encoding))
+    mesh, texts = load(tmp_path / "a.ply")
+    assert has_colours(mesh)
+    assert not texts
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "ply\n", "ply\nformat ascii 1.0\nend_header\n", header("", "").replace("float x", "float q") + rows([""] * 4)],
+)
+def test_damaged_files_are_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "a.ply").write_text(content)
+    with pytest.raises(MeshError, match=r"a\.ply"):
+        cr.load_mesh(tmp_path / "a.ply")
+
+
+def test_headers_of_many_columns_are_refused(tmp_path: Path) -> None:
+    columns = "".join(f"property list uchar float a{k}\n" for k in range(501))
+    (tmp_path / "a.ply").write_text(header(columns, "", kind="binary_little_endian"))
+    with pytest.raises(MeshError, match="more than 500 kinds of rows or columns"):
+        cr.load_mesh(tmp_path / "a.ply")
+
+
+HOSTILE = {
+    "comments": lambda n: header("", "", comments="comment\n" * n) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
+    "blanks": lambda n: header("", "", comments=f"comment{' ' * 20 * n}x\n") + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
+    "textures": lambda n: header("", "", comments="comment TextureFile a.png\n" * n) + rows([""] * 4) + "3 0 1 2\n" * 2,
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_time_grows_with_the_size(tmp_path: Path, load: Load, kind: str) -> None:
+    def seconds(n: int) -> float:
+        (tmp_path / "a.ply").write_text(HOSTILE[kind](n))
+        start = time.process_time()
+        load(tmp_path / "a.ply")
+        return time.process_time() - start
+
+    seconds(100)
+    small = min(seconds(5_000) for _ in range(2))
+    assert seconds(20_000) < max(9.0 * small, 0.3)
