@@ -74,8 +74,8 @@ def add_register(commands: Any) -> None:
         type=Path,
         metavar="LIST",
         help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
-        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, no "
-        "camera, MESH, what the options say",
+        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, "
+        "EXIF or an estimated camera, MESH, what the options say",
     )
     add(
         "--views",
@@ -141,14 +141,15 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
         return "--start: refines this pose alone; leave limits on the pose out"
-    if "distance" in limits and not listed and arguments.camera is arguments.guess is None:
-        return f"--distance: needs a camera; give {CAMERA_OPTIONS}"
+    without_camera = arguments.camera is arguments.guess is None and arguments.mesh_is == "similar"
+    if "distance" in limits and not listed and without_camera:
+        return f"--distance: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
         return "--start and --mask are of one photograph; give several masks in a list, column mask"
     if arguments.format and (arguments.list or arguments.out is None):
         return "--format ros: of one result, in --out DIR"
-    if arguments.format and rig is None and arguments.camera is arguments.guess is None:
-        return f"--format ros: needs a camera; give {CAMERA_OPTIONS}"
+    if arguments.format and rig is None and without_camera:
+        return f"--format ros: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
     return None
 
 
@@ -231,6 +232,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..evaluation.photograph import check_entry, register_entry
     from ..evaluation.result_files import write_lost
     from ..geometry import Camera
+    from ..registration.result import camera_in_words
 
     out, path = arguments.out, options.photos[0]
     photo, entry = read_photo(path), options.entry(path)
@@ -250,10 +252,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         _write_pose(arguments, found.document)
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
-    remarks, inputs = list(photo.notes), found.document["inputs"]
-    if inputs["camera_source"] in ("exif", "fov"):
-        focal = inputs["camera"][0]
-        remarks.append(f"camera guessed, focal length {focal:.0f} px; distances are off by the same factor")
+    remarks = [*photo.notes, *camera_in_words(found.document)]
     if isinstance(options.camera, Camera) and options.camera.distorts:
         remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
     if remarks:  # with --json, standard output holds only the result
@@ -316,8 +315,6 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
     else:
         photos = read_list(arguments.list, options)
         source = [str(arguments.list.resolve())]
-    if options.guess is not None:
-        print("unknown cameras are guessed; distances are off by the same factor as the guesses", file=sys.stderr)
     names = ("bank_decides", "pose", "mesh_is", "unit", "link", "up", "top", "refine", "renderer", "device")
     settings = {
         "pipeline": options.open_pipeline().describe(),

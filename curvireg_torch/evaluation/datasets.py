@@ -89,7 +89,9 @@ def evaluate(
     def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
         loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
         banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
-        return Registrar(banks, pipeline=pipeline, renderer=renderer)
+        # Without cameras, the datasets have meshes of similar objects.
+        mesh_is = "exact" if benchmark.gives_camera else "similar"
+        return Registrar(banks, pipeline=pipeline, renderer=renderer, mesh_is=mesh_is)
 
     entries = [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error]
     how: Row = {"settings": settings, "label": benchmark.name, "progress": progress, "reports": benchmark.reports}

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "POSE_FEATURES",
     "SCORE_WEIGHTS",
+    "SCREENING_WEIGHT",
     "Poses",
     "best_views",
     "close_rivals",
@@ -48,6 +49,9 @@ __all__ = [
 
 SAME_POSE_ANGLE = 15.0
 """Degrees within which two fitted hypotheses count as one."""
+
+SCREENING_WEIGHT = 20.0
+"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views that are fitted."""
 
 FINISHED_FITS = 2
 """Hypotheses of a photograph whose contours are fitted at full size."""

@@ -164,7 +164,7 @@ class Rig:
 
     def __init__(self, registrar: "Registrar", photographs: Sequence[RigPhotograph]) -> None:
         self.registrar, self.describer, self.photographs = registrar, registrar.describer, photographs
-        self.exact = registrar.is_exact(with_camera=True)
+        self.exact = registrar.is_exact
         symmetries = registrar.symmetries_of(exact=self.exact)
         self.symmetries = torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
         self.cameras = torch.stack([p.camera for p in photographs])

@@ -19,7 +19,7 @@ from .confidence import (
 )
 from .detection import detect
 from .framing import border_sides, outside_fraction
-from .inputs import ImageItem, OnDemand, copies_of, image_items, is_missing, rig_cameras
+from .inputs import ImageItem, OnDemand, check_cameras, copies_of, image_items, is_missing, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .tracker import boxes_at
@@ -47,7 +47,7 @@ def register_views(
         images: V photographs, see :class:`Registrar`.
         boxes: (V, 4), or a list with None where the poses of the others say where the object is. None: the object is
             searched for in each photograph.
-        camera_matrices: see :class:`Registrar`; needed.
+        camera_matrices: see :class:`Registrar`; needed, or EXIF data that have the focal length.
         T_cam_from_world: (V, 4, 4) rigid poses of the cameras, with lengths in the mesh's unit.
 
     Returns:
@@ -70,8 +70,7 @@ def register_views(
         >>> result.transform.shape, len(result.views)
         (torch.Size([4, 4]), 1)
     """
-    if camera_matrices is None:
-        raise InvalidInputError("register_views: needs the camera matrix of each photograph")
+    check_cameras(images, camera_matrices, "register_views")
     count = registrar.pipeline.hypotheses
     registrar = registrar.with_hypotheses(JOINT_HYPOTHESES)
     items = image_items(images, boxes, camera_matrices)

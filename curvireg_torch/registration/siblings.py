@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 import trimesh
@@ -13,7 +14,12 @@ from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from .confidence import RIVAL_ANGLE
 from .details import compare_details
 from .edges import EdgeCrops
-from .poses import POSE_FEATURES, Poses, placed, pose_scores
+from .poses import POSE_FEATURES, Poses, placed, pose_scores, with_edge_support
+from .refits import best_inside
+
+if TYPE_CHECKING:
+    from .judging import Work
+    from .registrar import Registrar
 
 MAX_SIBLINGS = 12  # Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
@@ -93,3 +99,28 @@ def spread(symmetries: Tensor) -> Tensor:
         chosen.append(farthest)
         nearest = torch.minimum(nearest, rotation_error(R, R[farthest]))
     return symmetries[torch.tensor(chosen)]
+
+
+def with_siblings(
+    registrar: "Registrar", work: "Work", crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
+    """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
+    strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
+    symmetries = registrar.telling_symmetries
+    if len(symmetries) == 1:
+        return poses, features, None
+    best = best_inside(features, outside)
+
+    def measure(some: Poses) -> Tensor:
+        return registrar.features_of(work, with_edge_support(registrar.describer, crops, some))
+
+    siblings = Siblings.of(poses[best], symmetries, registrar.describer, crops, measure)
+    kept = siblings.best()
+    if kept:
+        fitted = registrar.fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
+        new = registrar.features_of(work, fitted)
+        poses, features = registrar.replaced(work, poses, features, best, fitted, new)
+    rival = siblings.rival(kept, features[best])
+    if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
+        rival = None
+    return poses, features, rival

@@ -229,7 +229,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     grey = kind in GREY and samples[0]["obj_id"] % 3 == 0
     if grey:
         mesh.visual = trimesh.visual.ColorVisuals()
-    registrar = cr.Registrar(mesh, pipeline=pipeline)
+    registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is="similar" if "similar" in kind else "exact")
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
     else:
