@@ -236,12 +236,16 @@ class Inputs:
             return "of each photograph, from the rig" + ", without its distortion" * self.session.shot.is_undistorted
         if guess == "exif" and photo is not None:
             focal = f"{photo.focal_35mm:g} mm of a 35 mm camera" if photo.focal_35mm else "has no focal length"
-            return f"guessed from the photograph's EXIF, {focal}: no covariance"
+            return f"from the photograph's EXIF, {focal}"
         if guess is not None:
-            return "guessed from the field of view: no covariance"
+            return "from the field of view, to about 10 %"
         if isinstance(camera, Camera):
             return "from a calibration file" + (", without its distortion" if camera.distorts else "")
-        return "" if camera else "unknown: the result is a rotation without translation"
+        if camera:
+            return ""
+        if photo is not None and photo.camera() is not None:
+            return "from the photograph's EXIF"
+        return "unknown: the focal length is estimated, and the distance with it"
 
 
 def _typed_numbers(text: str | None) -> tuple[float, ...] | None:
