@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
-        raise InvalidInputError(f"follow: give {CAMERA_OPTIONS}")
+        raise InvalidInputError(f"follow: needs the camera, which it does not estimate; give {CAMERA_OPTIONS}")
     if out is None and not (arguments.json or arguments.show):
         raise InvalidInputError("follow: give --out DIR, --show or --json")
     if arguments.show:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, CurviregError, ImageError, MissingFileError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
 from ..utils.pictures import check_pixels, damaged_picture
@@ -38,9 +39,14 @@ _WIDTH, _HEIGHT, _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _
 )
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
+_TAKEN_WIDTH, _TAKEN_HEIGHT = 0xA002, 0xA003  # EXIF sizes in px of the picture that the camera took
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+
+EXIF_DEVIATION = 0.05
+"""Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections and stabilisers cut
+the border off, and some cameras mean the width by it, not the diagonal. An estimate, not measured."""
 
 
 @dataclass(frozen=True)
@@ -52,23 +58,47 @@ class Photo:
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
         notes: changes to the pixels, in words.
+        taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None if it is not known.
     """
 
     image: Tensor
     orientation: int
     focal_35mm: float | None
     notes: tuple[str, ...]
+    taken_size: tuple[int, int] | None = None
+
+    @property
+    def is_cropped(self) -> bool:
+        """Whether the proportions of the pixels differ from those of the picture that the camera took."""
+        H, W = self.image.shape[-2:]
+        longer, shorter = max(H, W), min(H, W)
+        if self.taken_size is None:
+            return False
+        taken = max(self.taken_size) / min(self.taken_size)
+        return abs(shorter * taken - longer) > 1.0 + taken
 
     def guessed_camera_matrix(self) -> Tensor | None:
         """Return the (3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
-        The focal length is relative to the diagonal, the principal point the centre: the picture must not be cropped.
+        The focal length is relative to the diagonal of the picture that the camera took. A picture of its proportions
+        is taken for a resized one, with the principal point in its centre. One of other proportions is taken for a
+        part of it at full size, which is as large; None if it is larger.
         """
         if self.focal_35mm is None:
             return None
         H, W = self.image.shape[-2:]
-        focal = self.focal_35mm * math.hypot(H, W) / _DIAGONAL_35MM
+        taken = (H, W)
+        if self.is_cropped and self.taken_size is not None:
+            taken = self.taken_size
+            if max(H, W) > max(taken) or min(H, W) > min(taken):
+                return None
+        focal = self.focal_35mm * math.hypot(*taken) / _DIAGONAL_35MM
         return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
+
+    def camera(self) -> Camera | None:
+        """Return the camera of :meth:`guessed_camera_matrix`, or None."""
+        K = self.guessed_camera_matrix()
+        return None if K is None else Camera(K, focal_deviation=EXIF_DEVIATION, source="exif")
 
     def facts(self) -> dict[str, Any]:
         """Return all but the pixels, as plain JSON."""
@@ -99,12 +129,30 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
         >>> photo.image.shape, int(photo.image[0, 0, 0]), photo.notes
         (torch.Size([3, 4, 6]), 51, ('grey: three equal channels',))
     """
-    rgb, orientation, focal, notes = _decode(Path(path))
-    orientation = 1 if as_stored else orientation
+    return _photo(*_decode(Path(path)), as_stored=as_stored)
+
+
+def photo_of_picture(image: "Image") -> Photo:
+    """A picture that Pillow has opened, as :func:`read_photo` reads its file; of one made in memory, its pixels.
+
+    Raises:
+        ImageError: a mode that is not read, a damaged file, or one beyond :mod:`curvireg_torch.errors`.
+    """
+    try:
+        check_pixels(image)
+        return _photo(*_decoded(image, b""))
+    except ImageError:
+        raise
+    except Exception as error:  # Pillow raises errors of any kind for damaged files
+        raise damaged_picture(error) from error
+
+
+def _photo(rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_stored: bool = False) -> Photo:
+    orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
     pixels = torch.from_numpy(np.array(oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
-    return Photo(pixels, orientation, focal, notes)
+    return Photo(pixels, orientation, exif.focal_35mm, notes, exif.taken_size)
 
 
 def read_image(path: str | os.PathLike[str]) -> Tensor:
@@ -126,17 +174,24 @@ def photo_size(path: Path) -> tuple[int, int]:
     return (width, height) if orientation > 4 else (height, width)
 
 
-def _decode(path: Path) -> tuple[NDArray[np.uint8], int, float | None, tuple[str, ...]]:
-    """(H, W, 3) RGB pixels as stored, EXIF orientation and focal length, and notes."""
+class _Exif(NamedTuple):
+    """What is used of a file's metadata, see :class:`Photo`."""
 
-    def read(image: "Image", orientation: int, data: bytes) -> tuple[NDArray[np.uint8], float | None, tuple[str, ...]]:
-        notes = _notes(image)
-        focal = _exif(image)[1]
-        rgb, stretched = _rgb_pixels(image, data)
-        return as_in_file(rgb, image, orientation), focal, (*notes, *stretched)
+    orientation: int
+    focal_35mm: float | None
+    taken_size: tuple[int, int] | None
 
-    (rgb, focal, notes), orientation = decoded(path, read)
-    return rgb, orientation, focal, notes
+
+def _decode(path: Path) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+    """(H, W, 3) RGB pixels as stored, metadata, and notes."""
+    return decoded(path, lambda image, _, data: _decoded(image, data))[0]
+
+
+def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+    notes = _notes(image)
+    exif = _exif(image)
+    rgb, stretched = _rgb_pixels(image, data)
+    return as_in_file(rgb, image, exif.orientation), exif, (*notes, *stretched)
 
 
 def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, int]:
@@ -155,7 +210,7 @@ def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, in
         with open_photograph(data) as image:
             _seek_full_image(image)
             check_pixels(image)
-            orientation = _exif(image)[0]
+            orientation = _exif(image).orientation
             return read(image, orientation, data), orientation
     except CurviregError as error:
         raise error.with_subject(path) from error.__cause__
@@ -179,15 +234,23 @@ def _seek_full_image(image: "Image") -> None:
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _exif(image: "Image") -> tuple[int, float | None]:
-    """Orientation and focal length in mm of a 36 x 24 mm camera; what is damaged gives 1 and None."""
+def _exif(image: "Image") -> _Exif:
+    """The metadata of a picture; what is damaged gives orientation 1, and None."""
     orientation, focal = 1, 0.0
+    width = height = 0
     with suppress(Exception):
         exif = image.getexif()
         orientation = exif.get(_ORIENTATION, 1)
-        focal = float(exif.get_ifd(_EXIF_DIRECTORY).get(_FOCAL_35MM, 0))
+        directory = exif.get_ifd(_EXIF_DIRECTORY)
+        focal = float(directory.get(_FOCAL_35MM, 0))
+        width = int(directory.get(_TAKEN_WIDTH, 0))
+        height = int(directory.get(_TAKEN_HEIGHT, 0))
     valid = isinstance(orientation, int) and orientation in range(1, 9)
-    return orientation if valid else 1, focal if 0 < focal < math.inf else None
+    return _Exif(
+        orientation if valid else 1,
+        focal if 0 < focal < math.inf else None,
+        (height, width) if width > 0 and height > 0 else None,
+    )
 
 
 def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
@@ -218,7 +281,9 @@ def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[s
 
 
 def _is_deep(image: "Image", data: bytes) -> bool:
-    """Whether a colour picture has 16 bits for each channel, of which Pillow keeps the upper 8."""
+    """Whether a colour picture has 16 bits for each channel, of which Pillow keeps the upper 8; False without data."""
+    if not data:
+        return False
     if image.format == "PNG":
         return data[24:25] == b"\x10"  # of its first chunk
     tags = getattr(image, "tag_v2", {})

@@ -103,7 +103,7 @@ PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
     "side": {"choices": SIDE_NAMES, "help": "side that faces the camera, 45 degrees to either side of it"},
     "near": {"type": Numbers("AZIMUTH ELEVATION [THETA]"), "help": "a viewpoint nearby"},
     "within": {"type": Numbers("DEG"), "help": f"largest angle from --near (default: {WITHIN:g})"},
-    "distance": {"type": Numbers("NEAR FAR"), "help": "of the object's centre, in the mesh's unit; needs a camera"},
+    "distance": {"type": Numbers("NEAR FAR"), "help": "of the object's centre, in the mesh's unit"},
     "front": {"choices": UP_AXES, "help": "axis of the mesh file that points out of its front, at azimuth 0"},
 }
 """What may be known about the pose: options of the command line, and columns of lists."""
@@ -132,9 +132,9 @@ class RegisterOptions:
     )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
-        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
-        "distortion is removed: gives the translation. Or exif, the focal length of the photograph's file: the "
-        "result then has no covariance",
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or other tools, whose "
+        "distortion is removed. exif insists on the focal length of the photograph's file (default: this one, if it "
+        "has one; else the focal length is estimated, and the distance with it)",
         type=camera_option,
     )
     mask: Path | None = _option(
@@ -143,7 +143,7 @@ class RegisterOptions:
         type=Path,
     )
     guess: str | float | None = _option(
-        None, "horizontal field of view of an unknown camera", flag="--fov", type=Numbers("DEG")
+        None, "horizontal field of view of the camera, if it is about known", flag="--fov", type=Numbers("DEG")
     )
     start: Path | None = _option(
         None,
@@ -180,7 +180,7 @@ class RegisterOptions:
     mesh_is: str | None = _option(
         None,
         "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
-        "(default: exact with a camera, similar without)",
+        "(default: exact)",
         choices=MESH_KINDS,
     )
     preset: str | None = _option(

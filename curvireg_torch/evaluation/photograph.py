@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
 from ..data.frames import VideoFrame
+from ..data.images import photo_of_picture
 from ..data.masks import mask_file
 from ..data.pose_files import PoseFile
 from ..errors import CurviregError, InvalidInputError, MissingFileError
@@ -40,6 +41,7 @@ from .result_files import View, write_result
 
 __all__ = ["RegisteredPhotograph", "register"]
 
+VIEW_DEVIATION = 0.1  # standard deviation of the focal length of a given field of view, as a fraction of it
 THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
 
 
@@ -52,7 +54,7 @@ class Entry:
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()  # of several the best is found
     box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
-    camera: Camera | str | float | None = None  # "exif" and a horizontal field of view in degrees are guesses
+    camera: Camera | str | float | None = None  # "exif" insists on the file's; or a horizontal field of view in degrees
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
@@ -153,12 +155,13 @@ def register(
     """Find the pose of a mesh in one photograph.
 
     Args:
-        image: a path, a PIL image, an (H, W) or (H, W, 3) array, or a (1 or 3, H, W) tensor.
+        image: a path, a PIL image, an (H, W) or (H, W, 3) RGB array, or a (1 or 3, H, W) tensor.
         mesh: a mesh or a bank, or the path of one, see :class:`Registrar`; or a registrar, which is faster for several
             photographs.
         box: x0, y0, x1, y1 in px; without box and mask the object is searched for.
         camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a calibration file;
-            "exif" takes the focal length of the photograph's file. None: the rotation is estimated alone.
+            "exif" insists on the focal length of the photograph's EXIF data. None: this one, if there is one, or else
+            the focal length is estimated in the photograph; ``result.camera`` tells which.
         mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
         prior: limits on the pose.
         unit, up: of a mesh file, see :func:`load_mesh`; None: "m", and the usual axis. A bank must have been built with
@@ -185,8 +188,8 @@ def register(
         path = Path(image)
         name, photo = str(image), read_photo(image)
     else:
-        pixels = np.array(image.convert("RGB")) if isinstance(image, Image.Image) else image
-        photo = Photo(image_item(pixels, None).image, 1, None, ())
+        is_picture = isinstance(image, Image.Image)
+        photo = photo_of_picture(image) if is_picture else Photo(image_item(image, None).image, 1, None, ())
     if isinstance(camera, str | PathLike):
         camera = camera if camera == "exif" else load_camera(camera)
     elif camera is not None and not isinstance(camera, Camera):
@@ -197,7 +200,7 @@ def register(
             mesh = ViewBank.load(mesh)
             check_bank(mesh, meshes[0], unit=unit, up=up)
         else:
-            mesh = load_mesh(mesh, unit=unit or "m", up=up)
+            mesh = load_mesh(mesh, unit=unit, up=up)
     elif unit is not None or up is not None:
         raise InvalidInputError("unit, up: of a mesh file; what is given as mesh has its own, leave them out")
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
@@ -262,17 +265,24 @@ def register_entry(
             "camera_source": source,
             "picture": photo.facts(),
         },
-        "camera": None if camera is None else camera.at(item.size).describe(),
+        **_camera_document(result.camera, camera and camera.at(item.size)),
     }
     if result.detection is not None:
         document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
-    if source in ("exif", "fov"):  # the error of a guessed camera is unknown
-        document["covariance"] = document["standard_deviations"] = None
     box = box.double() if result.corrected_box is None else result.corrected_box
     files = entry.files
     return RegisteredPhotograph(
         **vars(result), registrar=registrar, image=item.image, box=box, document=document, inputs=files
     )
+
+
+def _camera_document(found: Camera | None, given: Camera | None) -> dict[str, Any]:
+    """The keys ``camera`` and ``camera_source``: the camera found, with the distortion of a ``given`` one."""
+    if found is None:
+        found = given
+    elif given is not None:
+        found = replace(given, matrix=found.matrix, focal_deviation=found.focal_deviation)
+    return {"camera": found and found.describe(), "camera_source": found and found.source}
 
 
 def register_views(
@@ -309,18 +319,17 @@ def register_views(
 
 
 def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
-    """The camera, and its source; that of a calibration has a size or distortion."""
+    """The camera, or None if it is unknown, and its source; that of a calibration has a size or distortion."""
     given = entry.camera
     if isinstance(given, Camera):
         return given, "file" if given.size or given.distorts else "given"
-    if given is None:
-        if entry.start is not None:
-            raise InvalidInputError(f"--start: needs the camera; give {CAMERA_OPTIONS}", subject=entry.name)
-        return None, None
-    if given != "exif":
+    if given not in (None, "exif"):
         H, W = photo.image.shape[-2:]
-        return Camera(camera_of_view(float(given), (H, W))), "fov"
-    K = photo.guessed_camera_matrix()
-    if K is None:
-        raise InvalidInputError(f"no focal length in its EXIF; give {CAMERA_OPTIONS}", subject=entry.name)
-    return Camera(K), "exif"
+        return Camera(camera_of_view(float(given), (H, W)), focal_deviation=VIEW_DEVIATION), "fov"
+    camera = None if entry.as_stored else photo.camera()  # boxes of datasets come with what is to be known
+    if camera is not None:
+        return camera, "exif"
+    if given == "exif" or entry.start is not None:
+        what = "no focal length in its EXIF" if given == "exif" else "--start: needs the camera"
+        raise InvalidInputError(f"{what}; give {CAMERA_OPTIONS}", subject=entry.name)
+    return None, None

@@ -4,7 +4,8 @@ Channel 0 = x, 1 = y; the length is the measure, the direction points across the
 function has a module twin with the same options. The dtype is kept (half types compute in float32). Wrong shapes,
 dtypes, masks and options raise :class:`~curvireg_torch.errors.InvalidInputError`.
 
-Gradients, Hessian, diffusion and box means are own code because kornia's take 5 to 70 times as long on one CPU thread.
+Grey levels are kornia's. Gaussians and derivatives are own code, which gives the same results: on one CPU thread,
+forward and backward, kornia's take several times as long (``docs/kornia.md`` has the measurements).
 """
 
 from .curvilinear import DepthCurvilinearSaliency as DepthCurvilinearSaliency

@@ -17,6 +17,9 @@ from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
 
+SOURCES = ("given", "exif", "estimated")
+"""Where a camera may come from."""
+
 # Numbers of coefficients of each distortion model
 MODELS = {"radial-tangential": (0, 4, 5, 8, 12, 14), "fisheye": (4,)}
 MAX_ANGLE = 1.55  # Radians from the optical axis up to which distortion is computed: 89 degrees
@@ -34,9 +37,13 @@ class Camera:
             k4, k5, k6, s1, s2, s3, s4, tx, ty); "fisheye" (equidistant): the 4 of ``cv2.fisheye``.
         model: "radial-tangential" or "fisheye".
         size: (H, W) of the photographs that it was calibrated with; None: that of any photograph.
+        focal_deviation: standard deviation of the focal length, as a fraction of it; 0 of a known one.
+        source: one of :data:`SOURCES`: "given"; "exif", by the metadata of the photograph's file; "estimated" in the
+            photograph itself.
 
     Raises:
-        InvalidInputError: an unusable matrix, or a wrong number of coefficients.
+        InvalidInputError: an unusable matrix, a wrong number of coefficients, or a deviation that is not finite and
+            >= 0.
 
     Example:
         >>> camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], (-0.3, 0.1, 0, 0), size=(480, 640))
@@ -48,12 +55,17 @@ class Camera:
     distortion: Sequence[float] = ()
     model: str = "radial-tangential"
     size: tuple[int, int] | None = None
+    focal_deviation: float = 0.0
+    source: str = "given"
 
     def __post_init__(self) -> None:
         matrix = as_numbers(self.matrix, "camera matrix", dtype=torch.float64).detach().cpu().double()
         check_tensor(matrix, "camera matrix", (3, 3))
         check_camera_matrix(matrix)
         check_option(self.model, MODELS, "distortion model")
+        check_option(self.source, SOURCES, "source")
+        if not 0.0 <= self.focal_deviation < float("inf"):
+            raise InvalidInputError(f"focal_deviation: expected a fraction >= 0, got {self.focal_deviation}")
         given = list(self.distortion)
         numbers = finite_numbers(given, len(given))
         if numbers is None or len(numbers) not in MODELS[self.model]:
@@ -85,8 +97,14 @@ class Camera:
 
     def describe(self) -> dict[str, Any]:
         """Return the attributes as plain JSON."""
-        attributes = {"matrix": self.matrix.tolist(), "distortion": list(self.distortion), "model": self.model}
-        return {**attributes, "size": None if self.size is None else list(self.size)}
+        return {
+            "matrix": self.matrix.tolist(),
+            "distortion": list(self.distortion),
+            "model": self.model,
+            "size": None if self.size is None else list(self.size),
+            "source": self.source,
+            "focal_deviation": self.focal_deviation,
+        }
 
 
 class Undistorted(NamedTuple):

@@ -247,7 +247,7 @@ class ViewMatcher(nn.Module):
         order, outside = log.argsort(dim=1, descending=True, stable=True), None
         if allowed is not None:
             R = self.bank.rotations
-            near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE
+            near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE - ROUNDING_OF_TRACE
             best, outside = without_limits.masked_fill(allowed | near, -torch.inf).max(dim=1)
             outside = outside.masked_fill(best == -torch.inf, -1)
         return Ranking(log.exp(), order, {**terms, **compared}, allowed, outside)

@@ -40,6 +40,7 @@ options = dict(tol_linear={LINEAR_TOLERANCE}, tol_angular={ANGULAR_TOLERANCE}, t
 content = cascadio.to_glb_bytes(Path(sys.argv[1]).read_bytes(), kind, **options)
 Path(sys.argv[2]).write_bytes(content)
 """
+IGES_METRES = 1e-3  # OpenCASCADE leaves the triangles of IGES files in mm
 _PREFIXES = {b".MILLI.": "mm", b".CENTI.": "cm", b".DECI.": "dm", b"$": "m"}
 _CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
 _IGES_FLAGS = {b"1": "in", b"2": "mm", b"4": "ft", b"6": "m", b"10": "cm"}
@@ -71,12 +72,13 @@ def read_step(source: MeshSource) -> ReadMesh:
         raise ValueError("not a STEP file")
     unit = (iges_unit(data) if is_iges else step_unit(data)) or "m"
     mesh = read_gltf(source, _converted(source.path.resolve(), "iges" if is_iges else "step"))
-    vertices = mesh.vertices / UNITS[unit]
+    metres = IGES_METRES if is_iges else 1.0
+    vertices = mesh.vertices * (metres / UNITS[unit])
     return ReadMesh(vertices, mesh.faces, mesh.colours, unit, "z")
 
 
 def _converted(path: Path, kind: str) -> bytes:
-    """The GLB, in metres, of a STEP or IGES file."""
+    """The GLB of a STEP file, in metres, or of an IGES file, in millimetres."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "part.glb")
         command = [sys.executable, "-P", "-c", _CONVERT, str(path), str(out), kind]

@@ -118,6 +118,8 @@ def _check_sizes(tree: dict[str, Any]) -> None:
 def _check_nodes(tree: dict[str, Any]) -> None:
     """Every node must be the child of one node at most, and a root of none: else the nodes form a circle, or more."""
     nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
+    if len(nodes) > 10 * MAX_MESH_PARTS:
+        raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} nodes; join them")
     named = [child for node in nodes for child in node.get("children", [])]
     named += scenes[_natural(tree.get("scene", 0))].get("nodes", []) if scenes else []
     if len(set(map(_natural, named))) < len(named) or max(named, default=-1) >= len(nodes):
@@ -260,7 +262,7 @@ class _File:
         image = self._tree["images"][_natural(index)]
         name = str(image.get("name", f"number {index}"))
         if "bufferView" in image:
-            return self._source.texture(index, self._view(image["bufferView"]), name)
+            return self._source.texture(index, bytes(self._view(image["bufferView"])), name)
         uri = str(image["uri"])
         if uri.startswith("data:"):
             return self._source.texture(index, _data_of(uri), name)
@@ -288,14 +290,14 @@ class _File:
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
         return values
 
-    def _view(self, index: Any) -> bytes:
+    def _view(self, index: Any) -> memoryview:
         view = self._tree["bufferViews"][_natural(index)]
         buffer = self._buffer(_natural(view["buffer"]))
         start = _natural(view.get("byteOffset", 0))
         end = start + view["byteLength"]
         if end > len(buffer):
             raise ValueError("a buffer is shorter than its views; the file ends too early")
-        return buffer[start:end]
+        return memoryview(buffer)[start:end]  # no copy: many accessors may share a view
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:

@@ -13,6 +13,7 @@ from .colours import SurfaceColours
 from .polygons import triangles_of_faces
 from .source import MeshSource, Pixels, ReadMesh, spellings
 
+MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
 _COLOURS = (
     ("red", "green", "blue"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
@@ -35,6 +36,8 @@ def read_ply(source: MeshSource) -> ReadMesh:
     header, end, body = data.partition(b"end_header")
     if not end or not header.startswith(b"ply"):
         raise ValueError("not a PLY file, or its header ends too early")
+    if max(header.count(b"property"), header.count(b"element")) > MAX_COLUMNS:
+        raise ValueError(f"more than {MAX_COLUMNS:,} kinds of rows or columns")
     names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
     if b"ascii" in header[:100] and max(body.count(b"\n"), body.count(b"\r")) > MAX_MESH_LINES:
         raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")

@@ -3,6 +3,7 @@ specifications."""
 
 import xml.parsers.expat
 import zipfile
+from array import array
 from dataclasses import dataclass, field
 from io import BytesIO
 
@@ -26,8 +27,8 @@ class _Object:
 
     group: str = ""
     index: int = 0
-    vertices: list[float] = field(default_factory=list)
-    triangles: list[int] = field(default_factory=list)
+    vertices: "array[float]" = field(default_factory=lambda: array("d"))
+    triangles: "array[int]" = field(default_factory=lambda: array("q"))
     properties: list[tuple[str, int, int, int] | None] = field(default_factory=list)
     components: list[tuple[str, str, str]] = field(default_factory=list)
 
@@ -194,9 +195,9 @@ def _parsed(data: bytes) -> _Model:
         kind = tag.rpartition(":")[2]
         plain = {name.rpartition(":")[2]: value for name, value in attributes.items()}
         if kind == "vertex":
-            current.vertices += (float(plain["x"]), float(plain["y"]), float(plain["z"]))
+            current.vertices.extend((float(plain["x"]), float(plain["y"]), float(plain["z"])))
         elif kind == "triangle":
-            current.triangles += (int(plain["v1"]), int(plain["v2"]), int(plain["v3"]))
+            current.triangles.extend((int(plain["v1"]), int(plain["v2"]), int(plain["v3"])))
             current.properties.append(_property(plain, current))
         elif kind == "object":
             current = model.objects[plain["id"]] = _Object(plain.get("pid", ""), int(plain.get("pindex", 0)))

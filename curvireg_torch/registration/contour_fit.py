@@ -146,11 +146,18 @@ class ContourProblem:
     def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
         """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and ``others`` measurements."""
         uv, J = project(points.model, points.normals, T, self.K, self.centre)
+        step = self.selected_step(points, uv, J, radius, [other.equations() for other in others])
+        return apply_twist(T, step * self.step_fraction(step, T)[:, None], self.centre)
+
+    def selected_step(
+        self, points: ContourPoints, uv: Tensor, J: Tensor, radius: float, equations: Sequence[tuple[Tensor, Tensor]]
+    ) -> Tensor:
+        """(N, D) solutions for edges within ``radius`` px of points at ``uv`` (N, P, 2) px, which shift along their
+        normals by ``J`` (N, P, D), and of other normal ``equations``; edges are selected again near the solution."""
         distance, strength = self._candidates(uv, points, radius)
         J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
-        equations = [other.equations() for other in others]
         log, residual = strength.log(), distance
         for _ in range(SELECTIONS_PER_STEP):
             # The largest strength times exp(-2 (residual / radius)^2)
@@ -162,7 +169,7 @@ class ContourProblem:
                 A, b = A + more_A, b + more_b
             step = self.solution(A, b)
             residual = distance - J @ step[..., None].to(J.dtype)
-        return apply_twist(T, step * self.step_fraction(step, T)[:, None], self.centre)
+        return step
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
         """(N, 6) damped solutions of normal equations (N, 6, 6) and (N, 6, 1)."""
@@ -384,10 +391,11 @@ def fit_to_edges(
     before[index] = support[: len(index)]
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
     state, support = state[best], support[best]
-    return _measured(full, state, support, before)
+    return measured_fit(full, state, support, before)
 
 
-def _measured(full: ContourProblem, state: ContourState, support: Tensor, before: Tensor) -> ContourFit:
+def measured_fit(full: ContourProblem, state: ContourState, support: Tensor, before: Tensor) -> ContourFit:
+    """A fit that ended in a ``state`` with its edge ``support`` (N,), that of its start being ``before`` (N,)."""
     edges, contours = full.measured_edges(state, FULL_SIZE_RADII[-1]), full.contours
     covariance, observable = pose_covariance(
         edges, state.points, state.T, full.K, contours.centre, radius=contours.radius
@@ -401,7 +409,7 @@ def measure_contours(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Ten
     full = ContourProblem.of(contours, crops, K, image_index)
     state = full.state(T)
     support = full.edge_support(state)
-    return _measured(full, state, support, support)
+    return measured_fit(full, state, support, support)
 
 
 @torch.no_grad()

@@ -21,11 +21,12 @@ from ..matching import ViewBank, ViewMatcher
 from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
 from .confidence import detection_probability
+from .focal import usual_camera
 from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
-from .priors import Limits
-from .result import Detection, FailedRegistration, Registration, corners
+from .result import Detection, FailedRegistration, Registration, corners, two_decimals
 from .tracker import boxes_at
+from .unknown_camera import limits_of
 
 if TYPE_CHECKING:
     from .registrar import Registrar
@@ -66,8 +67,7 @@ def detect(
         :class:`LostObjectError` where no place is convincing.
 
     Raises:
-        InvalidInputError: not as many cameras or priors as images, a distance limited without cameras, or
-            ``instances`` < 1.
+        InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
     """
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
@@ -93,7 +93,8 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     poses, count = registrar.landmark_poses(registrar.landmark_matches(item))
     if item.prior is not None:
         distance, allowed = item.prior.distance, _allowed_views(registrar, item)
-        kept = Limits(item, registrar.bank).keeps(poses)
+        distance = None if item.camera_matrix is None else distance  # sizes do not limit an unknown camera
+        kept = limits_of(registrar, item).keeps(poses)
         poses, count = poses[kept], count[kept]
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
@@ -112,7 +113,7 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
     best = max(found, key=lambda one: one.confidence or 0.0)
     assert best.detection is not None
     place = f"at the most likely place, box {corners(best.detection.box.tolist())}"
-    seen = f"the object is seen with a probability of {best.confidence:.2f}"
+    seen = f"the object is seen with a probability of {two_decimals(best.confidence or 0.0)}"
     error = LostObjectError(f"not found: {place}, {seen}; give a box", subject=subject)
     error.detection = best.detection
     return FailedRegistration(error)
@@ -121,12 +122,14 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
 def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
     """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph, which is the box."""
     off_centre = 0.0
+    if item.camera_matrix is None and registrar.is_exact:
+        item = replace(item, camera_matrix=usual_camera(item.size))
     if item.camera_matrix is not None:
         x0, y0, x1, y1 = item.box.double().tolist()
         points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
         rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
         off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
-    return Limits(item, registrar.bank).allowed(off_centre=off_centre)
+    return limits_of(registrar, item).allowed(off_centre=off_centre)
 
 
 @dataclass(frozen=True)
@@ -166,7 +169,7 @@ class Candidate:
         query = registrar.matcher.query([item.image], box[None].float())
         allowed = None
         if item.prior is not None:
-            allowed = Limits(replace(item, box=box.float()), registrar.bank).allowed()[None]
+            allowed = limits_of(registrar, replace(item, box=box.float())).allowed()[None]
         similarity = float(registrar.matcher.similarity(query, allowed))
         score = detection_probability(response, similarity, rival=rival)
         return cls(box, response, rival, query, score)

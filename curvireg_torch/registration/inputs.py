@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL.Image import Image as Picture
 from torch import Tensor
 
-from ..data.images import read_photo
+from ..data.images import photo_of_picture, read_photo
 from ..data.masks import mask_of_values, read_mask
 from ..errors import CurviregError, ImageError, InvalidInputError
 from ..geometry.calibration import Camera, undistorted
@@ -42,6 +43,7 @@ FRACTIONS = "box: in px, not fractions of the photograph; multiply them, or give
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
+SAME_PLACE = 1e-4  # Relative difference of poses and cameras up to which two photographs come from the same place
 SAME_PICTURE = 0.8  # Correlation of small copies of two photographs from which they may come from the same place
 # Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
 # on 60 generated photographs
@@ -52,7 +54,8 @@ MISSING_SHARE = 0.2  # Part of a box without pixels of the photograph, from whic
 @dataclass(frozen=True)
 class ImageItem:
     """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,),
-    ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and what is questionable about them.
+    ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and what is questionable about them;
+    ``focal_deviation`` and ``camera_source`` as in :class:`Camera`.
 
     Raises:
         InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
@@ -64,6 +67,8 @@ class ImageItem:
     prior: PosePrior | None = None
     mask: Tensor | None = None
     notes: tuple[str, ...] = ()
+    focal_deviation: float = 0.0
+    camera_source: str = "given"
 
     def __post_init__(self) -> None:
         check_photograph(self.image, "photograph")
@@ -79,9 +84,24 @@ class ImageItem:
 
     @property
     def K(self) -> Tensor:  # noqa: N802
-        """(3, 3) float64 camera matrix of a photograph that has one."""
-        assert self.camera_matrix is not None
+        """(3, 3) float64 camera matrix; refuses a photograph without one."""
+        if self.camera_matrix is None:
+            raise InvalidInputError(
+                "needs the camera: give its matrix, or a photograph whose EXIF has its focal length"
+            )
         return self.camera_matrix.double()
+
+    @property
+    def camera(self) -> Camera | None:
+        """The camera, without distortion."""
+        if self.camera_matrix is None:
+            return None
+        return Camera(
+            self.camera_matrix,
+            size=self.size,
+            focal_deviation=self.focal_deviation,
+            source=self.camera_source,
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -115,8 +135,9 @@ def image_items(
 ) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
     Arguments and errors are those of ``Registrar``; each is read and checked whenever it is asked for, so that many
-    large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed. A box
-    of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is refused."""
+    large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed; a
+    file without one has the camera of its EXIF data. A box of which less than ``MIN_BOX_SIDE`` px lie inside its
+    photograph in a direction is refused."""
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
         raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
     n, no_box = len(images), boxes is None
@@ -131,8 +152,6 @@ def image_items(
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
         raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
-    if camera_matrices is None and any(p is not None and p.distance is not None for p in priors):
-        raise InvalidInputError("distance: needs the camera matrix of every photograph")
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
@@ -149,6 +168,12 @@ def image_items(
             return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
 
     return OnDemand(item, n)
+
+
+def check_cameras(images: Any, camera_matrices: Any | None, what: str) -> None:
+    """Refuse photographs without a camera and without a file, whose EXIF data may have one."""
+    if camera_matrices is None and not all(isinstance(image, str | PathLike | Picture) for image in images):
+        raise InvalidInputError(f"{what}: needs the camera matrix of each photograph")
 
 
 def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
@@ -185,6 +210,27 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
     return T
 
 
+def copies_of(T: Tensor, items: "Sequence[ImageItem | CurviregError]") -> dict[int, int]:
+    """Photographs of a rig that show what an earlier one does, by their index, and that one: those that the same camera
+    took from the same place ``T`` (V, 4, 4). They are no further evidence."""
+    found: dict[int, int] = {}
+    size = T[:, :3, 3].abs().amax(dim=1).clamp(min=1e-300)
+    for i, pose in enumerate(T):
+        turned = (T[:i, :3, :3] - pose[:3, :3]).flatten(1).abs().amax(dim=1) <= SAME_PLACE
+        near = (T[:i, :3, 3] - pose[:3, 3]).abs().amax(dim=1) <= SAME_PLACE * size[i]
+        for j in (turned & near).nonzero()[:, 0].tolist():
+            one, other = items[j], items[i]
+            if i not in found and j not in found and _by_same_camera(one, other):
+                found[i] = j
+    return found
+
+
+def _by_same_camera(one: ImageItem | CurviregError, other: ImageItem | CurviregError) -> bool:
+    if not (isinstance(one, ImageItem) and isinstance(other, ImageItem)) or one.size != other.size:
+        return False
+    return bool((one.K - other.K).abs().max() <= SAME_PLACE * one.K.abs().max())
+
+
 def _contradict(one: ImageItem, other: ImageItem) -> bool:
     """Whether small copies of two photographs by the same camera are hardly correlated."""
     if one.size != other.size or not torch.equal(one.K, other.K):
@@ -213,7 +259,8 @@ def image_item(
     mask: Any | None = None,
 ) -> ImageItem:
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image), however small."""
-    pixels, notes = _pixels(image), []
+    (pixels, recorded), notes = _pixels(image), []
+    camera = recorded if camera is None else camera
     box = None if box is None else box.detach().float().cpu()
     mask = None if mask is None else _object_mask(mask, pixels)
     if mask is not None:
@@ -222,9 +269,13 @@ def image_item(
         if min(float(border.float().mean()), float(white.float().mean())) > 0.5:
             notes.append("the mask covers most of the photograph and its border; the object must be white, not black")
     missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
+    deviation = 0.0
+    source = "given"
     if isinstance(camera, Camera):
         camera = camera.at((pixels.shape[-2], pixels.shape[-1]))
         pixels, box, mask, missing = undistorted(pixels, camera, box, mask)
+        deviation = camera.focal_deviation
+        source = camera.source
         camera = camera.matrix
     if mask is not None:
         white = mask >= 0.5
@@ -240,7 +291,7 @@ def image_item(
     item = replace(item, box=clipped(box, item.size))
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
         notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
-    return replace(item, notes=tuple(notes))
+    return replace(item, notes=tuple(notes), focal_deviation=deviation, camera_source=source)
 
 
 def _object_mask(mask: Any, image: Tensor) -> Tensor:
@@ -280,9 +331,14 @@ class OnDemand(Sequence[ImageItem | CurviregError]):
         return self._item(self._indices[index])
 
 
-def _pixels(image: Any) -> Tensor:
+def _pixels(image: Any) -> tuple[Tensor, Camera | None]:
+    """The pixels of a photograph in any form, and the camera of its EXIF data."""
     if isinstance(image, str | PathLike):
-        return read_photo(image).image
+        photo = read_photo(image)
+        return photo.image, photo.camera()
+    if isinstance(image, Picture):
+        photo = photo_of_picture(image)
+        return photo.image, photo.camera()
     if isinstance(image, np.ndarray):
         if not (np.issubdtype(image.dtype, np.number) or image.dtype == bool):
             raise InvalidInputError(f"photograph: expected an array of numbers, got {image.dtype}")
@@ -291,7 +347,7 @@ def _pixels(image: Any) -> Tensor:
     if not isinstance(image, Tensor):
         raise InvalidInputError(f"expected a tensor, an array or a path, got {type(image).__name__}")
     check_photograph(image, "photograph")
-    return image
+    return image, None
 
 
 def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> Tensor:

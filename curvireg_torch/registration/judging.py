@@ -39,7 +39,7 @@ FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below wh
 @dataclass(frozen=True)
 class Work:
     """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
-    fits, and ``landmarks`` in the box, if there are any."""
+    fits, and ``landmarks`` in the box, if there are any; ``starts`` with several cameras if the camera is unknown."""
 
     item: ImageItem
     query: QueryFeatures
@@ -50,6 +50,7 @@ class Work:
     symmetries: Tensor | None
     crops: EdgeCrops | None
     landmarks: LandmarkMatches | None
+    starts: Poses | None = None
 
 
 def judged(
@@ -81,6 +82,7 @@ def judged(
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,
         border=border_sides(work.item.box, work.item.size),
+        focal=work.item.focal_deviation,
     )
     gain = _gain_outside(features, best, order[outside[order]])
     if gain is not None and len(rivals) == 1:  # limits that leave no rival do not make a pose uncertain
@@ -103,6 +105,7 @@ def judged(
         prior_contradiction=_contradiction(registrar, work, poses[best], gain),
         warnings=item.warnings + registrar.mesh_warnings + outside_warnings(fraction),
         notes=registrar.mesh_notes,
+        camera=item.camera,
     )
 
 

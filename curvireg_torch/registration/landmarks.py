@@ -116,14 +116,16 @@ class LandmarkMatches:
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
-    def agreeing(self, T: Tensor) -> Tensor:
-        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4)."""
+    def agreeing(self, T: Tensor, cameras: Tensor | None = None) -> Tensor:
+        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4); ``cameras`` (N, 3, 3) if they have
+        other ones."""
         counts = []
-        for pose in T.double().cpu().numpy():
+        matrices = [self.K] * len(T) if cameras is None else cameras.double().cpu().numpy()
+        for pose, K in zip(T.double().cpu().numpy(), matrices, strict=True):
             cam = self.points @ pose[:3, :3].T + pose[:3, 3]
             z = float(pose[2, :3] @ self.centre + pose[2, 3])
-            error = AGREEMENT * self.K[0, 0] * self.radius / max(z, 1e-9)
-            uv = cam @ self.K[:2].T / np.maximum(cam[:, 2:], 1e-9)
+            error = AGREEMENT * K[0, 0] * self.radius / max(z, 1e-9)
+            uv = cam @ K[:2].T / np.maximum(cam[:, 2:], 1e-9)
             counts.append(_places(self.uv[np.linalg.norm(uv - self.uv, axis=1) < error], error))
         return torch.tensor(counts, dtype=torch.float64)
 

@@ -158,6 +158,22 @@ UNKNOWN_ROTATION = math.pi
 MIN_TOTAL_WEIGHT = 6.0  # Sum of weights that a covariance needs
 
 
+def summed_by_cells(uv: Tensor, values: Tensor) -> Tensor:
+    """(N, C, D) sums of values (N, P, D) of points (N, P, 2) over the cells of crops within which errors are
+    correlated."""
+    cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
+    cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
+    sums = values.new_zeros(len(values), CELLS_PER_SIDE**2, values.shape[-1])
+    return sums.scatter_add_(1, cell[..., None].expand_as(values), values)
+
+
+def residual_variance(measured: Measurements) -> Tensor:
+    """(N,) px^2 of each distance."""
+    W = measured.weight
+    square = (W * measured.distance**2).sum(dim=(1, 2)) / W.sum(dim=(1, 2)).clamp(min=1e-12)
+    return POINT_ERROR**2 + SHARED_ERROR * square
+
+
 def pose_covariance(
     measured: Measurements, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
 ) -> tuple[Tensor, Tensor]:
@@ -200,12 +216,9 @@ def pose_covariance(
     basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
     known = fraction > OBSERVABLE_FRACTION
 
-    cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
-    cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
-    g = torch.zeros(len(T), CELLS_PER_SIDE**2, 6, dtype=A.dtype)
-    g.scatter_add_(1, cell[..., None].expand(-1, -1, 6), W * measured.distance * measured.J)
-    square = (W * measured.distance**2).sum(dim=1, keepdim=True) / W.sum(dim=1, keepdim=True).clamp(min=1e-12)
-    B = g.mT @ g + (POINT_ERROR**2 + SHARED_ERROR * square) * (measured.J.mT @ (W * W * measured.J))
+    g = summed_by_cells(uv, W * measured.distance * measured.J)
+    variance = residual_variance(measured)[:, None, None]
+    B = g.mT @ g + variance * (measured.J.mT @ (W * W * measured.J))
     inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
     C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
     position = T[:, :3, :3] @ centre + T[:, :3, 3]

@@ -25,10 +25,12 @@ BOX_DISTANCE_TOLERANCE = 0.1
 
 class Limits:
     """The limits of a photograph's ``prior``, for rotations in its own camera; without a camera matrix, in one that
-    looks straight at the box. Views are allocentric, and are rotated towards the ray through the centre of the box."""
+    looks straight at the box. Views are allocentric, and are rotated towards the ray through the centre of the box,
+    which is known to ``off_centre`` degrees."""
 
-    def __init__(self, item: ImageItem, bank: ViewBank) -> None:
+    def __init__(self, item: ImageItem, bank: ViewBank, *, off_centre: float = 0.0) -> None:
         assert item.prior is not None
+        self._off_centre = off_centre
         self.prior, self._bank, self._frame = item.prior, bank, object_frame(mesh_up(bank.mesh), item.prior.front)
         self._centre = mesh_centre(bank.mesh)
         self._towards = torch.eye(3, dtype=torch.float64)
@@ -47,7 +49,7 @@ class Limits:
                 f"whose radius is {radius:.3g}; give distances in the mesh's unit"
             )
         excess = self.prior.excess(self._towards @ self._bank.rotations.cpu().double(), self._frame)
-        allowed = excess <= VIEW_SPACING + off_centre + 1e-4
+        allowed = excess <= VIEW_SPACING + self._off_centre + off_centre + 1e-4
         if not bool(allowed.any()):
             message = f"no view of the bank lies within {self.prior.to_dict()}; widen it, or leave it out"
             raise InvalidInputError(f"prior: {message}")

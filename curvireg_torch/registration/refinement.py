@@ -9,10 +9,11 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, LostObjectError
 from ..matching import Ranking
-from ..utils.checks import as_numbers, check_pose
+from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .edges import EdgeCrops
-from .inputs import MIN_BOX_SIDE, ImageItem, check_crop, image_items
+from .focal import focal_covariance
+from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .poses import (
     Poses,
     distinct_poses,
@@ -55,25 +56,28 @@ def refine(
 
     Args:
         registrar: :class:`Registrar` of the mesh.
-        images, camera_matrices: see :class:`Registrar`; the camera is needed.
+        images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that have its focal
+            length.
         poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
-        start_confidences: of the starts of each photograph, if they are known, as those of earlier results are.
+        start_confidences: probabilities in [0, 1] of the starts of each photograph, if they are known, as those of
+            earlier results are.
 
     Returns:
         For each photograph its refined poses, best first. A :class:`FailedRegistration` with :class:`LostObjectError`
         where the object is not near any start.
 
     Raises:
-        InvalidInputError: not as many cameras or starts as photographs, or a start that is not rigid and finite.
+        InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid and finite, or a
+            confidence that is no probability.
     """
-    if camera_matrices is None:
-        raise InvalidInputError("refine: needs the camera matrix of each photograph")
+    check_cameras(images, camera_matrices, "refine")
     items, starts = image_items(images, None, camera_matrices), []
     for one in poses:
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()
         starts.append(T[None] if T.ndim == 2 else T)
         check_pose(T, "poses")
     limits = [None] * len(items) if start_confidences is None else list(start_confidences)
+    limits = [None if c is None else check_probability(c, "start_confidences") for c in limits]
     if len(starts) != len(items) or len(limits) != len(items):
         raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
     return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))
@@ -113,6 +117,11 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     scores = pose_scores(evidence, exact=True)
     distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
+    if item.focal_deviation:
+        first = torch.tensor(order[:1])
+        covariance, deviation = focal_covariance(describer, crops, poses[first], item)
+        poses = replace(poses, covariance=poses.covariance.index_copy(0, first, covariance))
+        item = replace(item, focal_deviation=deviation)
     hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
@@ -128,7 +137,9 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     warnings = item.warnings + registrar.mesh_warnings
     notes = registrar.mesh_notes
     ranking = Ranking.none()
-    return Registration(hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes)
+    return Registration(
+        hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes, camera=item.camera
+    )
 
 
 def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:
@@ -138,7 +149,7 @@ def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses
     query = registrar.matcher.query([item.image], boxes.float())
     found = registrar.with_hypotheses(COMPARED).register(replace(item, box=boxes[0].float()), query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
-    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact(with_camera=True)))
+    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -28,13 +28,15 @@ from .confidence import MIN_LANDMARKS, are_near
 from .contour_fit import measure_contours
 from .detection import Detector, detect
 from .edges import EdgeCrops
+from .focal import FINISHED
 from .inputs import ImageItem, check_crop, image_items
 from .judging import Work, better_of, flat_mesh_warnings, judged
 from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
+    FINISHED_FITS,
+    SCREENING_WEIGHT,
     Poses,
     best_views,
-    close_rivals,
     common_score,
     compare_with_photograph,
     distinct_poses,
@@ -47,12 +49,13 @@ from .poses import (
     with_edge_support,
     with_quick_fit,
 )
-from .priors import Limits
 from .refinement import nearest_view, refine
+from .refits import best_inside, fitted_again
 from .result import FailedRegistration, Registration
 from .search import search
 from .several import register_views
-from .siblings import Siblings, telling_symmetries
+from .siblings import telling_symmetries, with_siblings
+from .unknown_camera import limits_of, with_fitted_focal_lengths, with_focal_deviation, with_possible_cameras
 
 __all__ = ["Registrar"]
 
@@ -60,9 +63,9 @@ MIN_REFINED = 3
 """Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on rivals. Of 15
 photographs of another object, 14 were called reliable with one hypothesis, 2 with two, none with three or five."""
 
-SCREENED_VIEWS, SCREENING_WEIGHT = 10, 20.0
-"""Number of the best distinct views of an exact mesh that get a short contour fit, and weight of the edge support that
-they reach, beside log S, in the choice of those that become hypotheses."""
+SCREENED_VIEWS = 10
+"""Number of the best distinct views of an exact mesh that get a short contour fit, which decides with their rank which
+become hypotheses."""
 
 KEPT_LANDMARKS = 0.5  # Fraction of the landmarks that agree with a start, which must agree with its fit as well
 
@@ -87,9 +90,9 @@ class Registrar:
         views, settings: custom viewpoints and bank settings, for a mesh.
         field: custom photograph filter, see :class:`ViewMatcher`.
         renderer: for views of the mesh and a bank that is built; a custom renderer knows one mesh.
-        mesh_is: "exact" for the mesh of this very object, "similar" for that of another one of its kind. It decides how
-            far fitted contours are trusted, and the probabilities of the hypotheses. Default: exact for photographs
-            with a camera matrix, similar for others.
+        mesh_is: "exact" for the mesh of this very object (None: the same), "similar" for that of another one of its
+            kind. It decides how far fitted contours are trusted, and the probabilities of the hypotheses; a focal
+            length is estimated with an exact mesh alone.
         symmetries: (S, 4, 4) of the mesh, from :func:`curvireg_torch.geometry.symmetry_transforms`; hypotheses that
             differ by one of them are reported once. Default: those of the shape of an exact mesh without colours, see
             :func:`curvireg_torch.mesh.mesh_symmetries`; ``torch.eye(4)[None]`` for none.
@@ -105,8 +108,8 @@ class Registrar:
         >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
         ...                       image_size=64, progress=False)
         >>> result = Registrar(bank)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]))[0]
-        >>> result.rotation.shape, result.translation
-        (torch.Size([3, 3]), None)
+        >>> result.rotation.shape, result.translation.shape, result.camera.source
+        (torch.Size([3, 3]), torch.Size([3]), 'estimated')
     """
 
     def __init__(
@@ -178,11 +181,12 @@ class Registrar:
         """Register a batch.
 
         Args:
-            images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays or paths, C = 1 or 3, floating in
-                [0, 1] or uint8.
+            images: (B, C, H, W) or a list of (C, H, W) tensors, (H, W, C) arrays, Pillow pictures or paths, C = 1
+                or 3 (RGB), floating in [0, 1] or uint8. Pictures and files are turned as their EXIF data say.
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
-            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these; None: rotations are
-                relative to a camera that looks at the box.
+            camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these. None: the camera of
+                the EXIF data; without, its focal length is estimated with the pose, see :mod:`.focal`, or with a
+                similar mesh, rotations are relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
             masks: B masks (H, W) of the objects, white in bool, uint8 or floating in [0, 1], paths, or None for some
                 photographs with boxes. Contours are fitted to them; without boxes they give these.
@@ -193,8 +197,7 @@ class Registrar:
             convincingly; it raises its error on access to a pose.
 
         Raises:
-            InvalidInputError: not as many boxes, cameras, priors or masks as images, or a distance limited without
-                cameras.
+            InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
         if boxes is None and masks is None:
             results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
@@ -247,9 +250,10 @@ class Registrar:
         other.pipeline = replace(self.pipeline, hypotheses=count)
         return other
 
-    def is_exact(self, *, with_camera: bool) -> bool:
+    @property
+    def is_exact(self) -> bool:
         """Whether the mesh counts as that of this very object."""
-        return self.mesh_is == "exact" if self.mesh_is else with_camera
+        return self.mesh_is != "similar"
 
     def symmetries_of(self, *, exact: bool) -> Tensor | None:
         """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are none."""
@@ -261,7 +265,7 @@ class Registrar:
     @property
     def uses_landmarks(self) -> bool:
         """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
-        return self.is_exact(with_camera=True) and self.pipeline.contours
+        return self.is_exact and self.pipeline.contours
 
     def landmark_matches(self, item: ImageItem, box: Tensor | None = None) -> LandmarkMatches | None:
         """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without colours or a camera
@@ -293,7 +297,7 @@ class Registrar:
         return Landmarks(self.describer)
 
     @cached_property
-    def _telling_symmetries(self) -> Tensor:
+    def telling_symmetries(self) -> Tensor:
         """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity alone if they are
         given, and trusted."""
         symmetries = self.symmetries_of(exact=True)
@@ -336,7 +340,7 @@ class Registrar:
         whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
-        _ = self.is_exact(with_camera=True) and self._telling_symmetries
+        _ = self.is_exact and self.telling_symmetries
 
         def run(index: int) -> Any:
             item = items[index]
@@ -352,8 +356,8 @@ class Registrar:
     def register_item(self, item: ImageItem) -> Registration:
         """Register a photograph with a box, and again if its pose asks for another box."""
         result = self._register_box(item)
-        # Without a camera matrix, poses are derived from their boxes.
-        if self.pipeline.box_jitter and self.pipeline.contours and item.camera_matrix is not None:
+        # Without a camera, poses are derived from their boxes.
+        if self.pipeline.box_jitter and self.pipeline.contours and result.camera is not None:
             box = projected_box(self.describer, result.projection)
             if item.shows_other_part(box):
                 with suppress(CurviregError):
@@ -376,27 +380,32 @@ class Registrar:
             query: the same, cropped and described by the matcher.
         """
         work = self._rank(item, query)
+        if work.exact and item.camera_matrix is None:
+            work = with_possible_cameras(self, work)
         if self.pipeline.search:
             return self._searched(work)
-        starts, outside, by_landmarks = self._starts(work)
+        starts, outside, repeated = self._starts(work)
         poses = starts
         if work.crops is not None:
             self.report_progress("contours")
             unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
             if len(unknown):
                 poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
-            poses = self._fitted(work, work.crops, poses, quick=poses.quick)
-        features = self._features(work, poses)
+            finish = FINISHED_FITS if work.starts is None else FINISHED
+            poses = self.fitted(work, work.crops, poses, quick=poses.quick, finish=finish)
+        features = self.features_of(work, poses)
         sibling: tuple[Poses, Tensor] | None = None
         if work.crops is not None and work.exact:
-            poses, features = self._fitted_again(work, work.crops, poses, features, outside)
-            poses, features, sibling = self._with_siblings(work, work.crops, poses, features, outside)
+            if work.item.focal_deviation:
+                poses, features = with_fitted_focal_lengths(self, work, work.crops, poses, features, outside)
+            poses, features = fitted_again(self, work, work.crops, poses, features, outside)
+            poses, features, sibling = with_siblings(self, work, work.crops, poses, features, outside)
             poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
         distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
-        # Unlike a view, a pose of landmarks starts near the one that it merged with: it is no rival.
-        other = (distinct | ~by_landmarks).nonzero()[:, 0]
+        # Unlike another view, these started near the pose that they merged with: they are no rivals.
+        other = (distinct | ~repeated).nonzero()[:, 0]
         starts, poses, features = starts[other], poses[other], features[other]
         distinct, outside = distinct[other], outside[other]
         keep = self._kept(work, poses, distinct, outside)
@@ -407,7 +416,9 @@ class Registrar:
             if work.crops is not None:
                 restored = with_edge_support(self.describer, work.crops, restored)
             poses = poses.replaced(back, restored)
-            features = features.index_copy(0, back, self._features(work, restored))
+            features = features.index_copy(0, back, self.features_of(work, restored))
+        if work.crops is not None and work.item.focal_deviation:
+            work, poses = with_focal_deviation(self, work, work.crops, poses, features, outside)
         if sibling is not None:
             poses, features = Poses.cat([poses, sibling[0]]), torch.cat([features, sibling[1]])
             distinct, outside = F.pad(distinct, (0, 1), value=True), F.pad(outside, (0, 1))
@@ -415,9 +426,9 @@ class Registrar:
 
     def _rank(self, item: ImageItem, query: QueryFeatures) -> Work:
         self.report_progress("ranking")
-        limits = None if item.prior is None else Limits(item, self.bank)
+        exact = self.is_exact
+        limits = None if item.prior is None else limits_of(self, item)
         ranking = self.matcher.rank(query, None if limits is None else limits.allowed()[None])
-        exact = self.is_exact(with_camera=item.camera_matrix is not None)
         symmetries = self.symmetries_of(exact=exact)
         crops = None
         if self.pipeline.contours:
@@ -429,35 +440,45 @@ class Registrar:
 
     def _starts(self, work: Work) -> tuple[Poses, Tensor, Tensor]:
         """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits, the last one at
-        most, and which landmarks agree on, in place of the views near it.
+        most, and which repeats another one: the same view with another camera, or a pose that landmarks agree on, in
+        place of the views near it.
 
         That outside is the best view there; it is never reported, and tells whether the limits are wrong.
         """
-        count = max(MIN_REFINED, self.pipeline.hypotheses)
-        screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
-        view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
-        poses = self._of_views(work, view, rank)
-        if work.limits is not None:
-            poses = work.limits.moved_inside(poses)
-        if work.crops is not None and len(poses) > count:
-            poses = self._screened(work.crops, poses, count)
-        by_landmarks = torch.zeros(len(poses), dtype=torch.bool)
+        poses = self._promising(work) if work.starts is None else work.starts
+        repeated = _are_repeated(poses.view)
         if work.crops is not None and work.exact:
             found, _ = self.landmark_poses(work.landmarks)
             found = found if work.limits is None else found[work.limits.keeps(found)]
             if len(found):
-                poses = poses[~are_near(poses.rotation, found.rotation[0], work.symmetries)]
-                poses = Poses.cat([poses, found[torch.tensor([0])]])
-                by_landmarks = torch.arange(len(poses)) == len(poses) - 1
-        outside = torch.zeros_like(by_landmarks)
+                far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)
+                poses = Poses.cat([poses[far], found[torch.tensor([0])]])
+                repeated = F.pad(repeated[far], (0, 1), value=True)
+        outside = torch.zeros_like(repeated)
         if work.limits is None:
-            return poses, outside, by_landmarks
+            return poses, outside, repeated
         assert work.ranking.outside is not None
         view = work.ranking.outside.cpu()
         if int(view) < 0:
-            return poses, outside, by_landmarks
-        other = self._of_views(work, view, torch.zeros(1, dtype=torch.float64))
-        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(by_landmarks, (0, 1))
+            return poses, outside, repeated
+        other = self.poses_of_views(work, view, torch.zeros(1, dtype=torch.float64))
+        return Poses.cat([poses, other]), F.pad(outside, (0, 1), value=True), F.pad(repeated, (0, 1))
+
+    @property
+    def least_starts(self) -> int:
+        return max(MIN_REFINED, self.pipeline.hypotheses)
+
+    def _promising(self, work: Work) -> Poses:
+        """Poses of the most promising distinct views."""
+        count = self.least_starts
+        screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
+        view, rank = best_views(work.ranking, self.bank, count=screened, symmetries=work.symmetries)
+        poses = self.poses_of_views(work, view, rank)
+        if work.limits is not None:
+            poses = work.limits.moved_inside(poses)
+        if work.crops is not None and len(poses) > count:
+            poses = self._screened(work.crops, poses, count)
+        return poses
 
     def _searched(self, work: Work) -> Registration:
         """The result of the paper's search, and further distinct views of the ranking, in its order."""
@@ -465,11 +486,12 @@ class Registrar:
         view, rank = best_views(work.ranking, self.bank, count=self.pipeline.hypotheses, symmetries=work.symmetries)
         rotation, distance = search(self.matcher, work.query, work.ranking)
         found = self._in_box(work, rotation[None], distance[None], view[:1], rank[:1])
-        poses = self._of_views(work, view, rank).replaced(torch.tensor([0]), found)
+        poses = self.poses_of_views(work, view, rank).replaced(torch.tensor([0]), found)
         if work.limits is not None:
             poses = work.limits.moved_inside(poses)
         distinct = torch.ones(len(poses), dtype=torch.bool)
-        return judged(self, replace(work, exact=False), poses, self._features(work, poses), distinct, ~distinct)
+        by_rank = replace(work, exact=False)
+        return judged(self, by_rank, poses, self.features_of(work, poses), distinct, ~distinct)
 
     def _screened(self, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
         """The ``count`` poses with the largest sum of rank and weighted edge support after a short fit, best first."""
@@ -477,7 +499,7 @@ class Registrar:
         score = poses.rank + SCREENING_WEIGHT * support
         return poses[score.argsort(descending=True, stable=True)[:count]]
 
-    def _of_views(self, work: Work, view: Tensor, rank: Tensor) -> Poses:
+    def poses_of_views(self, work: Work, view: Tensor, rank: Tensor) -> Poses:
         return self._in_box(work, self.bank.rotations.cpu()[view].double(), self.bank.distances.cpu()[view], view, rank)
 
     def _in_box(self, work: Work, *poses: Tensor) -> Poses:
@@ -495,18 +517,21 @@ class Registrar:
             return None
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
-    def _features(self, work: Work, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES`."""
+    def features_of(self, work: Work, poses: Poses) -> Tensor:
+        """(H, F) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
-        landmarks = None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T))
+        landmarks = (
+            None if work.landmarks is None else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
+        )
         return pose_features(poses, similarity, appearance, landmarks)
 
-    def _fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
+    def fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
         poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
-            before, after = work.landmarks.agreeing(starts.T), work.landmarks.agreeing(poses.T)
+            before = work.landmarks.agreeing(starts.T, starts.cameras)
+            after = work.landmarks.agreeing(poses.T, poses.cameras)
             left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
             if len(left):
                 kept = starts[left]
@@ -514,72 +539,17 @@ class Registrar:
                 poses = poses.replaced(left, kept.with_fit(seen, self.describer.centre))
         return poses
 
-    def _fitted_again(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-    ) -> tuple[Poses, Tensor]:
-        """Fit the best pose again from where it is, then its close rivals: fits that differ in effort cannot be
-        compared. Results with a higher score are kept."""
-        best = _best_inside(features, outside)
-        poses, features = self._refitted(work, crops, poses, features, best)
-        scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
-        rivals = close_rivals(poses, scores, work.symmetries)
-        return self._refitted(work, crops, poses, features, rivals) if len(rivals) else (poses, features)
-
-    def _refitted(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
-    ) -> tuple[Poses, Tensor]:
-        """Fit poses again, and keep the results that have a higher score."""
-        fitted = self._fitted(work, crops, poses[index], again=True)
-        moved = (poses.T[index] != fitted.T).flatten(1).any(dim=1)
-        if not bool(moved.any()):
-            return poses, features
-        new = self._features(work, fitted)
-        better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
-        for k in better.nonzero()[:, 0].tolist():
-            one = torch.tensor([k])
-            poses, features = self._replaced(work, poses, features, index[one], fitted[one], new[one])
-        return poses, features
-
-    def _with_siblings(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-    ) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
-        """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
-        strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
-        symmetries = self._telling_symmetries
-        if len(symmetries) == 1:
-            return poses, features, None
-        best = _best_inside(features, outside)
-        measure = partial(self._measured, work, crops)
-        siblings = Siblings.of(poses[best], symmetries, self.describer, measure)
-        kept = siblings.best()
-        if kept:
-            fitted = self._fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
-            new = self._features(work, fitted)
-            better = bool(pose_scores(new, exact=True) > pose_scores(features[best], exact=True))
-            if better:
-                poses, features = self._replaced(work, poses, features, best, fitted, new)
-            else:
-                kept = 0
-        rival = siblings.rival(kept, features[best])
-        if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
-            rival = None
-        return poses, features, rival
-
-    def _measured(self, work: Work, crops: EdgeCrops, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES` of poses that are not fitted."""
-        return self._features(work, with_edge_support(self.describer, crops, poses))
-
     def _with_texture(
         self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose to the mesh's colours as well."""
-        best = _best_inside(features, outside)
+        best = best_inside(features, outside)
         fitted = fit_texture_of(self.describer, crops, poses, int(best))
         if fitted is None:
             return poses, features
-        return self._replaced(work, poses, features, best, fitted, self._features(work, fitted))
+        return self.replaced(work, poses, features, best, fitted, self.features_of(work, fitted))
 
-    def _replaced(
+    def replaced(
         self, work: Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
     ) -> tuple[Poses, Tensor]:
         """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds the limits."""
@@ -596,6 +566,7 @@ class Registrar:
         return kept if work.limits is None else kept & (work.limits.keeps(poses) | outside)
 
 
-def _best_inside(features: Tensor, outside: Tensor) -> Tensor:
-    """(1,) index of the best pose that is not outside the limits."""
-    return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+def _are_repeated(views: Tensor) -> Tensor:
+    """(H,) bool: whether a view (H,) is among those before it."""
+    equal = views == views[:, None]
+    return equal.tril(diagonal=-1).any(dim=1)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior, object_frame
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
@@ -32,17 +33,18 @@ RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which anot
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
 MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
 STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
+WEAK_PERSPECTIVE = 0.15  # Deviation of an estimated focal length, as a fraction, from which it is hardly measured
 SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
-    "translation": "in the mesh file's unit; null without a camera",
+    "translation": "in the mesh file's unit; null with a similar mesh and no camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
     "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
     "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose is a guess",
     "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
-    "t_true = t + e; errors of the camera matrix are not in it",
+    "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
 }
 
 
@@ -186,6 +188,8 @@ class Registration:
         warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
         notes: what the mesh lacks, as its textures, or what was left out of it, in words; reliable all the same.
         model: number of the mesh, of several.
+        camera: of the photograph without its distortion; its ``source`` tells whether it was given, and
+            ``focal_deviation`` how well its focal length is known. None without a camera, and of several photographs.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
             ``T_world_from_model``, along the world's axes.
     """
@@ -201,6 +205,7 @@ class Registration:
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     model: int = 0
+    camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
 
     ok = True
@@ -239,7 +244,7 @@ class Registration:
         the contours determine at least one axis of rotation; if False, the pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
-        if self.confidence is None or self.confidence < RELIABLE or doubtful:
+        if self.confidence is None or not self.confidence >= RELIABLE or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
@@ -259,7 +264,7 @@ class Registration:
 
     def __repr__(self) -> str:
         """At most ten lines."""
-        confidence = "not calibrated" if self.confidence is None else f"{self.confidence:.2f}"
+        confidence = "not calibrated" if self.confidence is None else two_decimals(self.confidence)
         rows = [", ".join(f"{v:8.4f}" for v in row) for row in self.rotation.tolist()]
         t = None if self.translation is None else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
         lines = [
@@ -304,6 +309,8 @@ class Registration:
             and {"rotation_deg": _finite(deviations[0]), "translation": _finite(deviations[1])},
             "covariance": _plain(self.covariance),
             "corrected_box": _plain(self.corrected_box),
+            "camera": self.camera and self.camera.describe(),
+            "camera_source": self.camera and self.camera.source,
             "top": [],
         }
         for one in self.hypotheses:
@@ -361,7 +368,7 @@ def result_document(result: Registration, registrar: "Registrar", seconds: Mappi
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
     registrar = registrar.of_model(result.model)
     bank = registrar.bank
-    symmetries = registrar.symmetries_of(exact=registrar.is_exact(with_camera=result.translation is not None))
+    symmetries = registrar.symmetries_of(exact=registrar.is_exact)
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
@@ -397,6 +404,16 @@ def places_document(detection: Detection) -> dict[str, Any]:
     return {"score": detection.score, "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs]}
 
 
+def two_decimals(probability: float) -> str:
+    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
+
+    Example:
+        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
+        ('0.89', '0.29', '1.00')
+    """
+    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"
+
+
 def corners(box: Sequence[float]) -> str:
     """A box in whole px, as ``--box`` takes it."""
     return " ".join(f"{v:.0f}" for v in box)
@@ -413,6 +430,23 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
     if (count := document.get("symmetries", 1)) > 1:
         lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
     return lines
+
+
+def camera_in_words(document: Mapping[str, Any]) -> list[str]:
+    """A line about a camera that was not given exactly: where it is from, and how well its focal length is known."""
+    camera = document["camera"]
+    if camera is None or not camera["focal_deviation"]:
+        return []
+    picture = document["inputs"]["picture"]
+    widths = camera["matrix"][0][0] / picture["width"]
+    deviation = 100.0 * camera["focal_deviation"]
+    if camera["source"] == "exif":
+        return [f"camera: from the file's EXIF, {picture['focal_35mm']:g} mm"]
+    known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
+    if camera["source"] == "given":
+        return [f"camera: field of view given, focal length {known}"]
+    weak = ", as perspective is too weak to measure it" if camera["focal_deviation"] > WEAK_PERSPECTIVE else ""
+    return [f"camera: focal length estimated, {known}{weak}"]
 
 
 def view_in_words(view: Mapping[str, Any]) -> str:

@@ -6,7 +6,6 @@ import math
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from curvireg_torch import Camera, camera_matrix
 from curvireg_torch.cli import main
@@ -37,7 +36,7 @@ def register(folder, capsys):
     return run
 
 
-def test_guessed_cameras_give_a_translation_without_covariance(register):
+def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_the_focal_length(register):
     known, _ = register("photos/0.png", "--camera", *CAMERA)
     assert known["inputs"]["camera_source"] == "given"
     assert known["covariance"] is not None
@@ -45,13 +44,35 @@ def test_guessed_cameras_give_a_translation_without_covariance(register):
     focal = 38 / math.hypot(36, 24) * math.hypot(240, 180)
     assert guessed["inputs"]["camera"] == pytest.approx([focal, focal, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "exif"
-    assert guessed["covariance"] is guessed["standard_deviations"] is None
-    assert f"camera guessed, focal length {focal:.0f} px" in printed
+    assert (guessed["camera_source"], known["camera_source"]) == ("exif", "given")
+    assert guessed["standard_deviations"]["translation"][2] > known["standard_deviations"]["translation"][2]
+    assert 0.0 < guessed["camera"]["focal_deviation"] <= 0.05
+    assert guessed["camera"]["matrix"][0][0] == pytest.approx(focal, rel=0.2)
+    assert "camera: from the file's EXIF, 38 mm" in printed
+    unasked, _ = register("exif.png")
+    assert (unasked["camera"], unasked["translation"]) == (guessed["camera"], guessed["translation"])
     check_pose(guessed, scene(0)[2], 15.0, 0.1)
-    guessed, _ = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))  # horizontal
+    guessed, printed = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))  # horizontal
     assert guessed["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "fov"
-    torch.testing.assert_close(torch.tensor(guessed["rotation"]), torch.tensor(known["rotation"]), atol=1e-3, rtol=0)
+    assert "camera: field of view given, focal length 1." in printed
+    check_pose(guessed, scene(0)[2], 3.0, 0.1)
+
+
+def test_without_a_camera_the_focal_length_is_estimated(register):
+    found, printed = register("photos/0.png")
+    assert (found["camera_source"], found["inputs"]["camera_source"], found["inputs"]["camera"]) == (
+        "estimated",
+        None,
+        None,
+    )
+    assert len(found["translation"]) == 3
+    camera = found["camera"]
+    assert found["camera"]["matrix"][0][0] == pytest.approx(260.0, rel=3 * camera["focal_deviation"])
+    assert "camera: focal length estimated" in printed
+    assert "the distance is proportional to it" in printed
+    similar, _ = register("photos/0.png", "--mesh-is", "similar")
+    assert similar["translation"] is similar["camera"] is similar["camera_source"] is None
 
 
 def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
@@ -59,7 +80,7 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     path = written(folder / "cameras.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *[[*row, *box_of(0)] for row in rows])
     words = ["register", "--list", str(path), str(folder / "truck.safetensors"), "--quiet", "--no-refine"]
     assert main([*words, "--out", str(tmp_path), "--camera", "exif"]) == 0
-    assert "guessed" in capsys.readouterr().err
+    capsys.readouterr()
     known, guessed, failed = lines(tmp_path)
     assert [line["inputs"]["camera_source"] for line in (known, guessed)] == ["given", "exif"]
     assert guessed["translation"] is not None

@@ -37,9 +37,9 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
     assert "0.png: detecting the object" in capsys.readouterr().err
-    assert register_one("--no-refine", box=()) == 0
+    assert register_one("--no-refine", "--mesh-is", "similar", box=()) == 0
     assert capsys.readouterr().err == ""
-    keys = ("translation", "covariance", "standard_deviations")
+    keys = ("translation", "covariance", "standard_deviations", "camera", "camera_source")
     assert {document()[key] for key in keys} == {None}
     assert document()["pipeline"]["contours"] is False
 

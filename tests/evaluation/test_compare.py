@@ -89,6 +89,8 @@ def test_average_recalls_of_bop_are_compared_by_object(tmp_path):
 def test_objects_of_unknown_pose_do_not_count(tmp_path):
     first = write_run(tmp_path / "a", {"0": 5, "1": ""}, "web", ("error_deg",))
     assert {each.n for each in compare(read_run(first), read_run(first))} == {1}
+    second = write_run(tmp_path / "c", {"0": "", "1": 5}, "web", ("error_deg",))
+    assert {each.n for each in compare(read_run(first), read_run(second))} == {0}
     unknown = read_run(write_run(tmp_path / "b", {"0": ""}, "web", ("error_deg",)))
     (each, *_) = compare(unknown, unknown)
     assert (each.n, math.isnan(each.a)) == (0, True)

@@ -98,12 +98,17 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
 FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 
 
-@pytest.mark.parametrize(("camera", "source"), [(CAMERA, "given"), *FILES, (50.0, "fov"), ("exif",) * 2, (None, None)])
+@pytest.mark.parametrize(
+    ("camera", "source"), [(CAMERA, "given"), *FILES, (50.0, "fov"), ("exif",) * 2, (None, "exif")]
+)
 def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     photo = read_photo(entry.photo)
+    assert photograph.camera_of(replace(entry, camera=None), photo) == (None, None), "without EXIF data"
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
     found, name = photograph.camera_of(replace(entry, camera=camera), photo)
-    assert (name, found is None) == (source, source is None)
+    assert (name, found.source) == (source, "exif" if source == "exif" else "given")
+    stored = replace(entry, camera=None, as_stored=True)
+    assert photograph.camera_of(stored, photo) == (None, None), "of a dataset"
 
 
 def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):

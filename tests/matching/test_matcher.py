@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sample_views
 from curvireg_torch.matching import distinct_views
-from curvireg_torch.terms import Correlation, Repeatability
+from curvireg_torch.terms import Appearance, Correlation, Repeatability
 from tests._support.scenes import scene
 
 
@@ -120,3 +121,39 @@ def test_views_exactly_as_far_apart_as_the_angle_count_as_one():
     assert len(distinct_views(order, views.rotations, count=99, angle=9.99)) == len(views)
     assert len(distinct_views(order, views.rotations, count=99, angle=360.0)) == 1
     assert len(distinct_views(order, views.rotations.bfloat16(), count=9, angle=20.0)) == 9
+
+
+def test_the_best_view_outside_the_limits_is_more_than_30_degrees_away(bank, matcher):
+    """For each view that alone is allowed, against a loop over all others."""
+    images, boxes = batch(0)
+    query = matcher.query(images, boxes)
+    scores = matcher.rank(query).scores[0]
+    angles = rotation_error(bank.rotations[:, None].double(), bank.rotations.double())
+    distances = []
+    for view in range(len(bank)):
+        allowed = torch.zeros(1, len(bank), dtype=torch.bool)
+        allowed[0, view] = True
+        ranking = matcher.rank(query, allowed)
+        assert ranking.order[0, 0] == view
+        outside = int(ranking.outside[0])
+        far = angles[view] > 30.0 + 1e-3  # views of the bank are exactly 30 degrees apart
+        assert scores[outside] == scores[far].max()
+        distances.append(float(angles[view, outside]))
+    assert min(distances) < 40.0
+
+
+def test_appearance_is_compared_with_the_views_that_were_compared(small_bank):
+    """Views without a raw score are no views of score 0."""
+    matcher = ViewMatcher(small_bank)
+    compared = torch.tensor([0.20, 0.30])
+    appearance = Mock(term=matcher._appearance.term)
+    appearance.compare.return_value = torch.tensor([[0.35, 0.25]])
+    matcher.__dict__["_modules"]["_appearance"] = appearance
+    pictures = torch.zeros(2, 1, 8, 8)
+    for raw in (compared, torch.tensor([torch.nan, 0.20, torch.nan, torch.nan, 0.30])):
+        ranking = SimpleNamespace(terms={Appearance.name: raw[None]})
+        scores = matcher.appearance_score(SimpleNamespace(), ranking, pictures)
+        for score, mine in zip(scores.tolist(), (0.35, 0.25), strict=True):
+            values = torch.cat([compared.double(), torch.tensor([mine], dtype=torch.float64)])
+            expected = (mine - 0.30) / float(values.std(correction=0))
+            assert score == pytest.approx(expected, rel=1e-5)

@@ -1,4 +1,4 @@
-"""A STEP file of a box, as CAD programs write it, in several units."""
+"""STEP files of a box and IGES files of a rectangle, as CAD programs write them, in several units."""
 
 from collections.abc import Sequence
 
@@ -91,3 +91,27 @@ def step_file(size: Sequence[float], unit: str) -> str:
     head += "FILE_NAME('part','2026-01-01T00:00:00',(''),(''),'','','');\n"
     head += "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
     return head + "\n".join(w.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n"
+
+
+def iges_file(size: Sequence[float], flag: int, name: str) -> str:
+    """The text of a rectangle at the origin: a ruled surface between two lines. ``flag`` is that of the unit."""
+    parameters = [
+        f"110,0.,0.,0.,{size[0]!r},0.,0.;",
+        f"110,0.,{size[1]!r},0.,{size[0]!r},{size[1]!r},0.;",
+        "118,1,3,0,0;",
+    ]
+    forms = [0, 0, 1]
+    whole = "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,"
+    whole += f"{flag},{len(name)}H{name},1,0.01,15H20260101.000000,1E-6,10.,1Ha,1Hb,11,0,15H20260101.000000;"
+    head = [whole[k : k + 72] for k in range(0, len(whole), 72)]
+    lines = [f"{'part':<72}S{1:7d}", *(f"{text:<72}G{k + 1:7d}" for k, text in enumerate(head))]
+    for k, text in enumerate(parameters):
+        kind = int(text.partition(",")[0])
+        first = (kind, k + 1, 0, 0, 0, 0, 0, 0, "00000000")
+        second = (kind, 0, 0, 1, forms[k], "", "", "", 0)
+        for number, row in ((2 * k + 1, first), (2 * k + 2, second)):
+            lines.append("".join(f"{value:>8}" for value in row) + f"D{number:7d}")
+    lines += [f"{text:<64}{2 * k + 1:8d}P{k + 1:7d}" for k, text in enumerate(parameters)]
+    count = len(parameters)
+    lines.append(f"S{1:7d}G{len(head):7d}D{2 * count:7d}P{count:7d}{'':40}T{1:7d}")
+    return "\n".join(lines) + "\n"

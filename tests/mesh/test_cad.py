@@ -18,7 +18,7 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
 from curvireg_torch.mesh import cad, has_colours, mesh_up, surface_colours
 from curvireg_torch.mesh.files import mesh_files
-from tests.mesh.step import step_file
+from tests.mesh.step import iges_file, step_file
 
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
@@ -39,6 +39,15 @@ def test_step_files_keep_their_unit_and_axes(tmp_path: Path, load: Load, unit: s
     assert mesh.volume == pytest.approx(6.0, rel=1e-6)
     with pytest.raises(MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"):
         cr.load_mesh(path, unit="dm")
+
+
+@needs("cascadio")
+@pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
+def test_iges_files_keep_their_unit(tmp_path: Path, load: Load, flag: int, name: str, unit: str) -> None:
+    (tmp_path / "part.igs").write_text(iges_file((3.0, 2.0), flag, name))
+    mesh, _ = load(tmp_path / "part.igs")
+    assert mesh.units == unit
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 0]], atol=1e-5)
 
 
 @needs("cascadio")

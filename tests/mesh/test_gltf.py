@@ -3,6 +3,7 @@
 import base64
 import json
 import math
+import time
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -221,4 +222,28 @@ def test_damaged_trees_are_refused(tmp_path: Path, change: dict[str, Any]) -> No
     part["attributes"] |= {"JOINTS_0": tree.array([[9] * 4] * 8, "B"), "WEIGHTS_0": tree.array([[1, 0, 0, 0]] * 8)}
     tree.content |= {"nodes": [{"mesh": 0, "skin": 0}], "materials": [{}], "skins": [{"joints": [0]}], **change}
     with pytest.raises(MeshError, match="cannot be read as a mesh"):
+        cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+
+
+def test_parts_share_a_view_without_copies(tmp_path: Path, load: Load) -> None:
+    """A thousand accessors of one view of 20 MB, and too many nodes."""
+    tree = Tree()
+    tree.part(None, np.zeros((9, 3)))
+    tree.data += bytes(20_000_000)
+    tree.content["bufferViews"][0]["byteLength"] = len(tree.data)
+    tree.content["accessors"] *= 1000
+    tree.content["accessors"] = [{**one, "byteOffset": 36} for one in tree.content["accessors"]]
+    tree.content["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"})
+    primitives = [{"attributes": {"POSITION": k}} for k in range(1000)]
+    tree.content["meshes"][0]["primitives"] = primitives
+    for one in tree.content["accessors"]:
+        one["count"] = 3
+    corners = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0]], np.float32).tobytes()
+    tree.data = bytes(36) + corners + tree.data[36 + len(corners) :]
+    path = tree.write(tmp_path / "a.gltf")
+    start = time.process_time()
+    assert len(load(path)[0].faces) == 1000
+    assert time.process_time() - start < 3.0
+    tree.content["nodes"] += [{}] * 100_001
+    with pytest.raises(MeshError, match="more than 100,000 nodes"):
         cr.load_mesh(tree.write(tmp_path / "a.gltf"))

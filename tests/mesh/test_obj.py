@@ -1,5 +1,6 @@
 """OBJ files as people have them."""
 
+import argparse
 import time
 import warnings
 from collections.abc import Callable
@@ -12,8 +13,9 @@ import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
-from curvireg_torch.errors import MeshError
-from curvireg_torch.mesh import has_colours, surface_colours
+from curvireg_torch.cli.options import MESH, add_options, register_options
+from curvireg_torch.errors import MeshError, MissingFileError
+from curvireg_torch.mesh import has_colours, mesh_symmetries, surface_colours
 
 POINTS = "".join(f"v {x} {y} {z}\n" for x in (0, 3) for y in (0, 2) for z in (0, 1))
 UV = "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
@@ -228,3 +230,37 @@ def test_an_obj_of_many_parts_is_refused(tmp_path: Path) -> None:
         path.write_text(POINTS + "".join(f"{key} p{k}\nf 1 2 3\n" for k in range(10_001)))
         with pytest.raises(MeshError, match="more than 10,000 parts; join them"):
             cr.load_mesh(path)
+
+
+def test_a_can_with_one_plain_material_is_grey(tmp_path: Path, load: Load) -> None:
+    """Texture coordinates without a material, a missing library, and one colour: no print, and all its symmetries."""
+    can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
+    points = "".join(f"v {x} {y} {z}\n" for x, y, z in can.vertices)
+    faces = "".join(f"f {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for a, b, c in can.faces)
+    (tmp_path / "kd.mtl").write_text("newmtl steel\nKd 0.6 0.6 0.6\n")
+    (tmp_path / "two.mtl").write_text("newmtl steel\nKd 0.6 0.6 0.6\nnewmtl chrome\nKd 0.61 0.6 0.6\n")
+    for head in ("", "mtllib lost.mtl\n", "mtllib kd.mtl\n", "mtllib two.mtl\n"):
+        half = len(faces.splitlines()) // 2
+        rows = faces.splitlines(keepends=True)
+        names = ("steel", "chrome" if "two" in head else "steel")
+        body = f"usemtl {names[0]}\n{''.join(rows[:half])}usemtl {names[1]}\n{''.join(rows[half:])}"
+        (tmp_path / "can.obj").write_text(f"{head}{points}{UV}{body}")
+        mesh, texts = load(tmp_path / "can.obj", unit="mm")
+        assert not has_colours(mesh)
+        assert len(mesh_symmetries(mesh)) == 72
+        assert [("lost.mtl is missing" in text) for text in texts] == ["lost" in head] * ("lost" in head)
+
+
+def test_options_of_the_command_line_reach_the_reader(tmp_path: Path) -> None:
+    picture(tmp_path / "images" / "label.png")
+    path = write(tmp_path / "models", "newmtl label\nmap_Kd ../images/label.png\n")
+    parser = argparse.ArgumentParser()
+    add_options(parser, *MESH)
+    arguments = parser.parse_args(["--textures", str(tmp_path / "images"), "--unit", "m"])
+    mesh = register_options(arguments).load_mesh(path)
+    assert has_colours(mesh)
+    arguments = parser.parse_args(["--link", "tip"])
+    with pytest.raises(MeshError, match="only a URDF has links"):
+        register_options(arguments).load_mesh(path)
+    with pytest.raises(MissingFileError, match="no such folder; check the folder of the textures"):
+        cr.load_mesh(path, textures=tmp_path / "nowhere")

@@ -1,5 +1,6 @@
 """PLY files as scanners write them."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -127,3 +128,30 @@ def test_damaged_files_are_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.ply").write_text(content)
     with pytest.raises(MeshError, match=r"a\.ply"):
         cr.load_mesh(tmp_path / "a.ply")
+
+
+def test_headers_of_many_columns_are_refused(tmp_path: Path) -> None:
+    columns = "".join(f"property list uchar float a{k}\n" for k in range(501))
+    (tmp_path / "a.ply").write_text(header(columns, "", kind="binary_little_endian"))
+    with pytest.raises(MeshError, match="more than 500 kinds of rows or columns"):
+        cr.load_mesh(tmp_path / "a.ply")
+
+
+HOSTILE = {
+    "comments": lambda n: header("", "", comments="comment\n" * n) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
+    "blanks": lambda n: header("", "", comments=f"comment{' ' * 20 * n}x\n") + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
+    "textures": lambda n: header("", "", comments="comment TextureFile a.png\n" * n) + rows([""] * 4) + "3 0 1 2\n" * 2,
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_time_grows_with_the_size(tmp_path: Path, load: Load, kind: str) -> None:
+    def seconds(n: int) -> float:
+        (tmp_path / "a.ply").write_text(HOSTILE[kind](n))
+        start = time.process_time()
+        load(tmp_path / "a.ply")
+        return time.process_time() - start
+
+    seconds(100)
+    small = min(seconds(5_000) for _ in range(2))
+    assert seconds(20_000) < max(9.0 * small, 0.3)

@@ -1,6 +1,7 @@
 """STL files as people have them."""
 
 import struct
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -109,3 +110,25 @@ def test_damaged_files_are_refused(tmp_path: Path, content: bytes, match: str) -
     (tmp_path / "a.stl").write_bytes(content)
     with pytest.raises(MeshError, match=match):
         cr.load_mesh(tmp_path / "a.stl")
+
+
+HOSTILE = {
+    "vertex": lambda n: "solid a\n" + "vertex" + " " * 20 * n + "\n",
+    "blanks": lambda n: "solid a\n" + " " * 20 * n + "x\n",
+    "lines": lambda n: "solid a\n" + " \n" * 20 * n,
+    "end": lambda n: "solid a\n" + "end " * 10 * n + "\n",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
+    def seconds(n: int) -> float:
+        (tmp_path / "a.stl").write_text(HOSTILE[kind](n))
+        start = time.process_time()
+        with pytest.raises(MeshError):
+            cr.load_mesh(tmp_path / "a.stl")
+        return time.process_time() - start
+
+    seconds(100)
+    small = min(seconds(5_000) for _ in range(2))
+    assert seconds(20_000) < max(9.0 * small, 0.3)

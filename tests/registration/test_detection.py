@@ -160,14 +160,15 @@ def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch,
         assert len(result.error.with_subject("photo.jpg").detection.boxes) > 1
         assert isinstance(result.error, LostObjectError)
         place = corners(one.box.tolist())
-        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.10; give a box"
+        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.09; give a box"
         assert str(result.error) == f"image 0: not found: {message}"
 
 
 def test_bad_distances_raise(registrar, found):
+    similar = cr.Registrar(bank(), mesh_is="similar")
     for boxes in (None, [[4.0, 4.0, 40.0, 40.0]]):
-        with pytest.raises(InvalidInputError, match="distance: needs the camera"):
-            registrar([found[0]], boxes, prior=cr.PosePrior(distance=(1.0, 2.0)))
+        (result,) = similar([found[0]], boxes, prior=cr.PosePrior(distance=(1.0, 2.0)))
+        assert "distance: with a similar mesh, needs the camera" in str(result.error)
     near, far = cr.PosePrior(distance=(1e-3, 2e-3)), cr.PosePrior(distance=(500.0, 900.0))
     for boxes, prior, message in (
         (None, far, "nothing of such a size fits"),
@@ -191,9 +192,10 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registra
     assert box_iou(result.detection.box[None], box[None].double()) > 0.5
 
 
-def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found):
+def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found, monkeypatch):
     image, azimuth = found[0], 200.0
     prior = PosePrior(azimuth=(azimuth - 20, azimuth + 20))
+    monkeypatch.setattr(registrar, "mesh_is", "similar")
     result = registrar([image], prior=prior)[0]
     allowed = _allowed_views(registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior))
     assert sorted(viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()) == [180.0, 210.0]
@@ -212,7 +214,10 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     degrees = rotation_error(bank().rotations, bank().rotations[0])
     half = math.degrees(math.atan(150 / 260))
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
-    assert torch.equal(_allowed_views(registrar, replace(item, camera_matrix=None)), degrees <= 8.5)
+    unknown = replace(item, camera_matrix=None)
+    assert torch.equal(_allowed_views(cr.Registrar(bank(), mesh_is="similar"), unknown), degrees <= 8.5)
+    usual = math.degrees(math.atan(150 / 240))
+    assert torch.equal(_allowed_views(registrar, unknown), degrees <= 8.5 + usual), "an unknown camera is a usual one"
 
 
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)])

@@ -14,7 +14,7 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, contour_fit
+from curvireg_torch.registration import FailedRegistration, Follower, contour_fit, refits
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
@@ -111,16 +111,16 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, 3))
+    features = F.pad(similarity[:, None], (1, 4))
     outside = torch.tensor([False, False, True, False])
-    assert registrar_module._best_inside(features, outside).tolist() == [1]
+    assert refits.best_inside(features, outside).tolist() == [1]
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
 def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monkeypatch, shift, calls):
     """The descriptions: of all poses, of the one that is fitted again if it moves, and of those that merged."""
     registrar, quick_fit, fits, described = truck_registrar(), contour_fit.quick_fit, [], []
-    features_of = type(registrar)._features
+    features_of = type(registrar).features_of
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
@@ -132,7 +132,7 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monke
 
     for module in (contour_fit, poses_module):
         monkeypatch.setattr(module, "quick_fit", counted)
-    monkeypatch.setattr(type(registrar), "_features", features)
+    monkeypatch.setattr(type(registrar), "features_of", features)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
     assert fits == [registrar_module.SCREENED_VIEWS, 1]
@@ -226,7 +226,8 @@ def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
     assert result.reliable == (limit == 0.0)
     assert (result.covariance is not None) == (result.standard_deviations is not None) == (limit == 0.0)
-    assert registrar([IMAGE], BOX[None])[0].covariance is None
+    similar = Registrar(registrar.bank, mesh_is="similar")
+    assert similar([IMAGE], BOX[None])[0].covariance is None
     unknown = replace(result, hypotheses=(replace(result.hypotheses[0], covariance=None),))
     assert not unknown.reliable, "a fitted pose without a covariance"
 
