@@ -46,12 +46,11 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     from ..inspection.facts import mesh_facts
     from ..inspection.page import report_lines, report_page
     from ..matching import cached_bank
-    from ..mesh import load_mesh
     from ..registration import Registrar
 
     backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
     options = register_options(arguments)
-    mesh = load_mesh(arguments.mesh, unit=options.unit, up=options.up)
+    mesh = options.load_mesh(arguments.mesh)
     with output_folder(arguments.out, "inspect", inputs=input_files(arguments, arguments.mesh, *backgrounds)):
         pipeline = options.open_pipeline()
         bar = tqdm(total=None, desc="photographs", unit="photograph", disable=not options.progress)

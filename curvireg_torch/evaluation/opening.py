@@ -132,7 +132,7 @@ class RegisterOptions:
     )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
-        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, Kalibr, COLMAP or BOP, whose "
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or other tools, whose "
         "distortion is removed. exif insists on the focal length of the photograph's file (default: this one, if it "
         "has one; else the focal length is estimated, and the distance with it)",
         type=camera_option,

@@ -200,7 +200,7 @@ def register(
             mesh = ViewBank.load(mesh)
             check_bank(mesh, meshes[0], unit=unit, up=up)
         else:
-            mesh = load_mesh(mesh, unit=unit or "m", up=up)
+            mesh = load_mesh(mesh, unit=unit, up=up)
     elif unit is not None or up is not None:
         raise InvalidInputError("unit, up: of a mesh file; what is given as mesh has its own, leave them out")
     registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)

@@ -14,6 +14,7 @@ from .source import MeshSource, Pixels, ReadMesh, numbers, plain_text, spellings
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
 # Corners of one form: v, v/vt and v/vt/vn. Possessive, so that no text takes long to be refused.
 _FORMS = {fields: re.compile(rb"(?:\s++" + rb"/".join([rb"-?+\d++"] * fields) + rb")++\s*+") for fields in (1, 2, 3)}
+_NAMES = (b"usemtl", b"o", b"g", b"mtllib")
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # Options of a texture in an MTL file, and how many words follow; "numbers": up to three numbers
 _MAP_OPTIONS: dict[bytes, int | str] = {
@@ -86,31 +87,44 @@ def _lines_of(data: bytes) -> _Lines:
         data = data.replace(b"\\\n", b" ")
     found, current = _Lines(), -1
     parts: set[bytes] = set()
+    points, faces, uv = found.points, found.faces, found.uv
+    has_remarks = b"#" in data
     for line in data.split(b"\n"):
+        start = line[:2]  # most lines, without a search for their words
+        if start == b"v " and not has_remarks:
+            points.append(line[2:])
+            continue
         words = line.split(None, 1)
         if not words:
             continue
         key = words[0]
         rest = words[1].partition(b"#")[0] if len(words) > 1 else b""
         if key == b"v":
-            found.points.append(rest)
+            points.append(rest)
         elif key == b"f":
-            found.faces.append(rest)
-            found.points_before.append(len(found.points))
-            found.uv_before.append(len(found.uv))
+            faces.append(rest)
+            found.points_before.append(len(points))
+            found.uv_before.append(len(uv))
             found.material.append(current)
         elif key == b"vt":
-            found.uv.append(rest)
-        elif key == b"usemtl":
-            name = rest.strip()
-            current = found.materials.setdefault(name, len(found.materials)) if name else -1
-        elif key in (b"o", b"g"):
-            parts.add(rest.strip())
-        elif key == b"mtllib":
-            found.libraries[words[1].strip() if len(words) > 1 else b""] = None
-        if max(len(parts), len(found.materials), len(found.libraries)) > MAX_MESH_PARTS:
-            raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+            uv.append(rest)
+        elif key in _NAMES:
+            name = words[1] if key == b"mtllib" and len(words) > 1 else rest
+            current = _noted(found, parts, key, name.strip(), current)
     return found
+
+
+def _noted(found: _Lines, parts: set[bytes], key: bytes, name: bytes, current: int) -> int:
+    """Note the name of a material, part or library; returns the number of the material that now holds."""
+    if key == b"usemtl":
+        current = found.materials.setdefault(name, len(found.materials)) if name else -1
+    elif key == b"mtllib":
+        found.libraries[name] = None
+    else:
+        parts.add(name)
+    if max(len(parts), len(found.materials), len(found.libraries)) > MAX_MESH_PARTS:
+        raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+    return current
 
 
 def _table(lines: list[bytes], least: int, what: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -16,8 +16,9 @@ from torch import nn
 
 import curvireg_torch as cr
 from scripts import _shared
-from scripts.speed.kornia_primitives import BATCH, backward, forward, least_times
+from scripts.speed.timing import backward, forward, least_times
 
+BATCH = 8
 SIZE = 128
 OUT = _shared.RESULTS / "compiled_layers.json"
 PAGE = _shared.REPOSITORY / "docs" / "guides" / "layers.md"

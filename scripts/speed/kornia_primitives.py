@@ -10,7 +10,6 @@ on one thread, on batches of eight images, and the least time of each counts, so
 import argparse
 import functools
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from curvireg_torch.filters import operations as ops
 from curvireg_torch.geometry.crops import crop_squares, square_boxes
 from curvireg_torch.terms import dilate_points
 from scripts import _shared
+from scripts.speed.timing import backward, forward, least_times
 
 SIZES = (128, 256)
 BATCH = 8
@@ -158,34 +158,6 @@ PRIMITIVES = (
     ),
 )
 """A median filter is missing because no filter here needs one."""
-
-
-def least_times(functions: Sequence[Callable[[], object]], rounds: int, seconds: float) -> list[float]:
-    """Least processor time in s of each function; the functions run in turn, so that all meet the same conditions."""
-    repeats = []
-    for function in functions:
-        function()
-        start = time.process_time()
-        function()
-        repeats.append(max(1, int(seconds / max(time.process_time() - start, 1e-6))))
-    least = [math.inf] * len(functions)
-    for _ in range(rounds):
-        for k, (function, count) in enumerate(zip(functions, repeats, strict=True)):
-            start = time.process_time()
-            for _ in range(count):
-                function()
-            least[k] = min(least[k], (time.process_time() - start) / count)
-    return least
-
-
-def forward(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    with torch.no_grad():
-        return function(x)
-
-
-def backward(function: Callable[[Tensor], Tensor], x: Tensor) -> None:
-    x.grad = None
-    function(x).square().sum().backward()
 
 
 def difference_of(primitive: Primitive, x: Tensor) -> float:

@@ -470,6 +470,10 @@ def test_yaml_cannot_blow_up_or_run_code(tmp_path):
     file.write_text("- " * 2000 + "1")
     with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
         load_camera(file)
+    for depth, words in ((45, "no camera matrix"), (55, "nested too deeply")):
+        file.write_text("a: " + "[" * depth + "1" + "]" * depth)
+        with pytest.raises(InvalidInputError, match=words):
+            load_camera(file)
     file.write_text(f"a: !!python/object/apply:os.mkdir [{tmp_path}/made]\nfx: 1\n")
     with pytest.raises(InvalidInputError, match="expected 9 numbers, or fx, fy, cx, cy, got 1"):
         load_camera(file)
@@ -483,6 +487,23 @@ def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
         with pytest.raises(InvalidInputError) as error:
             load_camera(file)
         assert "abc123" not in str(error.value)
+
+
+def test_both_coordinates_of_the_principal_point_decide_the_order_of_the_sides(tmp_path):
+    file = tmp_path / "camera.json"
+    for cx, cy, size in ((262.0, 238.5, (480, 640)), (238.5, 262.0, (640, 480))):  # 262 alone would say the other order
+        for written in ([480, 640], [640, 480]):
+            matrix = [[520.5, 0, cx], [0, 522.0, cy], [0, 0, 1]]
+            file.write_text(json.dumps({"K": matrix, "resolution": written}))
+            assert load_camera(file).size == size
+
+
+def test_distortion_beside_several_cameras_belongs_to_none_of_them(tmp_path):
+    file = tmp_path / "cameras.json"
+    other = (2 * K - np.diag([0, 0, 1.0])).tolist()
+    file.write_text(json.dumps({"a": {"K": MATRIX}, "b": {"K": other}, "dist": LENS}))
+    with pytest.raises(InvalidInputError, match="'dist': looks like distortion, but is not read"):
+        load_camera(f"{file}:a")
 
 
 @pytest.mark.parametrize(

@@ -254,7 +254,9 @@ def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
     pose = {"rotation": rotated(benchmark.samples[0], "z", 180), "translation": [0.0, 0.0, 500.0]}
     scores_of(benchmark, tmp_path / "bop", [pose, *[{"skipped": "x"}] * 3])
-    assert "1 of 1 within 30 degrees" in (tmp_path / "bop" / "index.html").read_text()
+    page = (tmp_path / "bop" / "index.html").read_text()
+    assert "1 of 1 within 30 degrees" in page
+    assert "0.0 degrees off" in page
 
 
 def posed(sample, degrees):

@@ -140,6 +140,21 @@ def test_field_points_of_a_ridge_two_pixels_wide_are_one_pixel_wide() -> None:
     assert field_points(field, fraction=1.0)[0, 0].sum(dim=1).tolist() == [1] * 5
 
 
+def test_hog_keeps_its_precision_under_autocast() -> None:
+    field = torch.randn(2, 2, 40, 48, generator=torch.Generator().manual_seed(0))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        autocast = hog(field)
+    assert torch.equal(autocast, hog(field))
+
+
+def test_hog_is_one_graph() -> None:
+    """Traced only: the slow tests compile it."""
+    torch._dynamo.reset()
+    field = torch.randn(2, 2, 32, 32, generator=torch.Generator().manual_seed(0))
+    graph = torch.compile(features.HOG(), fullgraph=True, backend="eager")
+    torch.testing.assert_close(graph(field), hog(field))
+
+
 @pytest.mark.parametrize("learnable", [False, True])
 def test_hog_on_the_meta_device(learnable: bool) -> None:
     layer = features.HOG(grid=4, learnable=learnable).to("meta")

@@ -116,6 +116,12 @@ def test_learned_field_with_weights_of_another_dtype(field, dtype, channels):
         )  # vectors have no sign
 
 
+def test_learned_field_of_double_weights_reads_double_images():
+    converted = LearnedCurvilinearSaliency().double()
+    x = torch.rand(1, 3, 60, 60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert not torch.equal(converted(x), converted(x.float().double()))
+
+
 def test_learned_field_under_autocast(field):
     x = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     with torch.autocast("cpu", dtype=torch.bfloat16):

@@ -9,6 +9,7 @@ import torch
 from curvireg_torch.filters.operations import to_grey
 from scripts.speed import kornia_primitives as script
 from scripts.speed.kornia_primitives import PRIMITIVES, decision, difference_of, table
+from scripts.speed.timing import backward, forward
 
 SAME = [primitive for primitive in PRIMITIVES if primitive.same]
 
@@ -19,7 +20,7 @@ def test_primitives_equal_those_of_kornia(primitive: script.Primitive, dtype: to
     x = torch.rand(2, primitive.channels, 116, 118, generator=torch.Generator().manual_seed(0)).to(dtype)
     assert difference_of(primitive, x) < 5e-5
     inner = slice(primitive.border, -primitive.border or None)
-    assert float(script.forward(primitive.kornia, x)[..., inner, inner].abs().max()) > 0.01
+    assert float(forward(primitive.kornia, x)[..., inner, inner].abs().max()) > 0.01
 
 
 @pytest.mark.parametrize("primitive", SAME, ids=lambda primitive: primitive.name)
@@ -30,7 +31,7 @@ def test_gradients_of_primitives_equal_those_of_kornia(primitive: script.Primiti
     gradients = []
     for function in (primitive.ours, primitive.kornia):
         image = x.clone().requires_grad_()
-        script.backward(function, image)
+        backward(function, image)
         gradients.append(image.grad)
     torch.testing.assert_close(*gradients)
 

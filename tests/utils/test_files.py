@@ -169,3 +169,16 @@ def test_only_in_finds_files_of_one_folder(tmp_path):
         assert find(name) == tmp_path / "a.png"
     for name in ("", "..", "../..", "/", "x/.", "..\\.."):
         assert find(name) == tmp_path / "file"
+
+
+def test_a_csv_file_that_grows_has_each_row_at_once_and_begins_anew(tmp_path):
+    path = tmp_path / "rows.csv"
+    path.write_text("older")
+    grown = files.CsvFile(path, ["name", "value"])
+    assert path.read_text() == "older", "until there is a row"
+    grown.add(["=a,b", 1.5])
+    assert path.read_bytes() == b'name,value\n"\'=a,b",1.5\n'
+    grown.add(["c", ""])
+    assert path.read_text().splitlines()[1:] == ['"\'=a,b",1.5', "c,"]
+    with pytest.raises(OutputError, match=r"none.x\.csv: cannot be written"):
+        files.CsvFile(tmp_path / "none" / "x.csv", ["name"]).add(["a"])
