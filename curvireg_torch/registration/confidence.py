@@ -1,7 +1,7 @@
 """Probabilities that a pose or a detection is right: logistic models of measured features.
 
-Two models serve registrations: "instance", for the mesh of this very object and a known camera, and "category", for the
-mesh of another object of its kind, or without a camera. Their constants, and those of refinement, tracking and
+Two models serve registrations: "instance", for the mesh of this very object, and "category", for the mesh of another
+object of its kind. Their constants, and those of refinement, tracking and
 detection, were fitted by scripts/calibration on generated photographs; docs/accuracy.md has their accuracy on others.
 """
 
@@ -29,7 +29,7 @@ COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
 MIN_LANDMARKS, LANDMARK_PROBABILITY = 8, 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
 EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")  # the more, the better
-DOUBT_FEATURES = ("undetermined", "outside", "border")  # the more, the worse
+DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
@@ -152,7 +152,14 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
 
 
 def confidence_features(
-    evidence: Tensor, scores: Tensor, share: float | None, *, undetermined: float, outside: float, border: float
+    evidence: Tensor,
+    scores: Tensor,
+    share: float | None,
+    *,
+    undetermined: float,
+    outside: float,
+    border: float,
+    focal: float = 0.0,
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
@@ -160,17 +167,18 @@ def confidence_features(
     clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, 5) :data:`POSE_FEATURES` of the hypotheses, the best first.
+        evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
         outside: fraction of the object that lies outside the photograph.
         border: number of the box's sides that lie on the border of the photograph.
+        focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count as 1.
     """
-    _, similarity, edge_support, _, landmarks = evidence[0].tolist()
+    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
     rivals = scores[1:]
     margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
-    values = similarity, margin, edge_support, share, landmarks, undetermined, outside, border
+    values = similarity, margin, edge_support, share, landmarks, undetermined, outside, border, min(focal, 1.0)
     return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
 
 

@@ -82,6 +82,7 @@ def judged(
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,
         border=border_sides(work.item.box, work.item.size),
+        focal=work.item.focal_deviation,
     )
     gain = _gain_outside(features, best, order[outside[order]])
     if gain is not None and len(rivals) == 1:  # limits that leave no rival do not make a pose uncertain

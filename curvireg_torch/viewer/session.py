@@ -372,8 +372,6 @@ class Session:
             if registration.views:
                 rows = zip(result.document["views"], document["views"], strict=True)
                 document["views"] = [{**row, **moved} for row, moved in rows]
-            if document["inputs"].get("camera_source") in ("exif", "fov"):
-                document["covariance"] = document["standard_deviations"] = None
             if "detection" in document:
                 first, *others = document["detection"]["instances"]
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}

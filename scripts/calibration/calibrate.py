@@ -71,14 +71,38 @@ SETS: dict[str, tuple[float, tuple[str, ...]]] = {
 }
 """Of each set: scenes, as a fraction of --count, and options of make.py."""
 
+ESTIMATED = {"estimated_shapes": "shapes", "estimated_packages": "packages", "estimated_wrong": "wrong"}
+"""Sets whose camera is withheld and estimated, and those with the same photographs."""
+
 SCENES_PER_MESH = 2.0
 
 SHARES = {"tied": 0.1, "cut": 0.1, "cut_packages": 0.05, "print": 0.05, "mirrored": 0.02, "wrong": 0.08}
+SHARES |= {"estimated_wrong": 0.08}
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each the same weight."""
 
-ABSENT = ("print", "mirrored", "wrong")  # sets whose photographs do not show the mesh: no pose is right
-UPRIGHT = ("furniture", "shapes", "furniture_similar", "similar", "sequences")  # sets of which half stand upright
-GREY = ("shapes", "packages", "shelves", "cut", "cut_packages")  # sets in which every third mesh loses its colours
+ABSENT = (
+    "print",
+    "mirrored",
+    "wrong",
+    "estimated_wrong",
+)  # sets whose photographs do not show the mesh: no pose is right
+UPRIGHT = (
+    "furniture",
+    "shapes",
+    "estimated_shapes",
+    "furniture_similar",
+    "similar",
+    "sequences",
+)  # sets of which half stand upright
+GREY = (
+    "shapes",
+    "packages",
+    "shelves",
+    "cut",
+    "cut_packages",
+    "estimated_shapes",
+    "estimated_packages",
+)  # sets in which every third mesh loses its colours
 
 RIGHT = 30.0  # degrees within which a registration is right
 FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within which a refined or tracked pose is right
@@ -89,7 +113,10 @@ STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 
 FOLDS = 5
 RESOLUTIONS = np.arange(0.0, 1.55, 0.1).round(2).tolist()  # that are tried
 MODELS = {
-    "instance": ("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages", *ABSENT),
+    "instance": (
+        *("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages", *ABSENT),
+        *("estimated_shapes", "estimated_packages"),
+    ),
     "category": ("furniture_similar", "similar"),
     "refinement": ("shapes",),
     "tracking": ("sequences",),
@@ -104,12 +131,17 @@ KINDS = {"refinement": "refined", "tracking": "sequences", "detection": "detecte
 def sets_of(models: Sequence[str], meshes: Path | None) -> list[str]:
     """Sets of the models, without those of furniture where there is none."""
     names = dict.fromkeys(name for model in models for name in MODELS[model])
-    return [name for name in names if meshes is not None or "furniture" not in SETS[name][1]]
+    return [name for name in names if meshes is not None or "furniture" not in SETS[photographs_of(name)][1]]
+
+
+def photographs_of(name: str) -> str:
+    """The set that has the photographs of a set."""
+    return ESTIMATED.get(name, name)
 
 
 def render_sets(work: Path, meshes: Path | None, count: int, jobs: int, models: Sequence[str]) -> None:
     """Render the sets of ``models`` that ``work`` lacks; finished scenes are kept."""
-    for name in sets_of(models, meshes):
+    for name in dict.fromkeys(map(photographs_of, sets_of(models, meshes))):
         fraction, options = SETS[name]
         scenes = max(1, round(fraction * count))
         words: list[Any] = ["--out", work / name, "--count", scenes, "--jobs", jobs, *options]
@@ -155,15 +187,16 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     result = registrar([sample["image"]], sample["box"][None], K)[0]
     if not result.ok:
         return
+    seen = sample
     R = torch.stack([h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses])
     if K is None:  # compare as seen by a camera that looks straight at the object
         ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
-        sample = sample | {"rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()}
+        seen = sample | {"rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()}
     evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]).double()
-    weights = torch.tensor(RANK_ALONE if K is None else SCORE_WEIGHTS, dtype=torch.float64)
+    weights = torch.tensor(SCORE_WEIGHTS if registrar.is_exact else RANK_ALONE, dtype=torch.float64)
     row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
-    S = symmetries_of(sample, None if K is None else registrar)
-    row |= {"errors": errors_of(R, sample, S).tolist(), "evidence": evidence.tolist()}
+    S = symmetries_of(sample, registrar if registrar.is_exact else None)
+    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
@@ -226,9 +259,11 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
     mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
-    if kind in GREY and samples[0]["obj_id"] % 3 == 0:
+    grey = kind in GREY and samples[0]["obj_id"] % 3 == 0
+    if grey:
         mesh.visual = trimesh.visual.ColorVisuals()
-    registrar = cr.Registrar(mesh, pipeline=pipeline)
+    mesh_is = "similar" if "similar" in kind else "exact"
+    registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is=mesh_is)
     if kind == "sequences":
         found = [(samples[0], row) for row in followed(registrar, samples)]
     else:
@@ -236,16 +271,19 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
             "refined": lambda s: refined(registrar, s, other),
             "detected": lambda s: detected(registrar, s, other),
         }
-        method = methods.get(kind, lambda s: registered(registrar, s, with_camera="similar" not in kind))
+        method = methods.get(
+            kind, lambda s: registered(registrar, s, with_camera=kind not in (*MODELS["category"], *ESTIMATED))
+        )
         found = [(s, row) for s in samples for row in method(s)]
     groups = json.loads((folder / "benchmark.json").read_text())["groups"]
-    more = {"set": kind, "object": samples[0]["obj_id"]}
+    more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
     return [{"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row} for s, row in found]
 
 
 def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
     """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read from the file."""
-    folder, out = work / (kind if kind in SETS else "shapes"), work / f"{kind}.jsonl"
+    photographs = photographs_of(kind)
+    folder, out = work / (photographs if photographs in SETS else "shapes"), work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
@@ -311,19 +349,18 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some pose is right and some
     are not; without ``ties`` the resolution is 0."""
-    cases = []
-    for row, w in zip(rows, weight, strict=True):
-        right = np.array(row["errors"]) < RIGHT
-        if row["right"] and not right.all():
-            scores = np.array(row["scores"])
-            cases.append((scores.max() - scores, right, w))
+    decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
+    most = max((len(rows[k]["scores"]) for k in decided), default=1)
+    behind, right = np.full((len(decided), most), np.inf), np.zeros((len(decided), most), bool)
+    for place, k in enumerate(decided):
+        scores = np.array(rows[k]["scores"])
+        behind[place, : len(scores)] = scores.max() - scores
+        right[place, : len(scores)] = np.array(rows[k]["errors"]) < RIGHT
 
     def loss(slope: float, resolution: float) -> float:
-        total = 0.05 * slope**2
-        for behind, right, w in cases:
-            logits = -slope * np.maximum(0.0, behind - resolution)
-            total += w * (logsumexp(logits) - logsumexp(logits[right]))
-        return float(total)
+        logits = -slope * np.maximum(0.0, behind - resolution)
+        of_right = np.where(right, logits, -np.inf)
+        return float(weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1)) + 0.05 * slope**2)
 
     found = []
     for resolution in RESOLUTIONS if ties else (0.0,):
@@ -375,7 +412,9 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     first = np.array([row["first"] for row in rows])
     quality = quality_of(p, first, weight)
     by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
-    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items()}
+    by_set["grey"] = np.array([row["grey"] for row in rows])
+    by_set["with colours"] = ~by_set["grey"]
+    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items() if own.any()}
     return fit(np.full(len(rows), True)), quality
 
 

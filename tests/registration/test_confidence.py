@@ -74,8 +74,8 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     assert all(model["weights"][name] >= 0.0 for name in confidence.EVIDENCE_FEATURES)
     assert all(model["weights"][name] <= 0.0 for name in confidence.DOUBT_FEATURES)
     tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3, "landmarks": 1.0}
-    tied |= {"undetermined": 0.5, "outside": 0.1, "border": 1.0}
-    decisive = ("similarity", "edge_support", "undetermined") if exact else ("similarity",)
+    tied |= {"undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
+    decisive = ("similarity", "edge_support", "undetermined", "focal") if exact else ("similarity",)
     for name in decisive:
         more = confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact)
         less = confidence.probability_of_any(tied, exact=exact)
@@ -84,10 +84,10 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 def test_confidence_features():
     evidence = torch.tensor(
-        [[0.0, 0.7, 0.4, 1.0, 2.0], [-1.0, 0.6, 0.5, 0.4, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0]], dtype=torch.float64
-    )
+        [[0.0, 0.7, 0.4, 1.0, 2.0, 0.5], [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0]]
+    ).double()
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
-    doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0}
+    doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
     expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0, **doubts}
     assert confidence.confidence_features(evidence, scores, 0.3, **doubts) == pytest.approx(expected)
     for factor in (10.0, -10.0):

@@ -291,7 +291,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     assert browser.messages() == []
     browser.unfold("camera")
     browser.click("exif")
-    caption = "guessed from the photograph's EXIF, 37 mm of a 35 mm camera: no covariance"
+    caption = "from the photograph's EXIF, 37 mm of a 35 mm camera"
     browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
     browser.part("camera").send_keys("65")
     browser.wait(lambda: "--fov 65" in browser.text("command"), "field of view")
