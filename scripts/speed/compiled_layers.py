@@ -3,8 +3,8 @@
     python scripts/speed/compiled_layers.py                    # ten minutes on one core
     python scripts/speed/compiled_layers.py --device cuda
 
-Adds to scripts/results/compiled_layers.json and writes the table of docs/guides/layers.md, after each layer. One
-thread, batches of eight images of 128 px; the layer and the compiled layer run in turn, and the least time of each counts.
+Adds to scripts/results/compiled_layers.json and writes the table of docs/guides/layers.md after each layer.
+One thread, batches of eight images of 128 px; both run in turn, and the least time of each counts.
 """
 
 import argparse
