@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MAX_FAILURES = 10  # photographs of a list that could not be registered, of which the command prints the reason
 NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
-WEAK_CONTOURS = 0.35  # edge support below which contours hardly show
+OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
 
 STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
 """Stages that are called otherwise than in the library."""
@@ -328,9 +328,9 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
     """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of its files."""
-    from ..registration.result import corners, remarks
+    from ..registration.result import corners, remarks, two_decimals
 
-    confidence = "not calibrated" if document["confidence"] is None else f"{document['confidence']:.2f}"
+    confidence = "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
     print(f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}")
     if not document["reliable"]:
         print(f"no reliable match: take the pose as a guess; {_advice(document)}")
@@ -340,7 +340,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     for line in remarks(document):
         print(line)
     for instance in document.get("detection", {}).get("instances", []):
-        print(f"found in box {corners(instance['box'])}: there with probability {instance['score']:.2f}")
+        print(f"found in box {corners(instance['box'])}: there with probability {two_decimals(instance['score'])}")
     if document["translation"] is not None:
         print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
     if (deviations := document["standard_deviations"]) is not None:
@@ -360,21 +360,22 @@ def _angles(pose: Mapping[str, Any]) -> str:
 
 def _print_rivals(document: Mapping[str, Any]) -> None:
     """Print rivals that are nearly as probable as the best pose, if there are any."""
-    from ..registration.result import RIVAL_FRACTION
+    from ..registration.result import RIVAL_FRACTION, two_decimals
 
     if document["ambiguous"] is None:
         return
     for rival, probability in list(zip(document["top"], document["probabilities"], strict=False))[1:]:
         if probability >= RIVAL_FRACTION * document["confidence"]:
-            print(f"could also be: {_angles(rival)}   probability {probability:.2f}")
+            print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
-    none = f"none of them: {document['none']:.2f}"
+    none = f"none of them: {two_decimals(document['none'])}"
     print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
 
 
 def _advice(document: Mapping[str, Any]) -> str:
-    """What to try after a registration that is not reliable, by its likely reason."""
-    support, mesh = document["edge_support"], "that the mesh is the object's, in its --unit and with its --up axis"
+    """What to try after a registration that is not reliable, by the reason that was measured, if there is one."""
+    mesh = "that the mesh is the object's, in its --unit and with its --up axis"
+    features = document["confidence_features"]
     if document["warnings"]:
         return "correct what the warning names"
     if document["ambiguous"] is not None:
@@ -383,8 +384,12 @@ def _advice(document: Mapping[str, Any]) -> str:
         return f"check --distance, --camera, and {mesh}"
     if "detection" in document:
         return f"add --box, and check {mesh}"
-    if support is not None and support < WEAK_CONTOURS:
-        return f"its contours hardly show in the photograph: take a sharp one with the whole object, and check {mesh}"
+    if (features.get("border") or 0) > 0:
+        return "the box ends at the border of the photograph: take one that shows the whole object"
+    if document["translation"] is None:
+        return f"give the --camera, and check {mesh}"
+    if (features.get("undetermined") or 0.0) >= OPEN_AXES:
+        return f"the contours that were found leave its rotation open: take a sharper or closer one, and check {mesh}"
     return f"check that the box is tight, and {mesh}"
 
 

@@ -15,6 +15,7 @@ from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
+from ..registration.result import two_decimals
 from ..utils.checks import check_positive
 from ..utils.files import code_digest, write_file
 from ..version import __version__
@@ -148,7 +149,7 @@ def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Se
     shown = []
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
         number = row.get("confidence")
-        confidence = "not calibrated" if number is None else f"confidence {number:.2f}"
+        confidence = "not calibrated" if number is None else f"confidence {two_decimals(number)}"
         if row["status"] == "failed":
             kind, caption, rank = "failed", row["message"], (2.0, 0.0)
         elif math.isnan(error):

@@ -14,6 +14,7 @@ from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
+from ..registration.result import two_decimals
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
@@ -240,7 +241,7 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
         number, message = row["row"], row["message"]
         reliable, confidence = row.get("reliable", False), row.get("confidence") or 0.0
         kind = "failed" if message else "reliable" if reliable else "doubtful"
-        caption, picture = message or f"confidence {confidence:.2f}, {kind}", thumbnail_of(out, row)
+        caption, picture = message or f"confidence {two_decimals(confidence)}, {kind}", thumbnail_of(out, row)
         rank = bool(message), not reliable, -confidence, number
         shown.append(SheetEntry(number, entry.name, caption, kind, picture, rank))
         if message:

@@ -167,7 +167,7 @@ def confidence_features(
     clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, 5) :data:`POSE_FEATURES` of the hypotheses, the best first.
+        evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
@@ -175,7 +175,7 @@ def confidence_features(
         border: number of the box's sides that lie on the border of the photograph.
         focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count as 1.
     """
-    _, similarity, edge_support, _, landmarks = evidence[0].tolist()
+    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
     rivals = scores[1:]
     margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
     values = similarity, margin, edge_support, share, landmarks, undetermined, outside, border, min(focal, 1.0)

@@ -24,7 +24,7 @@ from .confidence import detection_probability
 from .focal import usual_camera
 from .inputs import ImageItem, check_crop, image_items, resized
 from .poses import projected_box
-from .result import Detection, FailedRegistration, Registration, corners
+from .result import Detection, FailedRegistration, Registration, corners, two_decimals
 from .tracker import boxes_at
 from .unknown_camera import limits_of
 
@@ -113,7 +113,7 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
     best = max(found, key=lambda one: one.confidence or 0.0)
     assert best.detection is not None
     place = f"at the most likely place, box {corners(best.detection.box.tolist())}"
-    seen = f"the object is seen with a probability of {best.confidence:.2f}"
+    seen = f"the object is seen with a probability of {two_decimals(best.confidence or 0.0)}"
     error = LostObjectError(f"not found: {place}, {seen}; give a box", subject=subject)
     error.detection = best.detection
     return FailedRegistration(error)

@@ -11,7 +11,7 @@ from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectErr
 from ..geometry.calibration import Camera
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
-from ..utils.checks import as_numbers, check_pose, check_tensor
+from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.threads import map_on_threads
 from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
@@ -21,9 +21,9 @@ from .registrar import Registrar
 from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
-# Tracking confidence from which a tracked pose stands without a refinement, and after one that was no better
+# Confidence of a tracked pose from which it stands without a refinement, and after one that was no better
 TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
-# Confidence from which a pose is followed; while it is lower, each frame is registered to check it
+# Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
 
 
@@ -60,7 +60,7 @@ class Follower:
         self.camera_matrix, self.prior = camera_matrix, prior
         describer = self.registrar.describer
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
-        self._base = 0.0  # confidence of the pose that tracking goes on from; 0: there is none
+        self._base: float | None = None  # confidence of the pose that tracking goes on from, if there is one
 
     @torch.no_grad()
     def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
@@ -69,16 +69,19 @@ class Follower:
         Args:
             image: the frame, see :class:`Registrar`.
             pose: (4, 4) rigid ``T_cam_from_model``.
-            confidence: that the pose is right; no tracked pose has more, unless a registration confirms it.
+            confidence: probability in [0, 1] that the pose is right; no tracked pose has more, unless a registration
+                confirms it. Below 0.5 each frame is checked.
 
         Raises:
-            InvalidInputError: ``pose`` is not rigid and finite, or the frame cannot be used.
+            InvalidInputError: ``pose`` is not rigid and finite, ``confidence`` is no probability, or the frame cannot
+                be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
             ImageError: pixels around the mesh are outside [0, 1].
         """
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))
         check_pose(T, "pose")
+        confidence = check_probability(confidence, "confidence")
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             raise item
@@ -103,13 +106,13 @@ class Follower:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
-        if not self._base:
+        if self._base is None:
             return self._registered(item, image, box, BELIEVED_CONFIDENCE)
         tracked: TrackedPose | None = None
         with suppress(LostObjectError, ImageError):  # pixels around the last pose may be unusable
             tracked = self._tracker.track(item.image, item.K)
         found = None if tracked is None else self._registration(tracked, item)
-        if tracked and found and tracked.confidence >= TRUSTED_CONFIDENCE and self._base >= BELIEVED_CONFIDENCE:
+        if tracked and found and _confidence(found) >= TRUSTED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
         starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
@@ -119,7 +122,7 @@ class Follower:
                 self._tracker.accept(self._tracker.measure(item.image, item.K, refined.projection[0]))
                 self._base = _confidence(refined)
             return refined
-        if tracked and found and tracked.confidence >= KEPT_CONFIDENCE:
+        if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
             return found
@@ -140,7 +143,8 @@ class Follower:
             result = refine_item(self.registrar, item, starts)
         except CurviregError as error:
             return FailedRegistration(error)
-        bound = self._base if _confidence(result) < RELIABLE else 1.0
+        assert self._base is not None
+        bound = 1.0 if _confidence(result) >= RELIABLE else self._base
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
@@ -154,6 +158,7 @@ class Follower:
             covariance=self._tracker.covariance(tracked)[None],
         )
         hypothesis = hypothesis_of(poses, 0, tracked.features, score="region")
+        assert self._base is not None
         probabilities = (self._base * tracked.confidence,)
         warnings = item.warnings + self.registrar.mesh_warnings
         notes = self.registrar.mesh_notes

@@ -43,6 +43,7 @@ FRACTIONS = "box: in px, not fractions of the photograph; multiply them, or give
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
+SAME_PLACE = 1e-4  # Relative difference of poses and cameras up to which two photographs come from the same place
 SAME_PICTURE = 0.8  # Correlation of small copies of two photographs from which they may come from the same place
 # Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
 # on 60 generated photographs
@@ -207,6 +208,27 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
                     subject=f"image {i}",
                 )
     return T
+
+
+def copies_of(T: Tensor, items: "Sequence[ImageItem | CurviregError]") -> dict[int, int]:
+    """Photographs of a rig that show what an earlier one does, by their index, and that one: those that the same camera
+    took from the same place ``T`` (V, 4, 4). They are no further evidence."""
+    found: dict[int, int] = {}
+    size = T[:, :3, 3].abs().amax(dim=1).clamp(min=1e-300)
+    for i, pose in enumerate(T):
+        turned = (T[:i, :3, :3] - pose[:3, :3]).flatten(1).abs().amax(dim=1) <= SAME_PLACE
+        near = (T[:i, :3, 3] - pose[:3, 3]).abs().amax(dim=1) <= SAME_PLACE * size[i]
+        for j in (turned & near).nonzero()[:, 0].tolist():
+            one, other = items[j], items[i]
+            if i not in found and j not in found and _by_same_camera(one, other):
+                found[i] = j
+    return found
+
+
+def _by_same_camera(one: ImageItem | CurviregError, other: ImageItem | CurviregError) -> bool:
+    if not (isinstance(one, ImageItem) and isinstance(other, ImageItem)) or one.size != other.size:
+        return False
+    return bool((one.K - other.K).abs().max() <= SAME_PLACE * one.K.abs().max())
 
 
 def _contradict(one: ImageItem, other: ImageItem) -> bool:

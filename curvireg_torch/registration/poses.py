@@ -14,6 +14,7 @@ from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..terms import Appearance, QueryFeatures
 from .confidence import are_near
 from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges, quick_fit
+from .details import compare_details
 from .edges import EdgeCrops
 from .result import Hypothesis
 from .texture_fit import fit_texture, turned
@@ -41,6 +42,7 @@ __all__ = [
     "pose_scores",
     "projected_box",
     "similarities",
+    "with_details",
     "with_edge_support",
     "with_quick_fit",
 ]
@@ -55,18 +57,21 @@ FINISHED_FITS = 2
 """Hypotheses of a photograph whose contours are fitted at full size."""
 
 CLOSE_SCORE, CLOSE_RIVALS = 2.5, 2
-"""Score by which rivals may be behind to be fitted as thoroughly as the best pose, and how many of them are."""
+"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of them are fitted as
+thoroughly."""
 
-POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks")
+POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks", "details")
 """Features of a pose: log S of the view it started from, minus that of the best view; normalised correlation of the
 pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
 that term); log (1 + n) with the number n of landmarks that agree with it, beyond ``CHANCE_LANDMARKS`` (0 without
-colours, camera or contour fit, with a similar mesh, and where a given pose is refined)."""
+colours, camera or contour fit, with a similar mesh, and where a given pose is refined); by how much the contours that
+only this pose or only the best one predicts speak for it, see :func:`.compare_details` (0 for poses that score far less
+than the best)."""
 
 CHANCE_LANDMARKS = 2
 """Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses have no more."""
 
-SCORE_WEIGHTS, RANK_ALONE = (0.0, 10.0, 10.0, 2.5, 6.0), (1.0, 0.0, 0.0, 0.0, 0.0)
+SCORE_WEIGHTS, RANK_ALONE = (0.0, 10.0, 10.0, 2.5, 6.0, 1.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md). The
 rank does not count where poses are fitted: how near a view of the bank was to one is a matter of sampling."""
 
@@ -234,11 +239,25 @@ def compare_with_photograph(
 def pose_features(
     poses: Poses, similarity: Tensor, appearance: Tensor | None = None, landmarks: Tensor | None = None
 ) -> Tensor:
-    """(H, 5) :data:`POSE_FEATURES`: the :func:`similarities`, the ``appearance`` (H,) where the pipeline has that term,
-    and the evidence of ``landmarks`` (H,) where the mesh has any."""
+    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance`` (H,) where the
+    pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has any."""
     appearance, landmarks = (torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks))
     support = poses.edge_support.nan_to_num(0.0)
-    return torch.stack([poses.rank, similarity, support, appearance, landmarks], dim=1)
+    details = torch.zeros_like(similarity)
+    return torch.stack([poses.rank, similarity, support, appearance, landmarks, details], dim=1)
+
+
+def with_details(
+    describer: ViewDescriber, crops: EdgeCrops, poses: Poses, features: Tensor, best: int, rivals: Tensor
+) -> Tensor:
+    """Features (H, F) in which ``rivals`` (R,) are compared in detail with the ``best`` pose."""
+    index = torch.cat([torch.tensor([best]), rivals])
+    some = poses[index]
+    scores, _ = compare_details(describer.contours, crops, some.cameras, some.T, some.crop_index)
+    column = POSE_FEATURES.index("details")
+    features = features.clone()
+    features[rivals, column] = features[best, column] + scores[1:, 0].to(features)
+    return features
 
 
 def landmark_evidence(count: Tensor) -> Tensor:
@@ -266,12 +285,12 @@ def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None
 
 
 def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, at most ``CLOSE_RIVALS``."""
+    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best first."""
     best = int(scores.argmax())
     same = are_near(poses.rotation, poses.rotation[best], symmetries)
     close = ~same & (scores > scores[best] - CLOSE_SCORE)
     order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
-    return order[: min(CLOSE_RIVALS, int(close.sum()))]
+    return order[: int(close.sum())]
 
 
 def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError, LostObjectError
 from ..matching import Ranking
-from ..utils.checks import as_numbers, check_pose
+from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .edges import EdgeCrops
 from .focal import focal_covariance
@@ -59,14 +59,16 @@ def refine(
         images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that have its focal
             length.
         poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
-        start_confidences: of the starts of each photograph, if they are known, as those of earlier results are.
+        start_confidences: probabilities in [0, 1] of the starts of each photograph, if they are known, as those of
+            earlier results are.
 
     Returns:
         For each photograph its refined poses, best first. A :class:`FailedRegistration` with :class:`LostObjectError`
         where the object is not near any start.
 
     Raises:
-        InvalidInputError: not as many cameras or starts as photographs, or a start that is not rigid and finite.
+        InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid and finite, or a
+            confidence that is no probability.
     """
     check_cameras(images, camera_matrices, "refine")
     items, starts = image_items(images, None, camera_matrices), []
@@ -75,6 +77,7 @@ def refine(
         starts.append(T[None] if T.ndim == 2 else T)
         check_pose(T, "poses")
     limits = [None] * len(items) if start_confidences is None else list(start_confidences)
+    limits = [None if c is None else check_probability(c, "start_confidences") for c in limits]
     if len(starts) != len(items) or len(limits) != len(items):
         raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
     return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))

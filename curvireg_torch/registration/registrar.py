@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -37,7 +37,6 @@ from .poses import (
     SCREENING_WEIGHT,
     Poses,
     best_views,
-    close_rivals,
     common_score,
     compare_with_photograph,
     distinct_poses,
@@ -51,10 +50,11 @@ from .poses import (
     with_quick_fit,
 )
 from .refinement import nearest_view, refine
+from .refits import best_inside, fitted_again
 from .result import FailedRegistration, Registration
 from .search import search
 from .several import register_views
-from .siblings import Siblings, telling_symmetries
+from .siblings import telling_symmetries, with_siblings
 from .unknown_camera import limits_of, with_fitted_focal_lengths, with_focal_deviation, with_possible_cameras
 
 __all__ = ["Registrar"]
@@ -297,7 +297,7 @@ class Registrar:
         return Landmarks(self.describer)
 
     @cached_property
-    def _telling_symmetries(self) -> Tensor:
+    def telling_symmetries(self) -> Tensor:
         """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity alone if they are
         given, and trusted."""
         symmetries = self.symmetries_of(exact=True)
@@ -340,7 +340,7 @@ class Registrar:
         whatever else is registered. Items are read on demand, so that few photographs are in memory.
         """
         _ = self.describer.contours, self.mesh_warnings  # create once what threads share, before they use it
-        _ = self.is_exact and self._telling_symmetries
+        _ = self.is_exact and self.telling_symmetries
 
         def run(index: int) -> Any:
             item = items[index]
@@ -392,14 +392,14 @@ class Registrar:
             if len(unknown):
                 poses = poses.replaced(unknown, with_quick_fit(self.describer, work.crops, poses[unknown])[0])
             finish = FINISHED_FITS if work.starts is None else FINISHED
-            poses = self._fitted(work, work.crops, poses, quick=poses.quick, finish=finish)
+            poses = self.fitted(work, work.crops, poses, quick=poses.quick, finish=finish)
         features = self.features_of(work, poses)
         sibling: tuple[Poses, Tensor] | None = None
         if work.crops is not None and work.exact:
             if work.item.focal_deviation:
                 poses, features = with_fitted_focal_lengths(self, work, work.crops, poses, features, outside)
-            poses, features = self._fitted_again(work, work.crops, poses, features, outside)
-            poses, features, sibling = self._with_siblings(work, work.crops, poses, features, outside)
+            poses, features = fitted_again(self, work, work.crops, poses, features, outside)
+            poses, features, sibling = with_siblings(self, work, work.crops, poses, features, outside)
             poses, features = self._with_texture(work, work.crops, poses, features, outside)
         inside = (~outside).nonzero()[:, 0]
         scores = pose_scores(features[inside], exact=work.exact)
@@ -518,7 +518,7 @@ class Registrar:
         return torch.cat([torch.ones_like(known) if mask is None else mask.to(known) for mask in masks])
 
     def features_of(self, work: Work, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES`."""
+        """(H, F) :data:`POSE_FEATURES`."""
         given = work.query, work.descriptor, work.ranking
         similarity, appearance = compare_with_photograph(self, *given, poses.rotation, poses.distance)
         landmarks = (
@@ -526,7 +526,7 @@ class Registrar:
         )
         return pose_features(poses, similarity, appearance, landmarks)
 
-    def _fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
+    def fitted(self, work: Work, crops: EdgeCrops, starts: Poses, **options: Any) -> Poses:
         """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that agree with it."""
         poses = fit_poses(self.describer, crops, starts, **options)
         if work.landmarks is not None:
@@ -539,66 +539,11 @@ class Registrar:
                 poses = poses.replaced(left, kept.with_fit(seen, self.describer.centre))
         return poses
 
-    def _fitted_again(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-    ) -> tuple[Poses, Tensor]:
-        """Fit the best pose again from where it is, then its close rivals: fits that differ in effort cannot be
-        compared. Results with a higher score are kept."""
-        best = _best_inside(features, outside)
-        poses, features = self._refitted(work, crops, poses, features, best)
-        scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
-        rivals = close_rivals(poses, scores, work.symmetries)
-        return self._refitted(work, crops, poses, features, rivals) if len(rivals) else (poses, features)
-
-    def _refitted(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
-    ) -> tuple[Poses, Tensor]:
-        """Fit poses again, and keep the results that have a higher score."""
-        fitted = self._fitted(work, crops, poses[index], again=True)
-        moved = (poses.T[index] != fitted.T).flatten(1).any(dim=1)
-        if not bool(moved.any()):
-            return poses, features
-        new = self.features_of(work, fitted)
-        better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
-        for k in better.nonzero()[:, 0].tolist():
-            one = torch.tensor([k])
-            poses, features = self.replaced(work, poses, features, index[one], fitted[one], new[one])
-        return poses, features
-
-    def _with_siblings(
-        self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-    ) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
-        """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
-        strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
-        symmetries = self._telling_symmetries
-        if len(symmetries) == 1:
-            return poses, features, None
-        best = _best_inside(features, outside)
-        measure = partial(self._measured, work, crops)
-        siblings = Siblings.of(poses[best], symmetries, self.describer, measure)
-        kept = siblings.best()
-        if kept:
-            fitted = self._fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
-            new = self.features_of(work, fitted)
-            better = bool(pose_scores(new, exact=True) > pose_scores(features[best], exact=True))
-            if better:
-                poses, features = self.replaced(work, poses, features, best, fitted, new)
-            else:
-                kept = 0
-        rival = siblings.rival(kept, features[best])
-        if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
-            rival = None
-        return poses, features, rival
-
-    def _measured(self, work: Work, crops: EdgeCrops, poses: Poses) -> Tensor:
-        """(H, 5) :data:`POSE_FEATURES` of poses that are not fitted."""
-        return self.features_of(work, with_edge_support(self.describer, crops, poses))
-
     def _with_texture(
         self, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
     ) -> tuple[Poses, Tensor]:
         """Fit the best pose to the mesh's colours as well."""
-        best = _best_inside(features, outside)
+        best = best_inside(features, outside)
         fitted = fit_texture_of(self.describer, crops, poses, int(best))
         if fitted is None:
             return poses, features
@@ -625,8 +570,3 @@ def _are_repeated(views: Tensor) -> Tensor:
     """(H,) bool: whether a view (H,) is among those before it."""
     equal = views == views[:, None]
     return equal.tril(diagonal=-1).any(dim=1)
-
-
-def _best_inside(features: Tensor, outside: Tensor) -> Tensor:
-    """(1,) index of the best pose that is not outside the limits."""
-    return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]

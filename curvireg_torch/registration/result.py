@@ -244,7 +244,7 @@ class Registration:
         the contours determine at least one axis of rotation; if False, the pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
-        if self.confidence is None or self.confidence < RELIABLE or doubtful:
+        if self.confidence is None or not self.confidence >= RELIABLE or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
@@ -264,7 +264,7 @@ class Registration:
 
     def __repr__(self) -> str:
         """At most ten lines."""
-        confidence = "not calibrated" if self.confidence is None else f"{self.confidence:.2f}"
+        confidence = "not calibrated" if self.confidence is None else two_decimals(self.confidence)
         rows = [", ".join(f"{v:8.4f}" for v in row) for row in self.rotation.tolist()]
         t = None if self.translation is None else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
         lines = [
@@ -402,6 +402,16 @@ def places_document(detection: Detection) -> dict[str, Any]:
     """Where the object may be: the first place's score, and all proposals."""
     pairs = zip(detection.boxes, detection.responses, strict=True)
     return {"score": detection.score, "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs]}
+
+
+def two_decimals(probability: float) -> str:
+    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
+
+    Example:
+        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
+        ('0.89', '0.29', '1.00')
+    """
+    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"
 
 
 def corners(box: Sequence[float]) -> str:

@@ -18,6 +18,7 @@ from ..rendering.contours import ContourPoints
 from ..terms import QueryFeatures, crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
 from .contour_fit import FIRST_RADII, FULL_SIZE_RADII, QUARTER_SIZE_RADII, ContourProblem, ContourState
+from .details import compare_details
 from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
 from .landmarks import LandmarkMatches
@@ -149,7 +150,7 @@ Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by thei
 
 @dataclass(frozen=True)
 class Answer:
-    """M candidate poses in the world, best first, with evidence (V, M, 5) and scores (V, M) in V photographs, and
+    """M candidate poses in the world, best first, with evidence (V, M, F) and scores (V, M) in V photographs, and
     covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
@@ -366,7 +367,8 @@ class Rig:
         return 1.0 / (1.0 - angle / SAME_DIRECTION).clamp(min=0.0).fill_diagonal_(1.0).sum(dim=1)
 
     def evidence(self, T: Tensor, support: Tensor) -> Tensor:
-        """(V, M, 5) :data:`POSE_FEATURES` of world poses with edge supports (V, M)."""
+        """(V, M, F) :data:`POSE_FEATURES` of world poses with edge supports (V, M); details in comparison with the
+        first."""
         parts = []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
@@ -375,12 +377,19 @@ class Rig:
             landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
-            parts.append(torch.stack([similarity, appearance, landmarks]))
-        similarity, appearance, landmarks = torch.stack(parts, dim=1)
-        return torch.stack([self.ranks(T), similarity, support, appearance, landmarks], dim=-1)
+            parts.append(torch.stack([similarity, appearance, landmarks, self.details(photograph, T)]))
+        similarity, appearance, landmarks, details = torch.stack(parts, dim=1)
+        return torch.stack([self.ranks(T), similarity, support, appearance, landmarks, details], dim=-1)
+
+    def details(self, photograph: RigPhotograph, T: Tensor) -> Tensor:
+        """(M,) how much the details of world poses (M, 4, 4) are better than those of the first in a photograph."""
+        K = photograph.K.expand(len(T), 3, 3)
+        index = torch.zeros(len(T), dtype=torch.long)
+        scores, _ = compare_details(self.describer.contours, photograph.crops, K, photograph.camera @ T, index)
+        return scores[:, 0]
 
     def scores(self, evidence: Tensor) -> Tensor:
-        """(V, M) of (V, M, 5)."""
+        """(V, M) of (V, M, F)."""
         return evidence @ torch.tensor(SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64)
 
     def lost(self, answer: Answer) -> dict[int, str]:

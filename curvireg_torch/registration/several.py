@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ..errors import CurviregError, LostObjectError
+from ..errors import CurviregError, InvalidInputError, LostObjectError
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -19,7 +19,7 @@ from .confidence import (
 )
 from .detection import detect
 from .framing import border_sides, outside_fraction
-from .inputs import ImageItem, OnDemand, check_cameras, image_items, is_missing, rig_cameras
+from .inputs import ImageItem, OnDemand, check_cameras, copies_of, image_items, is_missing, rig_cameras
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .tracker import boxes_at
@@ -39,7 +39,8 @@ def register_views(
     Each photograph is registered alone. The hypotheses of all become poses in the world, which are moved to where the
     photographs agree that the object is, fitted to the contours in all photographs at once, and ordered by the sum of
     their scores. One photograph lowers a pose by at most five points, and those from nearly the same side share one
-    vote. A photograph that does not show the best pose is left out, and the others decide again.
+    vote; a copy, from the same place, counts for nothing. A photograph that does not show the best pose is left out,
+    and the others decide again.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
@@ -74,12 +75,15 @@ def register_views(
     registrar = registrar.with_hypotheses(JOINT_HYPOTHESES)
     items = image_items(images, boxes, camera_matrices)
     cameras = rig_cameras(T_cam_from_world, items)
-    given = [] if boxes is None else [i for i, box in enumerate(boxes) if not is_missing(box)]
+    copies = copies_of(cameras, items)
+    given = [] if boxes is None else [i for i, box in enumerate(boxes) if not is_missing(box) and i not in copies]
     found: Found = {}
     if given:
         found = _registered(registrar, items, cameras, given)
     else:
         for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
+            if i in copies:
+                continue
             item = items[i]
             if isinstance(result, FailedRegistration):
                 found[i] = result.error
@@ -88,6 +92,7 @@ def register_views(
                 found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
         if any(isinstance(one, RigPhotograph) for one in found.values()):  # they tell where it is in the others
             found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
+    found |= {i: InvalidInputError(f"a copy of image {j}, which counts once") for i, j in copies.items()}
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)

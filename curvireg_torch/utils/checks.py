@@ -123,6 +123,14 @@ def check_fraction(value: Any, name: str) -> float:
     return number
 
 
+def check_probability(value: Any, name: str) -> float:
+    """Return a number in [0, 1], or refuse it."""
+    number = check_number(value, name)
+    if not 0.0 <= number <= 1.0:
+        raise InvalidInputError(f"{name}: expected a probability from 0 to 1, got {value!r}")
+    return number
+
+
 def check_integer(value: Any, name: str, *, least: int = 1) -> int:
     """Return ``value`` if it is an integer >= ``least``; 2.0 and True are none."""
     if isinstance(value, bool) or not hasattr(type(value), "__index__") or isinstance(value, Tensor) or value < least:

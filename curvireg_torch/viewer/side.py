@@ -10,7 +10,7 @@ from ..errors import MAX_VIEWER_FACES
 from ..evaluation.store import to_json
 from ..geometry import Camera, rotation_error
 from ..mesh import mesh_unit, mesh_up
-from ..registration.result import pose_in_words, remarks, verdict, view_in_words
+from ..registration.result import pose_in_words, remarks, two_decimals, verdict, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot, numbers
@@ -93,7 +93,8 @@ class Answers:
         set_text(self.word, word)
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
         set_text(self.meaning, VERDICTS[word])
-        set_text(self.certainty, "" if document["confidence"] is None else f"probability {document['confidence']:.2f}")
+        confidence = document["confidence"]
+        set_text(self.certainty, "" if confidence is None else f"probability {two_decimals(confidence)}")
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
@@ -154,7 +155,8 @@ class Answers:
             with self.cards, region("button", "card", type="button", data_testid=f"answer-{number + 1}") as card:
                 region("img", src=url, alt=f"contours of answer {number + 1}")
                 text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
-                text("span", "" if probabilities[number] is None else f"{probabilities[number]:.2f}", "facts")
+                probability = probabilities[number]
+                text("span", "" if probability is None else two_decimals(probability), "facts")
             card.on("click", lambda number=number: shot.choose(number))
 
 

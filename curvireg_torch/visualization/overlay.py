@@ -15,7 +15,7 @@ from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
-from ..registration.result import pose_in_words, verdict
+from ..registration.result import pose_in_words, two_decimals, verdict
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
@@ -142,8 +142,8 @@ def _draw_caption(
     x, y = corner
     word, font = verdict(result.confidence, result.none, result.reliable), ImageFont.load_default(size)
     badge = word
-    if result.confidence is not None:  # 0.896 is not yet 0.90, reliable
-        badge += f": confidence {math.floor(100 * result.confidence) / 100:.2f}"
+    if result.confidence is not None:
+        badge += f": confidence {two_decimals(result.confidence)}"
     right = x + draw.textlength(badge, font) + size
     draw.rounded_rectangle((x, y, right, y + 1.6 * size), 0.5 * size, VERDICT_COLOURS[word])
     draw.text((x + size / 2, y + 0.8 * size), badge, PAPER, font, anchor="lm")
@@ -178,4 +178,4 @@ def _small_pictures(
 
 def _rival(result: Registration, index: int) -> str:
     angle = f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° away"
-    return f"{angle} ({result.probabilities[index]:.2f})" if result.probabilities else angle
+    return f"{angle} ({two_decimals(result.probabilities[index])})" if result.probabilities else angle

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.result import verdict
+from ..registration.result import two_decimals, verdict
 from .contours import draw_window
 from .overlay import VERDICT_COLOURS
 
@@ -98,5 +98,5 @@ def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, 
     if isinstance(result, FailedRegistration):
         return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS["no match"]
     word = verdict(result.confidence, result.none, result.reliable)
-    number = "" if result.confidence is None else f", confidence {result.confidence:.2f}"
+    number = "" if result.confidence is None else f", confidence {two_decimals(result.confidence)}"
     return word + number, VERDICT_COLOURS[word]

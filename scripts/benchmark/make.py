@@ -211,25 +211,21 @@ class Furniture(Packages):
                 continue
 
 
-def write_models(objects: Packages, folder: Path) -> None:
-    """Write BOP's ``models`` folder: PLY files in mm with one texture each, and ``models_info.json``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    info = {}
-    for obj_id in tqdm(objects.written, desc="models"):
-        mesh, path = objects.mesh(obj_id), folder / f"obj_{obj_id:06d}.ply"
-        if not path.exists():
-            mesh.save_ply(path)
-        low, high = 1000.0 * mesh.hull.min(axis=0), 1000.0 * mesh.hull.max(axis=0)
-        row = {"diameter": 1000.0 * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())}
-        row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
-        row |= {f"size_{c}": float(x) for c, x in zip("xyz", high - low, strict=True)}
-        discrete = []
-        for S in objects.symmetries(obj_id)[1:]:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = S, 1000.0 * (mesh.centre - S @ mesh.centre)
-            discrete.append(T.round(6).ravel().tolist())
-        info[str(obj_id)] = row | ({"symmetries_discrete": discrete} if discrete else {})
-    write_json(folder / "models_info.json", info)
+def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
+    """Write the model of an object, a PLY file in mm with one texture, unless it exists; its row of models_info."""
+    mesh, path = objects.mesh(obj_id), folder / f"obj_{obj_id:06d}.ply"
+    if not path.exists():
+        mesh.save_ply(path)
+    low, high = 1000.0 * mesh.hull.min(axis=0), 1000.0 * mesh.hull.max(axis=0)
+    row = {"diameter": 1000.0 * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())}
+    row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
+    row |= {f"size_{c}": float(x) for c, x in zip("xyz", high - low, strict=True)}
+    discrete = []
+    for S in objects.symmetries(obj_id)[1:]:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = S, 1000.0 * (mesh.centre - S @ mesh.centre)
+        discrete.append(T.round(6).ravel().tolist())
+    return row | ({"symmetries_discrete": discrete} if discrete else {})
 
 
 def compose(objects: Packages, options: argparse.Namespace, index: int, attempt: int) -> tuple[Scene, dict[int, Any]]:
@@ -356,6 +352,11 @@ def _one(index: int) -> list[list[float]]:
     return make_scene(*_state, index)
 
 
+def _model(obj_id: int) -> dict[str, Any]:
+    objects, options = _state
+    return model_row(objects, options.out / "models", obj_id)
+
+
 def arguments() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kind", choices=KINDS, default="printed")
@@ -383,8 +384,12 @@ def main() -> None:
     _start(options)
     objects = _state[0]
     (options.out / "test").mkdir(parents=True, exist_ok=True)
-    write_models(objects, options.out / "models")
+    models = options.out / "models"
+    models.mkdir(exist_ok=True)
+    ids = objects.written
     with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
+        rows = list(tqdm(pool.map(_model, ids, chunksize=4), total=len(ids), desc="models"))
+        write_json(models / "models_info.json", {str(k): row for k, row in zip(ids, rows, strict=True)})
         list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
     kept = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items() if k not in ("out", "jobs")}
     groups = {obj_id: objects.group(obj_id % TWIN) for obj_id in objects.written}

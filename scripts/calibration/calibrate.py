@@ -259,7 +259,8 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     samples, other = [data[i] for i in indices], data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
     mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
-    if kind in GREY and samples[0]["obj_id"] % 3 == 0:
+    grey = kind in GREY and samples[0]["obj_id"] % 3 == 0
+    if grey:
         mesh.visual = trimesh.visual.ColorVisuals()
     mesh_is = "similar" if "similar" in kind else "exact"
     registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is=mesh_is)
@@ -275,7 +276,7 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
         )
         found = [(s, row) for s in samples for row in method(s)]
     groups = json.loads((folder / "benchmark.json").read_text())["groups"]
-    more = {"set": kind, "object": samples[0]["obj_id"]}
+    more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
     return [{"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row} for s, row in found]
 
 
@@ -348,19 +349,18 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some pose is right and some
     are not; without ``ties`` the resolution is 0."""
-    cases = []
-    for row, w in zip(rows, weight, strict=True):
-        right = np.array(row["errors"]) < RIGHT
-        if row["right"] and not right.all():
-            scores = np.array(row["scores"])
-            cases.append((scores.max() - scores, right, w))
+    decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
+    most = max((len(rows[k]["scores"]) for k in decided), default=1)
+    behind, right = np.full((len(decided), most), np.inf), np.zeros((len(decided), most), bool)
+    for place, k in enumerate(decided):
+        scores = np.array(rows[k]["scores"])
+        behind[place, : len(scores)] = scores.max() - scores
+        right[place, : len(scores)] = np.array(rows[k]["errors"]) < RIGHT
 
     def loss(slope: float, resolution: float) -> float:
-        total = 0.05 * slope**2
-        for behind, right, w in cases:
-            logits = -slope * np.maximum(0.0, behind - resolution)
-            total += w * (logsumexp(logits) - logsumexp(logits[right]))
-        return float(total)
+        logits = -slope * np.maximum(0.0, behind - resolution)
+        of_right = np.where(right, logits, -np.inf)
+        return float(weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1)) + 0.05 * slope**2)
 
     found = []
     for resolution in RESOLUTIONS if ties else (0.0,):
@@ -412,7 +412,9 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     first = np.array([row["first"] for row in rows])
     quality = quality_of(p, first, weight)
     by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
-    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items()}
+    by_set["grey"] = np.array([row["grey"] for row in rows])
+    by_set["with colours"] = ~by_set["grey"]
+    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items() if own.any()}
     return fit(np.full(len(rows), True)), quality
 
 

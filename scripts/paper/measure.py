@@ -1,7 +1,7 @@
 """What the paper measures, for the photographs of one mesh: values that its tables are made of.
 
 Ranking is by the paper's S_hog and S_rep alone, in two variants: ``literal`` is the preset ``paper``; ``corrected`` has
-what docs/method.md corrects, in perspective views of the mesh in its own frame.
+what docs/method.md corrects, with S_hog as a cosine, in perspective views of the mesh in its own frame.
 """
 
 import math
@@ -50,7 +50,8 @@ def variants(pose: str) -> dict[str, Pipeline]:
     """The two variants of the paper's ranking and search."""
     literal = PRESETS["paper"]
     corrected = replace(literal, views=ViewPolicy(pose), bank=BankSettings())
-    return {"literal": literal, "corrected": corrected.with_term("repeatability", mode="monotone")}
+    corrected = corrected.with_term("repeatability", mode="monotone").with_term("hog", whitening="none")
+    return {"literal": literal, "corrected": corrected}
 
 
 def photo_fields(variant: str) -> dict[str, nn.Module]:

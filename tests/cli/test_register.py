@@ -8,6 +8,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
+from curvireg_torch.cli.register import _advice
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
@@ -210,3 +211,17 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, regi
     assert register_one(*words, box=()) == 2
     assert document()["status"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err
+
+
+def test_advice_names_what_was_measured_or_says_less():
+    document = {"warnings": [], "ambiguous": None, "translation": [0, 0, 1], "edge_support": 0.1}
+    document["confidence_features"] = {"border": 0, "undetermined": 0.1}
+    assert "contours" not in _advice(document), "few edges alone are no cause"
+    for change, words in (
+        ({"warnings": ["?"]}, "what the warning names"),
+        ({"ambiguous": "half turn"}, "more than one pose"),
+        ({"confidence_features": {"border": 1}}, "border of the photograph"),
+        ({"translation": None}, "--camera"),
+        ({"confidence_features": {"border": 0, "undetermined": 1.2}}, "rotation open"),
+    ):
+        assert words in _advice({**document, **change})

@@ -470,6 +470,10 @@ def test_yaml_cannot_blow_up_or_run_code(tmp_path):
     file.write_text("- " * 2000 + "1")
     with pytest.raises(InvalidInputError, match=r"nested too deeply|key: value"):
         load_camera(file)
+    for depth, words in ((45, "no camera matrix"), (55, "nested too deeply")):
+        file.write_text("a: " + "[" * depth + "1" + "]" * depth)
+        with pytest.raises(InvalidInputError, match=words):
+            load_camera(file)
     file.write_text(f"a: !!python/object/apply:os.mkdir [{tmp_path}/made]\nfx: 1\n")
     with pytest.raises(InvalidInputError, match="expected 9 numbers, or fx, fy, cx, cy, got 1"):
         load_camera(file)

@@ -91,3 +91,10 @@ def test_arrays_of_labels_are_read_as_files_are():
     assert torch.equal(item.mask, torch.from_numpy(OBJECT).float())
     with pytest.raises(InvalidInputError, match=r"labels 2, 5; .* mask == LABEL"):
         image_item(torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8)))
+
+
+def test_soft_borders_of_a_white_object_are_kept(tmp_path):
+    soft = cv2.blur(255 * OBJECT.astype(np.uint8), (3, 3))
+    file = written(tmp_path / "soft.png", soft)
+    assert np.allclose(read_mask(file), soft / 255.0)
+    assert len(np.unique(read_mask(file))) > 3

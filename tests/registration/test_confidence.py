@@ -84,8 +84,8 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 def test_confidence_features():
     evidence = torch.tensor(
-        [[0.0, 0.7, 0.4, 1.0, 2.0], [-1.0, 0.6, 0.5, 0.4, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0]], dtype=torch.float64
-    )
+        [[0.0, 0.7, 0.4, 1.0, 2.0, 0.5], [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0]]
+    ).double()
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
     expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0, **doubts}

@@ -160,7 +160,7 @@ def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch,
         assert len(result.error.with_subject("photo.jpg").detection.boxes) > 1
         assert isinstance(result.error, LostObjectError)
         place = corners(one.box.tolist())
-        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.10; give a box"
+        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.09; give a box"
         assert str(result.error) == f"image 0: not found: {message}"
 
 

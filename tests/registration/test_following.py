@@ -1,15 +1,16 @@
 """Following: generated sequences with bounded errors, frames without the object, and starts that are wrong."""
 
 import json
+import math
 from unittest.mock import Mock
 
 import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.errors import LostObjectError
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.registration import FailedRegistration, Follower, following
+from curvireg_torch.registration import FailedRegistration, Follower, following, refine
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
 from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, sequence, truck_registrar
@@ -182,3 +183,28 @@ def test_follower_loses_an_absent_object_and_finds_it_again():
     assert not lost.ok or lost.confidence < BELIEVED_CONFIDENCE
     result = follow(frames[1][0])
     assert errors(result, frames[1][2])[0] < 4.0
+
+
+@pytest.mark.parametrize("confidence", [math.nan, 1.5, -0.1, "sure"])
+def test_a_start_needs_a_probability(confidence):
+    image, _, T = sequence(1)[0]
+    with pytest.raises(InvalidInputError, match="confidence"):
+        Follower(truck_registrar(), CAMERA).start(image, T, confidence=confidence)
+    with pytest.raises(InvalidInputError, match="start_confidences"):
+        refine(truck_registrar(), [image], CAMERA, [T], start_confidences=[confidence])
+
+
+def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(monkeypatch):
+    """What decides is the confidence that is reported: that of the start times the tracker's."""
+    frames = sequence(2)
+    for confidence, checks in ((1.0, 0), (0.45, 1), (0.0, 1)):
+        calls = []
+        follow = Follower(learned_registrar(), CAMERA)
+        follow.start(frames[0][0], frames[0][2], confidence=confidence)
+        refined = following.refine_item
+        monkeypatch.setattr(following, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1])
+        monkeypatch.setattr(follow, "_registered", lambda *_: pytest.fail("the given pose was dropped"))
+        result = follow(frames[1][0])
+        monkeypatch.undo()
+        assert len(calls) == checks
+        assert errors(result, frames[1][2])[0] < 5.0

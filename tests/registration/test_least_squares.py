@@ -1,5 +1,7 @@
 """Least squares over poses: derivatives, bounded steps, the covariance in closed form and against injected noise."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -132,3 +134,32 @@ def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle
     assert float(axis @ T[:3, 2]) > 0.985
     assert float((axis @ C @ axis).sqrt()) > 1.0
     assert float(torch.linalg.eigvalsh(C)[0].sqrt()) < 0.2  # other rotations are known
+
+
+@pytest.mark.parametrize("unit", [1e-3, 80.0])
+@pytest.mark.parametrize("across", [False, True])
+def test_covariance_follows_the_unit_of_the_mesh(unit, across):
+    """Also of what is unknown: with normals along x alone, the translation along y."""
+    points, T, centre, J = cloud(60)
+    if across:
+        points = replace(points, normals=torch.tensor([1.0, 0.0]).double().expand(1, 60, 2))
+        _, J = ls.project(points.model, points.normals, T, K[None], centre)
+    generator = torch.Generator().manual_seed(1)
+    W, d = (torch.rand(1, 60, 1, generator=generator, dtype=torch.float64) for _ in range(2))
+    C, known = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    scaled = T.clone()
+    scaled[:, :3, 3] *= unit
+    S = torch.tensor([1.0, 1.0, 1.0, unit, unit, unit], dtype=torch.float64)
+    larger = replace(points, model=unit * points.model)
+    measured = ls.Measurements(J / S, d, W)
+    found, directions = ls.pose_covariance(measured, larger, scaled, K[None], unit * centre, radius=1.7 * unit)
+    assert int(directions) == int(known) == (6 if not across else int(known))
+    assert int(known) < 6 or not across
+    torch.testing.assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 80.0])
+def test_long_steps_are_shortened_by_the_distance_in_any_unit(unit):
+    T, centre = pose([0.0, 0.0, 0.0], [0.0, 0.0, 3.0 * unit])[None], unit * torch.tensor([0.0, 0.0, 0.5]).double()
+    step = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]], dtype=torch.float64)
+    assert ls.step_fraction(step, T, centre).tolist() == [pytest.approx(ls.MAX_TRANSLATION)]

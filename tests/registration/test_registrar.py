@@ -14,7 +14,7 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, contour_fit
+from curvireg_torch.registration import FailedRegistration, Follower, contour_fit, refits
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
@@ -111,9 +111,9 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, 3))
+    features = F.pad(similarity[:, None], (1, 4))
     outside = torch.tensor([False, False, True, False])
-    assert registrar_module._best_inside(features, outside).tolist() == [1]
+    assert refits.best_inside(features, outside).tolist() == [1]
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])

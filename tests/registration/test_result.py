@@ -18,6 +18,7 @@ from curvireg_torch.registration.result import (
     pose_in_words,
     remarks,
     result_document,
+    two_decimals,
     verdict,
 )
 
@@ -105,6 +106,12 @@ def test_pose_and_verdict_in_words():
     assert verdict(None, None, False) == "unsure"
 
 
+def test_confidence_is_never_shown_as_more_than_it_is():
+    shown = [two_decimals(p) for p in (0.897, 0.8999, 0.9, 0.29, 0.57, 0.0, 1.0)]
+    assert shown == ["0.89", "0.89", "0.90", "0.29", "0.57", "0.00", "1.00"]
+    assert "confidence 0.89" in repr(registration(confidence=0.897))
+
+
 def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
     return torch.stack([rotation_from_viewpoint(d, elevation, 0.0).double() for d in degrees])
 
@@ -125,7 +132,12 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
     sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
     assert sure.reliable
     changes = [{"warnings": ("the camera is questionable",)}, {"prior_contradiction": "better outside"}]
-    for change in ({"probabilities": (0.89, 0.0)}, {"probabilities": ()}, *changes):
+    for change in (
+        {"probabilities": (0.89, 0.0)},
+        {"probabilities": (torch.nan, 0.0)},
+        {"probabilities": ()},
+        *changes,
+    ):
         assert not replace(sure, **change).reliable
     assert replace(sure, prior_contradiction="at the limit").reliable
     # Not where all three rotations are unknown, as those of a sphere.

@@ -1,12 +1,13 @@
 """Several photographs of the truck from a rig of cameras: one pose in the world."""
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 from torch import Tensor
 
-from curvireg_torch import Registration, rotation_error, rotation_from_viewpoint
+from curvireg_torch import Registrar, Registration, rotation_error, rotation_from_viewpoint
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -209,3 +210,26 @@ def test_bad_rigs_name_the_photograph():
         registered(images, boxes[:2], cameras)
     with pytest.raises(InvalidInputError, match="needs the camera matrix"):
         learned_registrar().register_views(images, boxes, None, cameras)
+
+
+def test_copies_of_a_photograph_are_no_evidence():
+    images, boxes, cameras = rig_of(IN_DOUBT, noise=0.3)
+    once = registered(images[:1], boxes[:1], cameras[:1])
+    thrice = registered(images[:1] * 3, boxes[:1] * 3, cameras[:1].repeat(3, 1, 1))
+    assert thrice.probabilities == pytest.approx(once.probabilities)
+    assert torch.equal(thrice.transform, once.transform)
+    assert [view.failure for view in thrice.views] == [None, *["a copy of image 0, which counts once"] * 2]
+
+
+def test_rigs_compare_rivals_that_are_not_reported():
+    """Of each photograph five, though one is reported."""
+    images, boxes, cameras = rig_of(IN_DOUBT, noise=0.3)
+    bank = learned_registrar().bank
+    results = []
+    for hypotheses in (1, 5):
+        registrar = Registrar(bank, pipeline=replace(bank.pipeline, hypotheses=hypotheses))
+        results.append(registrar.register_views(images, boxes, CAMERA, cameras))
+    one, five = results
+    assert (len(one.hypotheses), len(one.probabilities)) == (1, 1)
+    assert one.confidence == pytest.approx(five.confidence)
+    assert one.confidence_features == pytest.approx(five.confidence_features)

@@ -159,3 +159,19 @@ def test_a_long_header_of_ppm_is_refused():
     for header in (b"P6 " + b" " * (room + 1) + b"1 1 255\n", b"P5 1 1", b"P5 1 1 x ", b"P5 1 12345678901 255 "):
         with pytest.raises(ImageError, match="long header; convert it to JPEG or PNG"):
             open_picture(header + b"abc")
+
+
+def test_pillow_is_given_the_one_decoder_that_the_first_bytes_name(monkeypatch):
+    """Else it would ask all of them when the right one refuses a damaged file."""
+    asked = []
+
+    def refuse(_, formats=None):
+        asked.append(formats)
+        raise OSError("damaged")
+
+    png = _saved("PNG")
+    monkeypatch.setattr(Image, "open", refuse)
+    for data in (png, b"BM" + bytes(50), b"\xff\xd8\xff" + bytes(50)):
+        with pytest.raises(ImageError, match=r"damaged or truncated \(damaged\)"):
+            open_picture(data)
+    assert asked == [["PNG"], ["BMP"], ["JPEG"]]
