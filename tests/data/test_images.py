@@ -1,3 +1,4 @@
+import math
 import struct
 import tracemalloc
 import zlib
@@ -229,3 +230,25 @@ def test_a_dark_pgm_is_not_stretched_as_it_names_its_largest_value(tmp_path):
     photo = read_photo(tmp_path / "a.pgm")
     assert photo.image[0, 0].tolist() == [0, 10]
     assert photo.notes == ("grey: three equal channels",)
+
+
+def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
+    tags = Image.Exif()
+    tags[0x0112] = 6  # turned by a quarter
+    tags.get_ifd(0x8769).update({0xA405: 26, 0xA002: 400, 0xA003: 300})
+    diagonal = math.hypot(36.0, 24.0)
+    for size, focal in (((400, 300), 500.0), ((200, 150), 250.0), ((200, 200), 500.0), ((500, 300), None)):
+        path = tmp_path / "photo.jpg"
+        Image.new("RGB", size).save(path, exif=tags)
+        photo = read_photo(path)
+        with Image.open(path) as picture:
+            same = images.photo_of_picture(picture)
+        assert tuple(photo.image.shape[1:]) == tuple(same.image.shape[1:]) == size
+        camera = photo.camera()
+        if focal is None:
+            assert camera is same.camera() is None, "larger than what the camera took"
+            continue
+        assert float(camera.matrix[0, 0]) == pytest.approx(26 * focal / diagonal)
+        assert torch.equal(camera.matrix, same.camera().matrix)
+        assert (camera.source, camera.focal_deviation) == ("exif", 0.05)
+        assert camera.matrix[:2, 2].tolist() == [(size[1] - 1) / 2, (size[0] - 1) / 2]
