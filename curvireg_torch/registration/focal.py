@@ -27,16 +27,16 @@ FIELDS_OF_VIEW = (12.0, 25.0, 45.0, 65.0, 85.0)
 TRIED_VIEWS = 8
 """Best distinct views that are tried with each field of view."""
 
-USUAL_FOCAL, USUAL_DEVIATION = 1.0, 0.7
+USUAL_FOCAL, USUAL_DEVIATION = 0.8, 0.7
 """Focal length of unknown cameras as a multiple of the photograph's longer side, and standard deviation of its
 logarithm: telephones have about 0.75, telephoto lenses 5."""
 
 FOCAL_LIMITS = (0.35, 8.0)
 """Multiples of the longer side that an estimated focal length stays within: 110 and 7 degrees."""
 
-FITTED_DEVIATION = 2.5
-"""Deviation of the prior while an unknown focal length is fitted: it decides only where perspective tells nothing, as
-edges that do not belong to the object pull less in common than ``FOCAL_SCALE`` allows for."""
+FITTED_DEVIATION, FITTED_REACH = 0.5, 0.35
+"""Deviation of the prior while an unknown focal length is fitted, and difference of log f from which its pull does not
+grow: telephones are the rule, and what is far from them must not be pulled far."""
 
 FOCAL_SCALE = 16.0
 """Factor of the least-squares variance of log f, chosen on generated photographs and on photographs with cameras."""
@@ -90,12 +90,13 @@ def starts_of_fields(describer: ViewDescriber, crops: EdgeCrops, starts: Sequenc
 @dataclass(frozen=True)
 class FocalPrior:
     """What is known of the focal lengths of N poses: log f is ``log_zoom`` (N,) more than that of their cameras, with a
-    standard ``deviation``, and stays within ``low`` and ``high`` (N,) of it."""
+    standard ``deviation``, and stays within ``low`` and ``high`` (N,) of it. Beyond ``reach``, its pull is constant."""
 
     log_zoom: Tensor
     deviation: float
     low: Tensor
     high: Tensor
+    reach: float = math.inf
 
     @staticmethod
     def usual(cameras: Tensor, size: tuple[int, int]) -> "FocalPrior":
@@ -103,7 +104,7 @@ class FocalPrior:
         longer = float(max(size))
         log = (cameras[:, 0, 0] / longer).log()
         low, high = (math.log(limit) - log for limit in FOCAL_LIMITS)
-        return FocalPrior(math.log(USUAL_FOCAL) - log, FITTED_DEVIATION, low, high)
+        return FocalPrior(math.log(USUAL_FOCAL) - log, FITTED_DEVIATION, low, high, FITTED_REACH)
 
     @staticmethod
     def of(item: ImageItem, cameras: Tensor) -> "FocalPrior":
@@ -132,14 +133,16 @@ def fit_focal_length(problem: ContourProblem, T: Tensor, prior: FocalPrior, radi
     state = problem.state(T)
     for radius in radii:
         information, _ = focal_information(problem, state, radius)
-        pull = information.scale / prior.deviation**2
+        stiffness = information.scale / prior.deviation**2
         for _ in range(STEPS_PER_ROUND):
             uv, J = project(state.points.model, state.points.normals, state.T, problem.K, problem.centre)
             J = torch.cat([J, _by_focal_length(problem, state, uv, J)[..., None]], dim=-1)
+            gap = prior.log_zoom - log_zoom
+            pull = stiffness * (prior.reach / gap.abs().clamp(min=1e-9)).clamp(max=1.0)
             A = torch.zeros(len(T), 7, 7, dtype=torch.float64)
             A[:, 6, 6] = pull
             b = torch.zeros(len(T), 7, 1, dtype=torch.float64)
-            b[:, 6, 0] = pull * (prior.log_zoom - log_zoom)
+            b[:, 6, 0] = pull * gap
             step = problem.selected_step(state.points, uv, J, radius, [(A, b)])
             fraction = problem.step_fraction(step[:, :6], state.T)
             fraction = torch.minimum(fraction, MAX_FOCAL_STEP / step[:, 6].abs().clamp(min=1e-9))

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 
+SAME_SCORE = 0.2
+"""Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge support."""
+
+
 def limits_of(registrar: "Registrar", item: ImageItem) -> Limits:
     """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens them."""
     assert item.prior is not None
@@ -64,14 +68,15 @@ def with_possible_cameras(registrar: "Registrar", work: Work) -> Work:
 def with_fitted_focal_lengths(
     registrar: "Registrar", work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
 ) -> tuple[Poses, Tensor]:
-    """The best poses fitted together with their focal lengths, where that does not lower their scores."""
+    """The best poses fitted together with their focal lengths, where that does not lower their scores noticeably: where
+    perspective tells nothing, a usual focal length is better than one of those tried."""
     scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
     count = FITTED if work.starts is not None else 1
     best = scores.topk(min(count, int((~outside).sum()))).indices
     for index in best.split(1):
         fitted = with_focal_length(registrar.describer, crops, poses[index], work.item)
         new = registrar.features_of(work, fitted)
-        if bool(pose_scores(new, exact=True) >= scores[index]):
+        if bool(pose_scores(new, exact=True) >= scores[index] - SAME_SCORE):
             poses, features = registrar.replaced(work, poses, features, index, fitted, new)
     return poses, features
 

@@ -8,22 +8,33 @@ import torch
 from torch import Tensor
 
 
-def least_times(functions: Sequence[Callable[[], object]], rounds: int, seconds: float) -> list[float]:
-    """Least processor time in s of each function; the functions run in turn, so that all meet the same conditions."""
+def least_times(
+    functions: Sequence[Callable[[], object]], rounds: int, seconds: float, device: str = "cpu"
+) -> list[float]:
+    """Least time in s of each function, on a CPU that of the processor, on a GPU until it has finished; the functions
+    run in turn, so that all meet the same conditions."""
     repeats = []
     for function in functions:
         function()
-        start = time.process_time()
-        function()
-        repeats.append(max(1, int(seconds / max(time.process_time() - start, 1e-6))))
+        repeats.append(max(1, int(seconds / max(_mean_time(function, 1, device), 1e-6))))
     least = [math.inf] * len(functions)
     for _ in range(rounds):
         for k, (function, count) in enumerate(zip(functions, repeats, strict=True)):
-            start = time.process_time()
-            for _ in range(count):
-                function()
-            least[k] = min(least[k], (time.process_time() - start) / count)
+            least[k] = min(least[k], _mean_time(function, count, device))
     return least
+
+
+def _mean_time(function: Callable[[], object], count: int, device: str) -> float:
+    on_gpu = device != "cpu"
+    clock = time.perf_counter if on_gpu else time.process_time
+    if on_gpu:
+        torch.cuda.synchronize()
+    start = clock()
+    for _ in range(count):
+        function()
+    if on_gpu:
+        torch.cuda.synchronize()
+    return (clock() - start) / count
 
 
 def forward(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:

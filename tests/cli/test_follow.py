@@ -167,3 +167,10 @@ def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 2
     assert "results.csv: not written by this command" in capsys.readouterr().err
     assert (tmp_path / "results.csv").read_text() == "of others"
+
+
+def test_the_message_of_a_tally_is_that_of_the_first_frame():
+    tally = Tally()
+    for message in ("first", "second"):
+        tally.add({"status": "failed", "message": message}, 1.0)
+    assert (tally.first_message, tally.frames) == ("first", 2)

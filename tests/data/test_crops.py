@@ -64,6 +64,8 @@ def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> No
 
 def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(tmp_path: Path) -> None:
     write_bop(tmp_path)
+    # One scene has no boxes: they are those of the mesh, if it can be read.
+    tmp_path.joinpath("models", "obj_000001.ply").write_text("ply")
     dataset = BOPDataset(tmp_path, targets=False)
     cropped = crops(dataset, 16)
     unknown = sum(bool(dataset.annotation(i)["box"].isnan().any()) for i in range(len(dataset)))

@@ -222,3 +222,10 @@ def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count
     pages[0].save(tmp_path / "b.tif", tiffinfo={254: 1}, save_all=True, append_images=pages[1:])
     with pytest.raises(ImageError, match="holds thumbnails only"):
         read_photo(tmp_path / "b.tif")
+
+
+def test_a_dark_pgm_is_not_stretched_as_it_names_its_largest_value(tmp_path):
+    (tmp_path / "a.pgm").write_bytes(b"P5 2 1 65535\n" + np.array([0, 2570], ">u2").tobytes())
+    photo = read_photo(tmp_path / "a.pgm")
+    assert photo.image[0, 0].tolist() == [0, 10]
+    assert photo.notes == ("grey: three equal channels",)

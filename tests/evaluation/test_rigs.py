@@ -167,3 +167,9 @@ def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
     (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
     with pytest.raises(InvalidInputError, match=r"image 0: cam_K in scene_camera\.json"):
         read_rig(tmp_path)
+
+
+def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_path):
+    (tmp_path / "cameras.txt").write_text(LINE)
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 7\n2 1 0 0 0 0 0 1 1 8\n")
+    assert [view.name for view in read_rig(tmp_path)] == ["image 7", "image 8"]

@@ -162,6 +162,15 @@ def test_hooks_of_the_field_run(small_bank: ViewBank) -> None:
     assert torch.equal(matcher.query(image[None], box[None]).field, plain.field)
 
 
+@pytest.mark.parametrize("kind", ["forward_pre_hook", "forward_hook", "full_backward_hook", "full_backward_pre_hook"])
+def test_a_hook_of_any_kind_calls_the_field(kind: str) -> None:
+    field, called = LearnedCurvilinearSaliency(), []
+    getattr(field, f"register_{kind}")(lambda *_: called.append(kind))
+    crops = torch.rand(1, 3, 32, 32, requires_grad=True)
+    terms.photograph_field(field, crops)[0].sum().backward()
+    assert called == [kind]
+
+
 @pytest.mark.parametrize("register", ["register_module_forward_hook", "register_module_forward_pre_hook"])
 def test_hooks_of_all_modules_see_the_field(register: str) -> None:
     field, seen = LearnedCurvilinearSaliency(), []

@@ -64,6 +64,7 @@ def test_colours_stay_with_their_faces() -> None:
         joined(box(), box((100.0, 0.0, 0.0), (4.0, 4.0, 4.0))),  # 0.9 % of the area
         joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),  # a thin mast on the top
         joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),  # a chip near the surface
+        joined(box(), *(triangle(1.0, (30.0 + 7.0 * k, 0.0, 0.0)) for k in range(1, 6))),  # a row of chips, 7 apart
         joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),  # a knob above a plate's middle
         joined(box(), box(sides=(200.0, 200.0, 200.0))),
         joined(*(triangle(5.0, (float(k * k), float(k), 0.0)) for k in range(60))),  # a soup of loose triangles
@@ -71,7 +72,7 @@ def test_colours_stay_with_their_faces() -> None:
         triangle(1.0, (0.0, 0.0, 0.0)),
         box(sides=(1000.0, 1.0, 1.0)),
     ],
-    ids=["body", "mast", "chip", "knob", "inside", "soup", "sphere", "triangle", "rod"],
+    ids=["body", "mast", "chip", "row", "knob", "inside", "soup", "sphere", "triangle", "rod"],
 )
 def test_parts_that_belong_to_the_object_stay(whole: trimesh.Trimesh) -> None:
     assert not stray_faces(whole).any()

@@ -216,7 +216,7 @@ def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
     unknown = replace(item, camera_matrix=None)
     assert torch.equal(_allowed_views(cr.Registrar(bank(), mesh_is="similar"), unknown), degrees <= 8.5)
-    usual = math.degrees(math.atan(150 / 240))
+    usual = math.degrees(math.atan(150 / (0.8 * 240)))
     assert torch.equal(_allowed_views(registrar, unknown), degrees <= 8.5 + usual), "an unknown camera is a usual one"
 
 

@@ -117,6 +117,24 @@ def test_jobs_that_have_not_started_are_cancelled_after_an_error() -> None:
     assert len(done) < 100
 
 
+def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller() -> None:
+    done: list[int] = []
+
+    def job(number: int) -> None:
+        time.sleep(0.01)
+        done.append(number)
+
+    def submit_and_fail() -> None:
+        with threads.single_threaded_pool() as pool:
+            for number in range(200):
+                pool.submit(job, number)
+            raise ValueError("caller")
+
+    with pytest.raises(ValueError, match="caller"):
+        submit_and_fail()
+    assert len(done) < 100
+
+
 @pytest.mark.parametrize("gradients", [True, False])
 def test_jobs_record_gradients_as_their_caller_does(gradients: bool) -> None:
     with torch.set_grad_enabled(gradients):
