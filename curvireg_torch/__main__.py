@@ -5,7 +5,8 @@ import signal
 import sys
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # while modules are imported, Ctrl-C ends the process without a trace
+    # while modules are imported, Ctrl-C ends the process without a trace
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from .cli import main as run
 
@@ -14,7 +15,8 @@ def main() -> int:
     """Run one command, see :func:`curvireg_torch.cli.main`."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    gc.set_threshold(10_000)  # imports make 400,000 objects that stay: look for cycles among them less often
+    # imports make 400,000 objects that stay: look for cycles among them less often
+    gc.set_threshold(10_000)
     code = run()
     gc.freeze()  # and not at exit
     return code

@@ -1,10 +1,12 @@
 """The errors that this library raises.
 
-All derive from :class:`CurviregError`, so ``except CurviregError`` catches them together. Each also derives from the
-built-in error that fits, so ``except ValueError`` works too. A message is one line: what is wrong and what to do.
+All derive from :class:`CurviregError`, so ``except CurviregError`` catches them together. Each also
+derives from the built-in error that fits, so ``except ValueError`` works too. A message is one
+line: what is wrong and what to do.
 
-Input files are untrusted: a file beyond one of the limits below is refused with an error that names the limit. Readers
-use no network, and open only the named file and, for meshes, files that it names in its folder or a given one.
+Input files are untrusted: a file beyond one of the limits below is refused with an error that names
+the limit. Readers use no network, and open only the named file and, for meshes, files that it names
+in its folder or a given one.
 """
 
 from copy import copy
@@ -16,7 +18,8 @@ class _SubjectError(Exception):
 
     def __init__(self, message: str = "", *, subject: object = "") -> None:
         super().__init__(message)
-        self.message, self.subject = message, str(subject)
+        self.message = message
+        self.subject = str(subject)
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.message}" if self.subject else self.message
@@ -33,8 +36,8 @@ class CurviregError(_SubjectError):
 
     Attributes:
         message: what is wrong and what to do.
-        subject: the file, photograph or option that the error is about, "" if the message names it. ``str(error)`` is
-            ``"subject: message"``.
+        subject: the file, photograph or option that the error is about, "" if the message names it.
+            ``str(error)`` is ``"subject: message"``.
 
     Example:
         >>> error = ImageError("truncated; download it again", subject="photo.jpg")
@@ -44,7 +47,8 @@ class CurviregError(_SubjectError):
 
 
 class CurviregWarning(_SubjectError, UserWarning):  # noqa: N818
-    """A file is usable, but perhaps not what the user means; fields as of :class:`CurviregError`."""
+    """A file is usable, but perhaps not what the user means; fields as of
+    :class:`CurviregError`."""
 
 
 class InvalidInputError(CurviregError, ValueError):
@@ -68,10 +72,12 @@ class MissingFileError(CurviregError, FileNotFoundError):
 
 
 class LostObjectError(CurviregError, ValueError):
-    """The object is not found in a photograph without a box, or not near the pose that a refinement started from.
+    """The object is not found in a photograph without a box, or not near the pose that a refinement
+    started from.
 
     Attributes:
-        detection: the :class:`.Detection` of the most likely place, with all proposals, in a photograph without a box.
+        detection: the :class:`.Detection` of the most likely place, with all proposals, in a
+            photograph without a box.
     """
 
     detection: Any = None
@@ -90,24 +96,30 @@ class RenderingError(CurviregError, RuntimeError):
 
 
 MAX_IMAGE_BYTES = 1 << 28  #: Bytes of an image file
-MAX_IMAGE_PIXELS = 89_478_485  #: Width times height in the header, before anything is decoded: Pillow's limit
-#: Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the whole picture.
+#: Width times height in the header, before anything is decoded: Pillow's limit
+MAX_IMAGE_PIXELS = 89_478_485
+#: Scans of a progressive JPEG. Encoders write about ten, and each takes as long to decode as the
+#: whole picture.
 MAX_IMAGE_SCANS = 64
 MAX_BOX_COORDINATE = 1e6  #: Distance of a box's corner from the origin, px; no image is that wide
 MAX_MESH_BYTES = 1 << 29  #: Bytes of a mesh file, and of all the buffers of a glTF file together
 MAX_MESH_FACES = 10_000_000  #: Triangles of a mesh; every copy of a part counts
-MAX_MESH_LINES = 50_000_000  #: Lines of a text file with polygons; each takes some 50 bytes more than its text
-#: Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay finite
+#: Lines of a text file with polygons; each takes some 50 bytes more than its text
+MAX_MESH_LINES = 50_000_000
+#: Distance of a vertex from the origin along an axis, in the file's unit; squares and products stay
+#: finite
 MAX_MESH_COORDINATE = 1e12
-#: Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no views
+#: Longest side of a mesh's box, in the file's unit; of smaller ones single precision computes no
+#: views
 MIN_MESH_EXTENT = 1e-6
-#: Nodes with a mesh in a glTF scene; parts, materials and libraries of an OBJ file; files that a mesh names
+#: Nodes with a mesh in a glTF scene; parts, materials and libraries of an OBJ file; files that a
+#: mesh names
 MAX_MESH_PARTS = 10_000
 MAX_CAD_BYTES = 1 << 27  #: Bytes of a STEP, IGES or Collada file
 MAX_CAD_SECONDS = 300  #: Time in which OpenCASCADE must have made triangles of a STEP or IGES file
 MAX_TEXTURE_PIXELS = 1 << 28  #: Pixels of all textures of a mesh together: 16 of 4096 x 4096
-#: Sum of squared corners of all concave faces, which bounds the time of their division: a million quads, or five faces
-#: of 2000 corners
+#: Sum of squared corners of all concave faces, which bounds the time of their division: a million
+#: quads, or five faces of 2000 corners
 MAX_POLYGON_WORK = 20_000_000
 #: Bytes of a JSON or CSV file, 32 MiB; rows of a CSV of poses take up to 60 times as much memory
 MAX_TABLE_BYTES = 1 << 25
@@ -115,8 +127,10 @@ MAX_LIST_COLUMNS = 1000  #: Columns of a list of photographs; each row has a tex
 MAX_RIG_VIEWS = 10_000  #: Photographs of a rig
 MAX_CAMERA_BYTES = 1 << 22  #: Bytes of a calibration file
 MAX_MAT_BYTES = 1 << 20  #: Bytes of a MATLAB annotation file, and of what it unpacks to
-#: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a notice
+#: Triangles that the viewer sends to the browser, 96 bytes each; for larger meshes it shows a
+#: notice
 MAX_VIEWER_FACES = 300_000
 MAX_VIEWER_PHOTOGRAPHS = 20  #: Photographs that the viewer holds in memory
-MAX_VIEWER_BYTES = 1 << 30  #: Bytes of the uploaded files of the viewer, those on their way included
+#: Bytes of the uploaded files of the viewer, those on their way included
+MAX_VIEWER_BYTES = 1 << 30
 MAX_ARCHIVE_FILES = 1000  #: Files in a zip archive with a mesh and its parts

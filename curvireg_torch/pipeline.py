@@ -31,7 +31,15 @@ from .utils.checks import check_option, check_positive
 from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
 
-__all__ = ["DEPTH_FIELDS", "FIELDS", "PRESETS", "BankSettings", "DetectionSettings", "Pipeline", "ViewPolicy"]
+__all__ = [
+    "DEPTH_FIELDS",
+    "FIELDS",
+    "PRESETS",
+    "BankSettings",
+    "DetectionSettings",
+    "Pipeline",
+    "ViewPolicy",
+]
 VERSION = 2  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
 
@@ -42,8 +50,8 @@ FIELDS: dict[str, Callable[[], nn.Module]] = {
     "saliency": MultiScaleCurvilinearSaliency,
     "gradient": ImageGradient,
 }
-"""Photograph filters by name: modules that are built without arguments. "MFC" is the paper's, "focus" the same weighted
-by CS, with the exact formula of the blur."""
+"""Photograph filters by name: modules that are built without arguments. "MFC" is the paper's,
+"focus" the same weighted by CS, with the exact formula of the blur."""
 
 DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
     "CS": DepthCurvilinearSaliency,
@@ -51,7 +59,8 @@ DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
     "HFN": HessianFrobeniusNorm,
     "AR": ApparentRidges,
 }
-"""Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without arguments."""
+"""Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without
+arguments."""
 
 Settings = TypeVar("Settings")
 
@@ -61,14 +70,16 @@ class ViewPolicy:
     """Which viewpoints a bank contains.
 
     Attributes:
-        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far below. "paper": the
-            paper's grid, see :func:`curvireg_torch.geometry.paper_views`. "given": the views were passed by the caller.
-        directions, theta_step: of "any": number of viewing directions on the sphere, and degrees between in-plane
-            rotations.
+        pose: "any": nothing is known. "upright": the object stands upright and is not seen from far
+            below. "paper": the paper's grid, see :func:`curvireg_torch.geometry.paper_views`.
+            "given": the views were passed by the caller.
+        directions, theta_step: of "any": number of viewing directions on the sphere, and degrees
+            between in-plane rotations.
         azimuth_step, elevations: of "upright", degrees.
         distance: of the camera from the object's centre, in object radii; not of "paper".
-        frame: in which azimuth and elevation are measured. "own": the mesh's. "principal": that of its principal axes,
-            see :func:`curvireg_torch.mesh.normalization_transform`. Poses are reported in the mesh's own frame.
+        frame: in which azimuth and elevation are measured. "own": the mesh's. "principal": that of
+            its principal axes, see :func:`curvireg_torch.mesh.normalization_transform`. Poses are
+            reported in the mesh's own frame.
 
     Example:
         >>> len(ViewPolicy().sphere()), len(ViewPolicy(pose="upright").sphere())
@@ -91,17 +102,26 @@ class ViewPolicy:
 
     def key_fields(self) -> dict[str, Any]:
         """The attributes that decide the viewpoints; the others belong to another ``pose``."""
-        names = {"any": ("directions", "theta_step", "distance"), "upright": ("azimuth_step", "elevations", "distance")}
+        names = {
+            "any": ("directions", "theta_step", "distance"),
+            "upright": ("azimuth_step", "elevations", "distance"),
+        }
         return {name: getattr(self, name) for name in ("pose", "frame", *names.get(self.pose, ()))}
 
     def sphere(self, up: str = "z") -> ViewSphere:
         """The viewpoints; ``up`` is the axis of the mesh that points up, for "upright"."""
         if self.pose == "given":
-            raise InvalidInputError("views: the views of this pipeline were passed by the caller; pass them again")
+            raise InvalidInputError(
+                "views: the views of this pipeline were passed by the caller; pass them again"
+            )
         if self.pose == "paper":
             return paper_views().for_up(up)
         if self.pose == "upright":
-            grid = sample_views(azimuth_step=self.azimuth_step, elevations=self.elevations, distances=[self.distance])
+            grid = sample_views(
+                azimuth_step=self.azimuth_step,
+                elevations=self.elevations,
+                distances=[self.distance],
+            )
             return grid.for_up(up)
         count = max(1, round(360.0 / self.theta_step))
         thetas = [360.0 * i / count for i in range(count)]
@@ -116,8 +136,9 @@ class BankSettings:
         image_size: side of views and crops in px.
         camera: "perspective" or "orthographic".
         margin: space around the object's box, as a fraction of its longer side.
-        depth_field: name in :data:`DEPTH_FIELDS`. "CS" is :func:`depth_curvilinear_saliency` with ``sigma`` and
-            ``formula``; the others, with which the paper compares it, use their defaults.
+        depth_field: name in :data:`DEPTH_FIELDS`. "CS" is :func:`depth_curvilinear_saliency` with
+            ``sigma`` and ``formula``; the others, with which the paper compares it, use their
+            defaults.
         grid, bins, block, clip: of :func:`hog`.
         point_fraction: of :func:`field_points`.
     """
@@ -139,20 +160,26 @@ class BankSettings:
         check_option(self.depth_field, DEPTH_FIELDS, "depth_field")
         check_positive(self.margin, "margin", zero_ok=True)
         if self.image_size < self.grid:
-            raise InvalidInputError(f"image_size: expected at least grid = {self.grid}, got {self.image_size}")
+            raise InvalidInputError(
+                f"image_size: expected at least grid = {self.grid}, got {self.image_size}"
+            )
         check_option(self.formula, ("geometric", "paper"), "formula")
         check_positive(self.sigma, "sigma", zero_ok=True)
         if not 1 <= self.block <= self.grid or self.bins < 1 or not 0.0 < self.clip <= 1.0:
-            raise InvalidInputError(f"hog: expected 1 <= block <= grid, bins >= 1 and clip in (0, 1], got {self}")
+            raise InvalidInputError(
+                f"hog: expected 1 <= block <= grid, bins >= 1 and clip in (0, 1], got {self}"
+            )
 
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """How an object without a box is searched for, see :class:`curvireg_torch.registration.Detector`.
+    """How an object without a box is searched for, see
+    :class:`curvireg_torch.registration.Detector`.
 
     Attributes:
         views: number of views that represent all of a bank.
-        min_size: longer side of the smallest object that is searched for, as a fraction of the photograph's.
+        min_size: longer side of the smallest object that is searched for, as a fraction of the
+            photograph's.
         proposals: number of boxes that are compared with all views of the bank.
     """
 
@@ -164,7 +191,9 @@ class DetectionSettings:
         if min(self.views, self.proposals) < 1:
             raise InvalidInputError(f"detection: expected views and proposals >= 1, got {self}")
         if not 0.02 <= self.min_size <= 1.0:
-            raise InvalidInputError(f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}")
+            raise InvalidInputError(
+                f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}"
+            )
 
 
 @dataclass(frozen=True)
@@ -174,13 +203,16 @@ class Pipeline:
     Attributes:
         views: which viewpoints are rendered.
         bank: how views and photographs are described.
-        field: filter of photographs: a name in :data:`FIELDS`, or "custom:NAME" for a module that is passed with each
-            call.
-        weights: digest of the field's weights; "" for a field without any. Filled in for packaged weights.
+        field: filter of photographs: a name in :data:`FIELDS`, or "custom:NAME" for a module that
+            is passed with each call.
+        weights: digest of the field's weights; "" for a field without any. Filled in for packaged
+            weights.
         terms: ranking terms, each at most once.
-        box_jitter: error that boxes are allowed, as a fraction of their longer side in [0, 0.45]; 0: exact boxes.
+        box_jitter: error that boxes are allowed, as a fraction of their longer side in [0, 0.45];
+            0: exact boxes.
         hypotheses: distinct views that are carried through search and contour fit.
-        search: the paper's search between the coherent ones of the three best views, without contour fit.
+        search: the paper's search between the coherent ones of the three best views, without
+            contour fit.
         contours: fit the mesh's contours to the photograph's edges.
         detection: how boxes that are not given are found.
 
@@ -198,7 +230,9 @@ class Pipeline:
     bank: BankSettings = BankSettings()
     field: str = "learned"
     weights: str = ""
-    terms: tuple[Term, ...] = dataclass_field(default=(Correlation(), Repeatability(), BoxShape(), Appearance()))
+    terms: tuple[Term, ...] = dataclass_field(
+        default=(Correlation(), Repeatability(), BoxShape(), Appearance())
+    )
     box_jitter: float = 0.1
     hypotheses: int = 5
     search: bool = False
@@ -211,13 +245,21 @@ class Pipeline:
         if self.field == "learned" and not self.weights:
             object.__setattr__(self, "weights", SHA256[:16])
         names = [term.name for term in self.terms]
-        if len(set(names)) < len(names) or not any(t.name == Correlation.name and t.weight > 0 for t in self.terms):
-            message = f"expected each term once, and {Correlation.name!r}, which all results are scored by, got {names}"
+        if len(set(names)) < len(names) or not any(
+            t.name == Correlation.name and t.weight > 0 for t in self.terms
+        ):
+            message = (
+                f"expected each term once, and {Correlation.name!r}, which all results are "
+                f"scored "
+                f"by, got {names}"
+            )
             raise InvalidInputError(f"terms: {message}")
         if self.hypotheses < 1:
             raise InvalidInputError(f"hypotheses: expected >= 1, got {self.hypotheses}")
         if self.search and self.contours:
-            raise InvalidInputError("search: the paper's search takes the place of the contour fit; set contours=False")
+            raise InvalidInputError(
+                "search: the paper's search takes the place of the contour fit; set contours=False"
+            )
         jittered_boxes(torch.ones(0, 4), self.box_jitter)  # checks box_jitter
 
     def with_pose_prior(self, pose: str) -> "Pipeline":
@@ -227,29 +269,43 @@ class Pipeline:
     def with_term(self, name: str, **options: Any) -> "Pipeline":
         """A copy with other options of one term; ``weight=0`` removes the term from the product."""
         check_option(name, [term.name for term in self.terms], "term")
-        return replace(self, terms=tuple(replace(t, **options) if t.name == name else t for t in self.terms))
+        return replace(
+            self, terms=tuple(replace(t, **options) if t.name == name else t for t in self.terms)
+        )
 
     def with_field(self, field: nn.Module) -> "Pipeline":
-        """A copy that records a custom module as the photograph's field, by class name and digest."""
+        """A copy that records a custom module as the photograph's field, by class name and
+        digest."""
         return replace(self, field=f"{CUSTOM}{type(field).__name__}", weights=field_digest(field))
 
     def photograph_field(self) -> nn.Module:
-        """The filter of photographs; refuses a custom field, and packaged weights of another digest."""
+        """The filter of photographs; refuses a custom field, and packaged weights of another
+        digest."""
         if self.field.startswith(CUSTOM):
-            raise InvalidInputError(f"field: {self.field!r} was passed by the caller; pass it again (field=...)")
+            raise InvalidInputError(
+                f"field: {self.field!r} was passed by the caller; pass it again (field=...)"
+            )
         if self.field == "learned" and self.weights != SHA256[:16]:
             raise InvalidInputError(
-                f"field: expected weights {self.weights}, got packaged {SHA256[:16]}; pass the module (field=...)"
+                f"field: expected weights {self.weights}, got packaged {SHA256[:16]}; pass the "
+                f"module (field=...)"
             )
         return FIELDS[self.field]()
 
     def stored_appearance(self, count: int) -> Appearance | None:
         """The appearance term, if a bank of ``count`` views holds the features of all its views."""
-        return next((t for t in self.terms if isinstance(t, Appearance) and count <= t.exhaustive_limit), None)
+        return next(
+            (t for t in self.terms if isinstance(t, Appearance) and count <= t.exhaustive_limit),
+            None,
+        )
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain numbers, strings, lists and dictionaries for JSON."""
-        described = {"version": VERSION, **asdict(self), "terms": {term.name: asdict(term) for term in self.terms}}
+        described = {
+            "version": VERSION,
+            **asdict(self),
+            "terms": {term.name: asdict(term) for term in self.terms},
+        }
         described["views"]["elevations"] = list(self.views.elevations)
         return described
 
@@ -265,7 +321,9 @@ class Pipeline:
             raise InvalidInputError(f"pipeline: not JSON ({error})") from error
         data = _object(data, "pipeline")
         if data.pop("version", VERSION) != VERSION:
-            raise InvalidInputError(f"pipeline: this library reads version {VERSION}; write the file again")
+            raise InvalidInputError(
+                f"pipeline: this library reads version {VERSION}; write the file again"
+            )
         return _settings(cls, data, "pipeline")
 
     @classmethod
@@ -282,7 +340,9 @@ class Pipeline:
 
 def _object(data: Any, name: str) -> dict[str, Any]:
     if not isinstance(data, dict):
-        raise InvalidInputError(f"{name}: expected a JSON object, got {data!r}; compare with Pipeline().to_json()")
+        raise InvalidInputError(
+            f"{name}: expected a JSON object, got {data!r}; compare with Pipeline().to_json()"
+        )
     return dict(data)
 
 
@@ -292,22 +352,28 @@ def _settings(kind: type[Settings], data: Any, name: str) -> Settings:
     values = _object(data, name)
     for key, value in values.items():
         if key not in defaults:
-            raise InvalidInputError(f"{name}: unknown key {key!r}; expected one of {', '.join(defaults)}")
-        default, path = defaults[key], f"{name}: {key}"
+            raise InvalidInputError(
+                f"{name}: unknown key {key!r}; expected one of {', '.join(defaults)}"
+            )
+        default = defaults[key]
+        path = f"{name}: {key}"
         if is_dataclass(default):
             values[key] = _settings(type(default), value, path)
         elif key == "terms":
             options = _object(value, path)
             for term in options:
                 check_option(term, TERMS, "term")
-            values[key] = tuple(_settings(TERMS[term], given, f"{path}: {term}") for term, given in options.items())
+            values[key] = tuple(
+                _settings(TERMS[term], given, f"{path}: {term}") for term, given in options.items()
+            )
         elif not _fits(value, default):
             raise InvalidInputError(f"{path}: expected a value like {default!r}, got {value!r}")
     return kind(**values)
 
 
 def _fits(value: Any, default: Any) -> bool:
-    """Whether a value from JSON has the type of a default: a flag, a finite number, a text, or a list of numbers."""
+    """Whether a value from JSON has the type of a default: a flag, a finite number, a text, or a
+    list of numbers."""
     if isinstance(default, bool | str):
         return isinstance(value, type(default))
     if isinstance(default, tuple):
@@ -339,9 +405,9 @@ PRESETS: dict[str, Pipeline] = {
         contours=False,
     ),
 }
-"""``learned``: :class:`LearnedCurvilinearSaliency` as the photograph's field, and the appearance term; ``classical``:
-focus curves, nothing learned; ``fast``: the learned field alone, without box jitter and contour fit; ``paper``:
-the paper to the letter, with none of our stages."""
+"""``learned``: :class:`LearnedCurvilinearSaliency` as the photograph's field, and the appearance
+term; ``classical``: focus curves, nothing learned; ``fast``: the learned field alone, without box
+jitter and contour fit; ``paper``: the paper to the letter, with none of our stages."""
 
 
 def preset_named(name: str) -> Pipeline:

@@ -16,15 +16,27 @@ from .geometry.cameras import rotation_towards, transform
 from .mesh import has_colours, mesh_centre, mesh_radius
 from .rendering import render_colour, render_depth
 
-__all__ = ["DemoScene", "demo_scene", "example_mesh", "procedural_background", "random_pose", "synthesize_photograph"]
-RED, STEEL, WOOD, RUBBER = (196, 44, 34, 255), (120, 124, 130, 255), (222, 190, 138, 255), (44, 44, 48, 255)
+__all__ = [
+    "DemoScene",
+    "demo_scene",
+    "example_mesh",
+    "procedural_background",
+    "random_pose",
+    "synthesize_photograph",
+]
+RED = (196, 44, 34, 255)
+STEEL = (120, 124, 130, 255)
+WOOD = (222, 190, 138, 255)
+RUBBER = (44, 44, 48, 255)
 PAINT = [STEEL, RED, RED, WOOD, WOOD, WOOD, STEEL, *[RUBBER] * 6]  # of the parts, in their order
 DEFOCUS = 1.5  # blur of the background in px
 
 
 def example_mesh(*, painted: bool = False) -> trimesh.Trimesh:
-    """Return a toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres; ``painted``: in colours."""
-    box, cylinder = trimesh.creation.box, trimesh.creation.cylinder
+    """Return a toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres;
+    ``painted``: in colours."""
+    box = trimesh.creation.box
+    cylinder = trimesh.creation.cylinder
     shift = trimesh.transformations.translation_matrix
     across = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0])
     parts = [
@@ -37,10 +49,15 @@ def example_mesh(*, painted: bool = False) -> trimesh.Trimesh:
         cylinder(0.008, 0.1, transform=shift((-0.035, -0.05, 0.13))),  # chimney
     ]
     for x in (-0.05, 0.05):
-        parts += [cylinder(0.03, 0.02, transform=shift((x, y, 0.03)) @ across) for y in (-0.085, 0.055, 0.1)]
+        parts += [
+            cylinder(0.03, 0.02, transform=shift((x, y, 0.03)) @ across)
+            for y in (-0.085, 0.055, 0.1)
+        ]
     mesh = trimesh.util.concatenate(parts)
     if painted:
-        mesh.visual.face_colors = np.repeat(np.array(PAINT, np.uint8), [len(part.faces) for part in parts], axis=0)
+        mesh.visual.face_colors = np.repeat(
+            np.array(PAINT, np.uint8), [len(part.faces) for part in parts], axis=0
+        )
     mesh.units = "m"
     return mesh
 
@@ -54,12 +71,15 @@ def random_pose(
     elevations: tuple[float, float] = (-10.0, 60.0),
     fill: tuple[float, float] = (0.4, 0.7),
 ) -> Tensor:
-    """Return a (4, 4) float64 pose of an upright object that fills ``fill`` of the image's shorter side."""
+    """Return a (4, 4) float64 pose of an upright object that fills ``fill`` of the image's shorter
+    side."""
     u = torch.rand(6, generator=generator, dtype=torch.float64)
     elevation = elevations[0] + (elevations[1] - elevations[0]) * u[1]
     fraction = fill[0] + (fill[1] - fill[0]) * float(u[3])
     distance = 2.0 * mesh_radius(mesh) * float(camera_matrix[0, 0]) / (fraction * min(size))
-    pixel = torch.stack([size[1] * (0.4 + 0.2 * u[4]), size[0] * (0.4 + 0.2 * u[5]), torch.ones_like(u[0])])
+    pixel = torch.stack(
+        [size[1] * (0.4 + 0.2 * u[4]), size[0] * (0.4 + 0.2 * u[5]), torch.ones_like(u[0])]
+    )
     ray = torch.linalg.inv(camera_matrix.double()) @ pixel
     R = rotation_towards(ray) @ rotation_from_viewpoint(360.0 * u[0], elevation, 10.0 * u[2] - 5.0)
     return transform(R, ray / torch.linalg.vector_norm(ray) * distance - R @ mesh_centre(mesh))
@@ -94,47 +114,64 @@ def synthesize_photograph(
     background: Tensor | None = None,
     texture: float = 0.35,
 ) -> tuple[Tensor, Tensor]:
-    """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box (4,) in px.
-    ``texture`` is the contrast of a random solid pattern; a mesh with colours shows those instead. The background
-    (3, H, W), default :func:`procedural_background`, is out of focus."""
+    """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box
+    (4,) in px. ``texture`` is the contrast of a random solid pattern; a mesh with colours shows
+    those instead. The background (3, H, W), default :func:`procedural_background`, is out of
+    focus."""
     H, W = size
     # Supersampling by two.
-    K = torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]).double() @ camera_matrix.double()
+    K = (
+        torch.tensor([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]).double()
+        @ camera_matrix.double()
+    )
     depth = render_depth(mesh, T_cam_from_model, K, (2 * H, 2 * W))[0, 0].double()
     mask = depth > 0
-    rows, columns = mask.any(dim=1).nonzero(), mask.any(dim=0).nonzero()
+    rows = mask.any(dim=1).nonzero()
+    columns = mask.any(dim=0).nonzero()
     if len(rows) == 0:
-        raise InvalidInputError("T_cam_from_model: expected a pose that shows the object, but no pixel does")
+        raise InvalidInputError(
+            "T_cam_from_model: expected a pose that shows the object, but no pixel does"
+        )
     v, u = torch.meshgrid(torch.arange(2.0 * H), torch.arange(2.0 * W), indexing="ij")
-    points = depth[..., None] * (torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T)
+    points = depth[..., None] * (
+        torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T
+    )
     # Normals come from neighbouring points; at occluding contours they point to the camera.
     dv, du = torch.gradient(points, dim=(0, 1))
     normal = F.normalize(torch.linalg.cross(dv, du), dim=-1)
     border = torch.maximum(du[..., 2].abs(), dv[..., 2].abs()) > 0.2 * mesh.scale
     normal[border] = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     light = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
-    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)  # from above, in front
+    # from above, in front
+    light = F.normalize(light + torch.tensor([0.0, -0.8, -1.2], dtype=torch.float64), dim=0)
     shade = 0.35 + 0.65 * (normal @ light).clamp(min=0)
     model = (points - T_cam_from_model[:3, 3]) @ T_cam_from_model[:3, :3] / (0.5 * mesh.scale)
     waves = torch.randn(3, 4, generator=generator, dtype=torch.float64) * 6
-    pattern = torch.sin(model @ waves + 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)).mean(dim=-1)
+    pattern = torch.sin(
+        model @ waves + 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)
+    ).mean(dim=-1)
     colour = 0.3 + 0.6 * torch.rand(3, generator=generator, dtype=torch.float64)
     surface = shade[..., None] * colour * (1.0 + texture * pattern[..., None])
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     if has_colours(mesh):  # drawn before white
-        front = (render_colour(mesh, T_cam_from_model, camera_matrix, size)[0] - (1.0 - coverage)).clamp(min=0.0)
+        front = (
+            render_colour(mesh, T_cam_from_model, camera_matrix, size)[0] - (1.0 - coverage)
+        ).clamp(min=0.0)
     back = procedural_background(size, generator) if background is None else background
     image = front + (1.0 - coverage) * gaussian_smooth(back[None], DEFOCUS)[0]
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     # Outer borders of the outermost pixels, converted from the fine grid to the picture's.
-    box = torch.tensor([int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5])
+    box = torch.tensor(
+        [int(columns[0]) - 0.5, int(rows[0]) - 0.5, int(columns[-1]) + 0.5, int(rows[-1]) + 0.5]
+    )
     return image.clamp(0, 1), (box - 0.5) / 2.0
 
 
 class DemoScene(NamedTuple):
-    """A generated ``image`` (3, 720, 960), float32 RGB in [0, 1], of a known object, its ``mesh`` in metres and ``box``
-    (4,) x0, y0, x1, y1 in px; ``camera_matrix`` (3, 3) and ``truth`` (4, 4), ``T_cam_from_model``, in float64."""
+    """A generated ``image`` (3, 720, 960), float32 RGB in [0, 1], of a known object, its ``mesh``
+    in metres and ``box`` (4,) x0, y0, x1, y1 in px; ``camera_matrix`` (3, 3) and ``truth`` (4, 4),
+    ``T_cam_from_model``, in float64."""
 
     mesh: trimesh.Trimesh
     image: Tensor
@@ -151,12 +188,15 @@ def demo_scene(seed: int = 2) -> DemoScene:
         torch.Size([3, 720, 960])
     """
     generator = torch.Generator().manual_seed(seed)
-    mesh, size = example_mesh(), (720, 960)
+    mesh = example_mesh()
+    size = (720, 960)
     K = camera_matrix(1040.0, 1040.0, 479.5, 359.5, dtype=torch.float64)
     truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0), fill=(0.75, 0.95))
     clutter = 0.15 * (procedural_background(size, generator).mean(dim=0) - 0.5)
     table = torch.arange(size[0])[:, None] > 0.3 * size[0]
     wall, wood = torch.tensor([[0.78, 0.76, 0.7], [0.62, 0.46, 0.3]])[..., None, None]
     room = torch.where(table, wood, wall) + clutter
-    image, box = synthesize_photograph(example_mesh(painted=True), truth, K, size, generator, background=room)
+    image, box = synthesize_photograph(
+        example_mesh(painted=True), truth, K, size, generator, background=room
+    )
     return DemoScene(mesh, image, box, K, truth)

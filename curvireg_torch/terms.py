@@ -1,4 +1,5 @@
-"""Ranking terms: photographs are described in crops of their boxes, and compared with views; the ranking multiplies."""
+"""Ranking terms: photographs are described in crops of their boxes, and compared with views; the
+ranking multiplies."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -18,27 +19,56 @@ from .features.backbone import SHA256, Backbone, describe, similarity
 from .features.learned_field import LearnedCurvilinearSaliency
 from .filters.operations import fill_missing, may_have_missing, missing_mask, to_grey
 from .geometry.crops import check_boxes, crop_squares, square_boxes
-from .utils.checks import check_integer, check_option, check_photograph, check_positive, check_tensor
+from .utils.checks import (
+    check_integer,
+    check_option,
+    check_photograph,
+    check_positive,
+    check_tensor,
+)
 from .utils.threads import map_on_threads
 
-__all__ = ["TERMS", "Appearance", "BoxShape", "Correlation", "QueryFeatures", "Repeatability", "Term", "Whitening"]
-BORDER_DISTANCE = 0.01  # of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
-VIEWS_AT_A_TIME, CELLS_AT_A_TIME = 64, 64  # whose points are counted, and in which they are compared
+__all__ = [
+    "TERMS",
+    "Appearance",
+    "BoxShape",
+    "Correlation",
+    "QueryFeatures",
+    "Repeatability",
+    "Term",
+    "Whitening",
+]
+# of a box cut off by the image's border, as a fraction of its longer side, plus 1 px
+BORDER_DISTANCE = 0.01
+# whose points are counted, and in which they are compared
+VIEWS_AT_A_TIME = 64
+CELLS_AT_A_TIME = 64
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
-_JITTER = ((0, 0, 0), (-0.75, 0, 0), (0.75, 0, 0), (0, -0.75, 0), (0, 0.75, 0), (0, 0, -1), (0, 0, 1))
+_JITTER = (
+    (0, 0, 0),
+    (-0.75, 0, 0),
+    (0.75, 0, 0),
+    (0, -0.75, 0),
+    (0, 0.75, 0),
+    (0, 0, -1),
+    (0, 0, 1),
+)
 
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """B photographs, each described in K crops: of its box first, then of jittered copies of the box.
+    """B photographs, each described in K crops: of its box first, then of jittered copies of the
+    box.
 
     Attributes:
-        regions: (B, K, C, S, S) the crops, in [0, 1]; NaN where pixels of the photograph are missing.
+        regions: (B, K, C, S, S) the crops, in [0, 1]; NaN where pixels of the photograph are
+            missing.
         field: (B, 2, S, S) of the first crop.
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
-        mask: (B, 1, S, S) probability that pixels of the first crop belong to the object, where the field predicts it.
+        mask: (B, 1, S, S) probability that pixels of the first crop belong to the object, where the
+            field predicts it.
         computed: features of the crops that terms have computed, by the term's name.
     """
 
@@ -57,9 +87,10 @@ class QueryFeatures:
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:
-    """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute ``colour = True``, and
-    the mask (B, 1, S, S) that the learned field predicts with it.
-    Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field is 0 there."""
+    """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute
+    ``colour = True``, and the mask (B, 1, S, S) that the learned field predicts with it.
+    Missing pixels (NaN or infinite) are filled from their surroundings before the filter; the field
+    is 0 there."""
     grey = crops.shape[1] == 3 and not getattr(field, "colour", False)
     holes = missing_mask(crops) if may_have_missing(crops) else None
     crops = crops if holes is None else fill_missing(crops, holes)
@@ -75,17 +106,25 @@ def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | 
 
 def _has_hooks(module: nn.Module) -> bool:
     """Whether a call of ``module`` does more than its ``forward``."""
-    own = module._forward_hooks, module._forward_pre_hooks, module._backward_hooks, module._backward_pre_hooks
+    own = (
+        module._forward_hooks,
+        module._forward_pre_hooks,
+        module._backward_hooks,
+        module._backward_pre_hooks,
+    )
     of_all = torch.nn.modules.module
     return any(own) or bool(of_all._global_forward_hooks or of_all._global_forward_pre_hooks)
 
 
 def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
-    """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer side, two scaled.
-    ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
+    """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer
+    side, two scaled. ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` =
+    0."""
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
-    jitter = torch.tensor(_JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device)
+    jitter = torch.tensor(
+        _JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device
+    )
     sides = boxes[:, 2:] - boxes[:, :2]
     shift = box_jitter * jitter[None, :, :2] * sides.amax(dim=1)[:, None, None]
     centre = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:]) + shift
@@ -93,14 +132,17 @@ def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
     return torch.cat([centre - half, centre + half], dim=2)
 
 
-def crop_regions(images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float) -> Tensor:
-    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them, on the device of the boxes.
+def crop_regions(
+    images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float
+) -> Tensor:
+    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them, on the device
+    of the boxes.
 
     Args:
-        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts differ, grey images
-            get three channels.
-        boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is replaced by the first
-            box, which must not be outside.
+        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts
+            differ, grey images get three channels.
+        boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is
+            replaced by the first box, which must not be outside.
     """
     for image in images:
         check_photograph(image)
@@ -126,8 +168,12 @@ def box_shapes(boxes: Tensor) -> Tensor:
 
 
 def whole_box_shapes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
-    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut the object off."""
-    end = torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2) - 0.5
+    """(B,) shapes of (B, 4) boxes in px in images of ``sizes`` (H, W); NaN if the border may cut
+    the object off."""
+    end = (
+        torch.tensor([[W, H] for H, W in sizes], dtype=boxes.dtype, device=boxes.device).view(-1, 2)
+        - 0.5
+    )
     border = 1.0 + BORDER_DISTANCE * (boxes[:, 2:] - boxes[:, :2]).amax(dim=1, keepdim=True)
     inside = (boxes[:, :2] > -0.5 + border).all(dim=1) & (boxes[:, 2:] < end - border).all(dim=1)
     return torch.where(inside, box_shapes(boxes), torch.nan)
@@ -138,9 +184,9 @@ Comparison = Callable[[QueryFeatures], Tensor]
 
 @dataclass(frozen=True)
 class Term(ABC):
-    """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its ``weight`` w is 0. A new
-    term is a frozen dataclass of plain numbers with a ``name`` and a method ``build``, added to
-    ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
+    """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its
+    ``weight`` w is 0. A new term is a frozen dataclass of plain numbers with a ``name`` and a
+    method ``build``, added to ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
 
     name: ClassVar[str]
     weight: float = 1.0
@@ -150,20 +196,25 @@ class Term(ABC):
 
     @abstractmethod
     def build(self, views: Any) -> Comparison:
-        """A function that compares B photographs with the N views of a :class:`curvireg_torch.ViewBank`, on its device:
-        :class:`QueryFeatures` -> (B, N) raw scores."""
+        """A function that compares B photographs with the N views of a
+        :class:`curvireg_torch.ViewBank`, on its device: :class:`QueryFeatures` -> (B, N) raw
+        scores."""
 
     def log_score(self, raw: Tensor) -> Tensor:
-        """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it. By default
-        ``(s - max s) / std s`` of each photograph's scores s: the log of a softmax of z-scores."""
+        """(B, N) log S_t <= 0 from raw scores, 0 for the best view of each photograph or near it.
+        By default ``(s - max s) / std s`` of each photograph's scores s: the log of a softmax of
+        z-scores."""
         # Not by std, which warns of empty batches.
         spread = (raw - raw.mean(dim=1, keepdim=True)).square().mean(dim=1, keepdim=True).sqrt()
-        return (raw - raw.amax(dim=1, keepdim=True)) / torch.where(spread > 0, spread, torch.ones_like(spread))
+        return (raw - raw.amax(dim=1, keepdim=True)) / torch.where(
+            spread > 0, spread, torch.ones_like(spread)
+        )
 
 
 class Whitening(nn.Module):
-    r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`.
-    ``mean`` is (D,), ``covariance`` (D, D), symmetric, positive definite."""
+    r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become
+    :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`. ``mean`` is (D,), ``covariance`` (D, D), symmetric,
+    positive definite."""
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
@@ -176,7 +227,9 @@ class Whitening(nn.Module):
         self.mean: Tensor
         self.matrix: Tensor
         self.register_buffer("mean", mean.float())
-        self.register_buffer("matrix", torch.linalg.solve_triangular(factor, identity, upper=False).float())
+        self.register_buffer(
+            "matrix", torch.linalg.solve_triangular(factor, identity, upper=False).float()
+        )
 
     def forward(self, descriptors: Tensor) -> Tensor:
         """(N, D) -> (N, D)."""
@@ -184,9 +237,9 @@ class Whitening(nn.Module):
 
 
 def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32. The covariance is (1 - a) S + a
-    tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's covariance best from the sample's
-    covariance S."""
+    """Mean (D,) and shrunk covariance (D, D) of (N, D) descriptors, N >= 2, float32. The covariance
+    is (1 - a) S + a tr(S)/D Id with the a of Ledoit and Wolf (2004) that estimates the population's
+    covariance best from the sample's covariance S."""
     mean, x, S = _centred(descriptors)
     S = x.T @ x / len(x) if S is None else S
     a = _shrinkage(x, S)
@@ -195,7 +248,8 @@ def ledoit_wolf(descriptors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _centred(descriptors: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Mean (D,) of (N, D) descriptors, their differences x from it, and x^T x / N if N >= D; float32."""
+    """Mean (D,) of (N, D) descriptors, their differences x from it, and x^T x / N if N >= D;
+    float32."""
     check_tensor(descriptors, "descriptors", (None, None))
     count = len(descriptors)
     if count < 2:
@@ -207,7 +261,8 @@ def _centred(descriptors: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
 
 
 def _shrinkage(x: Tensor, product: Tensor) -> float:
-    """The a of :func:`ledoit_wolf`, from x (N, D) with mean 0 and x^T x / N or x x^T / N, which have equal norms."""
+    """The a of :func:`ledoit_wolf`, from x (N, D) with mean 0 and x^T x / N or x x^T / N, which
+    have equal norms."""
     fourth = float(x.square().sum(dim=1).double().square().mean())
     square = float(product.double().square().sum())
     # Squared distance of the covariance from its multiple of the identity
@@ -216,10 +271,12 @@ def _shrinkage(x: Tensor, product: Tensor) -> float:
 
 
 class Precision(nn.Module):
-    r"""y -> Sigma^-1 y, with the :func:`ledoit_wolf` covariance Sigma and the ``mean`` (D,) of (N, D) descriptors.
+    r"""y -> Sigma^-1 y, with the :func:`ledoit_wolf` covariance Sigma and the ``mean`` (D,) of (N,
+    D) descriptors.
 
-    With fewer descriptors than entries, N < D, Sigma = r Id + c x^T x is never formed: by Woodbury's identity
-    :math:`\Sigma^{-1} y = (y - x^T (r/c\,Id + x x^T)^{-1} x y) / r`, in which the matrix to solve is (N, N).
+    With fewer descriptors than entries, N < D, Sigma = r Id + c x^T x is never formed: by
+    Woodbury's identity :math:`\Sigma^{-1} y = (y - x^T (r/c\,Id + x x^T)^{-1} x y) / r`, in which
+    the matrix to solve is (N, N).
     """
 
     def __init__(self, descriptors: Tensor) -> None:
@@ -232,8 +289,11 @@ class Precision(nn.Module):
         matrix.diagonal().add_(ridge)
         factor, failed = torch.linalg.cholesky_ex(matrix)
         if int(failed) or (S is None and ridge <= 0.0):
-            raise InvalidInputError("descriptors: all views look alike; show the object from several sides")
-        self.ridge, self.share = ridge, (1.0 - a) / len(x)
+            raise InvalidInputError(
+                "descriptors: all views look alike; show the object from several sides"
+            )
+        self.ridge = ridge
+        self.share = (1.0 - a) / len(x)
         self.mean: Tensor
         self.factor: Tensor
         self.register_buffer("mean", mean)
@@ -255,11 +315,12 @@ class Precision(nn.Module):
 class Correlation(Term):
     r"""S_hog: how well descriptors D agree, the best over the jittered crops.
 
-    With the mean :math:`\mu` and the covariance :math:`\Sigma` of the bank's views, which is shrunk (Ledoit-Wolf) where
-    a bank has fewer views than a descriptor has entries, the raw score is
+    With the mean :math:`\mu` and the covariance :math:`\Sigma` of the bank's views, which is shrunk
+    (Ledoit-Wolf) where a bank has fewer views than a descriptor has entries, the raw score is
 
     - ``"none"``: the cosine of both descriptors, without the two;
-    - ``"bank"``: the cosine of :math:`\Sigma^{-1/2}(D_{view} - \mu)` and :math:`\Sigma^{-1/2}(D_{query} - \mu)`;
+    - ``"bank"``: the cosine of :math:`\Sigma^{-1/2}(D_{view} - \mu)` and
+      :math:`\Sigma^{-1/2}(D_{query} - \mu)`;
     - ``"paper"``: :math:`(D_{view} - \mu)^T \Sigma^{-1} D_{query}`, as the paper prints it.
 
     Attributes:
@@ -280,7 +341,11 @@ class Correlation(Term):
             return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
 
         described = views.precision if self.whitening == "paper" else normalized
-        known = views.descriptors - views.precision.mean if self.whitening == "paper" else normalized(views.descriptors)
+        known = (
+            views.descriptors - views.precision.mean
+            if self.whitening == "paper"
+            else normalized(views.descriptors)
+        )
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
@@ -292,13 +357,16 @@ class Correlation(Term):
 
 @dataclass(frozen=True)
 class Repeatability(Term):
-    r"""S_rep: the photograph's feature points have points of the view nearby, the best over the jittered crops.
+    r"""S_rep: the photograph's feature points have points of the view nearby, the best over the
+    jittered crops.
 
-    The raw score Rep is the fraction of the photograph's points that have a view's point within eps (the paper's
-    Rep, view -> query), 0 without points. With :math:`R = 1 - Rep`, S_rep is
+    The raw score Rep is the fraction of the photograph's points that have a view's point within eps
+    (the paper's Rep, view -> query), 0 without points. With :math:`R = 1 - Rep`, S_rep is
 
-    - ``"monotone"``: :math:`\exp(-(R - \min R)^2 / (2\sigma^2))`: the most repeatable view scores 1;
-    - ``"paper"``: :math:`\exp(-(R - \mathrm{mean} R)^2 / (2\sigma^2))`, which favours average views.
+    - ``"monotone"``: :math:`\exp(-(R - \min R)^2 / (2\sigma^2))`: the most repeatable view scores
+      1;
+    - ``"paper"``: :math:`\exp(-(R - \mathrm{mean} R)^2 / (2\sigma^2))`, which favours average
+      views.
 
     Attributes:
         sigma, mode: of the score; the paper's :math:`\sigma_r`.
@@ -322,30 +390,44 @@ class Repeatability(Term):
         cell = max(1, min(int(self.eps * S), S // 64))
 
         def count(start: int) -> Tensor:
-            points = dilate_points(views.points_at(slice(start, start + VIEWS_AT_A_TIME)), self.eps * S)
+            points = dilate_points(
+                views.points_at(slice(start, start + VIEWS_AT_A_TIME)), self.eps * S
+            )
             return cell_counts(points, cell).flatten(1)
 
-        # Pixels of each cell within eps of a view's points, (cells, N), and all of its pixels, (1, cells)
-        near = torch.cat(map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device))
+        # Pixels of each cell within eps of a view's points, (cells, N), and all of its pixels, (1,
+        # cells)
+        near = torch.cat(
+            map_on_threads(
+                count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device
+            )
+        )
         near = near.T.contiguous()
-        area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=near.device), cell).flatten(1)
+        area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=near.device), cell).flatten(
+            1
+        )
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.points.shape[:2]
             # A point in a cut cell counts as much as any other.
             points = cell_counts(query.points.flatten(0, 1), cell).flatten(1).float()
-            # Most cells have no points. A float32 copy of the others at once would take longer than the product.
+            # Most cells have no points. A float32 copy of the others at once would take longer than
+            # the product.
             matched = points.new_zeros(len(points), near.shape[1])
             for few in points.any(dim=0).nonzero()[:, 0].split(CELLS_AT_A_TIME):
                 matched.addmm_(points[:, few] / area[:, few], near[few].float())
-            rep = matched / points.sum(dim=1, keepdim=True).clamp(min=torch.finfo(torch.float32).tiny)
+            rep = matched / points.sum(dim=1, keepdim=True).clamp(
+                min=torch.finfo(torch.float32).tiny
+            )
             return rep.view(B, K, near.shape[1]).amax(dim=1)
 
         return compare
 
     def log_score(self, raw: Tensor) -> Tensor:
         R = 1.0 - raw
-        centre = R.amin(dim=1, keepdim=True) if self.mode == "monotone" else R.mean(dim=1, keepdim=True)
+        centre = (
+            R.amin(dim=1, keepdim=True) if self.mode == "monotone" else R.mean(dim=1, keepdim=True)
+        )
         return -(R - centre).square() / (2.0 * self.sigma**2)
 
 
@@ -356,15 +438,18 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
         return points
     offsets = np.arange(-radius, radius + 1)
     disc = (offsets[:, None] ** 2 + offsets**2 <= eps**2).astype(np.uint8)
-    # All planes one below the other, with empty rows between: a call for each costs more than to dilate it.
+    # All planes one below the other, with empty rows between: a call for each costs more than to
+    # dilate it.
     planes = np.pad(points.cpu().numpy().view(np.uint8), [(0, 0), (0, radius), (0, 0)])
-    dilated = np.asarray(cv2.dilate(planes.reshape(-1, planes.shape[2]), disc)).reshape(planes.shape)
+    dilated = np.asarray(cv2.dilate(planes.reshape(-1, planes.shape[2]), disc)).reshape(
+        planes.shape
+    )
     return torch.from_numpy(dilated[:, :-radius].view(bool)).to(points.device)
 
 
 def cell_counts(points: Tensor, cell: int) -> Tensor:
-    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which may be cut. The
-    integers have 8 bits if that suffices for a cell, else 16."""
+    """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which
+    may be cut. The integers have 8 bits if that suffices for a cell, else 16."""
     over = -points.shape[-1] % cell
     count = F.pad(points.view(torch.uint8), (0, over, 0, over))
     count = count if cell**2 < 256 else count.short()
@@ -375,8 +460,9 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
 
 @dataclass(frozen=True)
 class BoxShape(Term):
-    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))` with the difference d of the logs of
-    width / height of the boxes of photograph and view. All views score 1 if the photograph's box reaches its border."""
+    r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))` with the
+    difference d of the logs of width / height of the boxes of photograph and view. All views score
+    1 if the photograph's box reaches its border."""
 
     name: ClassVar[str] = "box"
     sigma: float = 0.2  # corresponds to a box that is a fifth too wide
@@ -400,14 +486,15 @@ class BoxShape(Term):
 
 @dataclass(frozen=True)
 class Appearance(Term):
-    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and shaded view. A mesh
-    with colours is rendered in grey and in its colours, and the better match counts for each view: a print
-    distinguishes top from bottom, and the grey picture remains where it misleads. Raw scores are mean cosines.
+    """Appearance score: features of an ImageNet network agree, cell by cell, between photograph and
+    shaded view. A mesh with colours is rendered in grey and in its colours, and the better match
+    counts for each view: a print distinguishes top from bottom, and the grey picture remains where
+    it misleads. Raw scores are mean cosines.
 
-    A bank of up to ``exhaustive_limit`` views stores the features of all its views. Of a larger bank a fixed packing is
-    compared, with views at least ``min_angle`` degrees apart: of its cells, the ``top`` that hold the best views of the
-    other terms. Every other view gets the score of the nearest compared view, and NaN as raw score.
-    ``weights`` is the digest of the network's.
+    A bank of up to ``exhaustive_limit`` views stores the features of all its views. Of a larger
+    bank a fixed packing is compared, with views at least ``min_angle`` degrees apart: of its cells,
+    the ``top`` that hold the best views of the other terms. Every other view gets the score of the
+    nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
     """
 
     name: ClassVar[str] = "appearance"
@@ -423,7 +510,9 @@ class Appearance(Term):
         check_integer(self.top, f"{self.name}: top")
         check_integer(self.exhaustive_limit, f"{self.name}: exhaustive_limit", least=0)
         if self.weights != SHA256[:16]:
-            raise InvalidInputError(f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}")
+            raise InvalidInputError(
+                f"appearance: expected weights {self.weights}, got installed weights {SHA256[:16]}"
+            )
 
     def build(self, views: Any = None) -> "AppearanceModule":
         return AppearanceModule(self)
@@ -437,23 +526,29 @@ class AppearanceModule(Backbone):
         self.term = term
 
     def describe(self, pictures: Tensor, *, together: bool = False) -> Tensor:
-        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the mesh's colours;
-        ``together`` if the same ones always come together."""
+        """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the
+        mesh's colours; ``together`` if the same ones always come together."""
         kinds = [pictures[:, :1], pictures[:, 1:]]
-        return torch.cat([describe(kind, self, together=together) for kind in kinds if kind.shape[1]], dim=1)
+        return torch.cat(
+            [describe(kind, self, together=together) for kind in kinds if kind.shape[1]], dim=1
+        )
 
     def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
         """(B, N) raw scores of B photographs and the (N, D) features of N views."""
         if Appearance.name not in query.computed:  # shared by ranking and rescoring
             query.computed[Appearance.name] = describe(query.crops, self)
         crops = query.computed[Appearance.name]
-        if features.shape[1] not in (crops.shape[1], 2 * crops.shape[1]):  # of a file, which may hold anything
+        # of a file, which may hold anything
+        if features.shape[1] not in (crops.shape[1], 2 * crops.shape[1]):
             raise BankError(
-                f"bank: appearance of {features.shape[1]} numbers a view, expected {crops.shape[1]} or twice"
+                f"bank: appearance of {features.shape[1]} numbers a view, expected "
+                f"{crops.shape[1]} or twice"
             )
         similarities = similarity(crops, features.reshape(-1, crops.shape[1]))
         return similarities.view(len(crops), len(features), -1).amax(dim=2)
 
 
 # Terms by the name that JSON files of pipelines use
-TERMS: dict[str, type[Term]] = {term.name: term for term in (Correlation, Repeatability, BoxShape, Appearance)}
+TERMS: dict[str, type[Term]] = {
+    term.name: term for term in (Correlation, Repeatability, BoxShape, Appearance)
+}

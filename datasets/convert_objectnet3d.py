@@ -2,12 +2,12 @@
 
     python datasets/convert_objectnet3d.py OBJECTNET3D OUT [--splits train val]
 
-ObjectNet3D has one folder for all annotations and one for all photographs; PASCAL3D+ has one per class. Files are hard-
-linked if the file system allows it, and copied otherwise; the source is not changed. An image of several classes
-appears under each of them.
+ObjectNet3D has one folder for all annotations and one for all photographs; PASCAL3D+ has one per
+class. Files are hard- linked if the file system allows it, and copied otherwise; the source is not
+changed. An image of several classes appears under each of them.
 
-Input in OBJECTNET3D: Annotations/<id>.mat, Images/<id>.JPEG, Image_sets/<split>.txt, CAD/off/<class>/<NN>.off or
-CAD/<class>/<NN>.off.
+Input in OBJECTNET3D: Annotations/<id>.mat, Images/<id>.JPEG, Image_sets/<split>.txt,
+CAD/off/<class>/<NN>.off or CAD/<class>/<NN>.off.
 Exit code 0: all ids of the lists were found. 1: some are missing. 2: not an ObjectNet3D tree.
 """
 
@@ -45,7 +45,8 @@ def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
     counts: Counter[str] = Counter()
     lists: dict[str, list[str]] = {}
     for image_id in (root / "Image_sets" / f"{split}.txt").read_text(encoding="utf-8").split():
-        annotation, image = root / "Annotations" / f"{image_id}.mat", root / "Images" / f"{image_id}.JPEG"
+        annotation = root / "Annotations" / f"{image_id}.mat"
+        image = root / "Images" / f"{image_id}.JPEG"
         if not is_plain_name(image_id) or not annotation.is_file():
             counts["missing_annotation"] += 1
             continue
@@ -69,7 +70,9 @@ def convert_split(root: Path, out: Path, split: str) -> Counter[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", type=Path, metavar="OBJECTNET3D")
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--splits", nargs="+", default=["train", "val"])
@@ -79,12 +82,18 @@ def main(arguments: list[str] | None = None) -> int:
         cads = options.root / "CAD"
     needed = [cads, *(options.root / "Image_sets" / f"{split}.txt" for split in options.splits)]
     if absent := [str(path) for path in needed if not path.exists()]:
-        print(f"not an ObjectNet3D tree: no {', '.join(absent)}; see datasets/objectnet3d/README.md", file=sys.stderr)
+        print(
+            f"not an ObjectNet3D tree: no {', '.join(absent)}; see datasets/objectnet3d/README.md",
+            file=sys.stderr,
+        )
         return 2
     total: Counter[str] = Counter()
     for split in options.splits:
         counts = convert_split(options.root, options.out, split)
-        print(f"{split}: " + ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items())))
+        print(
+            f"{split}: "
+            + ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items()))
+        )
         total += counts
     for cad in sorted(cads.glob("*/*.off")):
         place(cad, options.out / "CAD" / cad.parent.name / cad.name)

@@ -2,10 +2,10 @@
 
     python datasets/download.py URL [URL ...] --out FOLDER
 
-FOLDER/manifest.json records URL, size and SHA-256 of every complete file; later runs verify the file against this
-record instead of downloading it again. --sha256 gives a known checksum (one URL only). Interrupted http(s) downloads
-are resumed if the server still has the same file; ftp downloads start again. Archives are not unpacked: use
-`python -m zipfile -e ARCHIVE.zip FOLDER`.
+FOLDER/manifest.json records URL, size and SHA-256 of every complete file; later runs verify the
+file against this record instead of downloading it again. --sha256 gives a known checksum (one URL
+only). Interrupted http(s) downloads are resumed if the server still has the same file; ftp
+downloads start again. Archives are not unpacked: use `python -m zipfile -e ARCHIVE.zip FOLDER`.
 """
 
 import argparse
@@ -50,7 +50,9 @@ def file_name(url: str) -> str:
     parts = urllib.parse.urlsplit(url)
     name = Path(urllib.parse.unquote(parts.path)).name
     if parts.scheme not in ("http", "https", "ftp") or not name:
-        raise DownloadError(f"{url}: expected an http, https or ftp address that ends in a file name")
+        raise DownloadError(
+            f"{url}: expected an http, https or ftp address that ends in a file name"
+        )
     return name
 
 
@@ -72,7 +74,9 @@ def fetch(url: str, part: Path, validator: str | None, timeout: float) -> int | 
         headers = response.headers
         resumed = getattr(response, "status", None) == 206
         if resumed and not headers.get("Content-Range", "").startswith(f"bytes {present}-"):
-            raise DownloadError(f"{url}: the server sent another range than requested; delete {part} and run again")
+            raise DownloadError(
+                f"{url}: the server sent another range than requested; delete {part} and run again"
+            )
         length = headers.get("Content-Length")
         total = None if length is None else int(length) + (present if resumed else 0)
         tag = headers.get("ETag") or "W/"
@@ -90,15 +94,20 @@ def fetch(url: str, part: Path, validator: str | None, timeout: float) -> int | 
 def download(url: str, folder: Path, sha256: str | None = None, timeout: float = 60.0) -> str:
     """Download or verify one file; returns a message."""
     name = file_name(url)
-    path, part = folder / name, folder / f"{name}.part"
+    path = folder / name
+    part = folder / f"{name}.part"
     manifest = load_manifest(folder)
     known = manifest.get(name)
     expected = sha256 or (known["sha256"] if known else None)
     if path.is_file():
         found = sha256_of(path)
         if expected is not None and found != expected:
-            raise DownloadError(f"{path}: checksum {found}, expected {expected}; delete the file and run again")
-        message = "recorded, not verified: no checksum was known" if expected is None else "verified"
+            raise DownloadError(
+                f"{path}: checksum {found}, expected {expected}; delete the file and run again"
+            )
+        message = (
+            "recorded, not verified: no checksum was known" if expected is None else "verified"
+        )
     else:
         record = part.with_suffix(part.suffix + ".validator")
         validator = record.read_text() if record.is_file() else None
@@ -110,7 +119,9 @@ def download(url: str, folder: Path, sha256: str | None = None, timeout: float =
         if expected is not None and found != expected:
             part.unlink()
             record.unlink(missing_ok=True)
-            raise DownloadError(f"{url}: checksum {found}, expected {expected}; the file was discarded")
+            raise DownloadError(
+                f"{url}: checksum {found}, expected {expected}; the file was discarded"
+            )
         os.replace(part, path)
         record.unlink(missing_ok=True)
         message = "downloaded" if expected is None else "downloaded and verified"
@@ -120,11 +131,22 @@ def download(url: str, folder: Path, sha256: str | None = None, timeout: float =
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("urls", nargs="+", metavar="URL", help="address of an archive; see the README of the dataset")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the files and manifest.json")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "urls",
+        nargs="+",
+        metavar="URL",
+        help="address of an archive; see the README of the dataset",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder for the files and manifest.json"
+    )
     parser.add_argument("--sha256", help="checksum that the file must have (one URL only)")
-    parser.add_argument("--timeout", type=float, default=60.0, help="seconds without a response before giving up")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, help="seconds without a response before giving up"
+    )
     options = parser.parse_args(arguments)
     if options.sha256 and len(options.urls) > 1:
         parser.error("--sha256 expects a single URL")
@@ -132,7 +154,11 @@ def main(arguments: list[str] | None = None) -> int:
     failed = 0
     for url in options.urls:
         try:
-            print(download(url, options.out, options.sha256 and options.sha256.lower(), options.timeout))
+            print(
+                download(
+                    url, options.out, options.sha256 and options.sha256.lower(), options.timeout
+                )
+            )
         except (DownloadError, OSError, ValueError) as error:
             print(f"{url}: {error}" if url not in str(error) else error, file=sys.stderr)
             failed += 1

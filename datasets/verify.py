@@ -4,7 +4,8 @@
     python datasets/verify.py bop ROOT [--split test]
     python datasets/verify.py web ROOT
 
-Exit code 0: no defects. 1: usable with defects (missing, corrupt or bad items, which the library skips). 2: unusable.
+Exit code 0: no defects. 1: usable with defects (missing, corrupt or bad items, which the library
+skips). 2: unusable.
 """
 
 import argparse
@@ -51,13 +52,19 @@ def report(dataset: Dataset, kind: DatasetSpec, images: bool, show: int) -> int:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     kinds = parser.add_subparsers(required=True, metavar=f"{{{','.join(DATASETS)}}}")
     for name, kind in DATASETS.items():
         command = kinds.add_parser(name)
         kind.add_arguments(command)
-        command.add_argument("--images", action="store_true", help="also decode every photograph (slow)")
-        command.add_argument("--show", type=int, default=5, help="number of items to list for each defect")
+        command.add_argument(
+            "--images", action="store_true", help="also decode every photograph (slow)"
+        )
+        command.add_argument(
+            "--show", type=int, default=5, help="number of items to list for each defect"
+        )
         command.set_defaults(kind=kind)
     options = parser.parse_args(arguments)
     try:

@@ -1,4 +1,5 @@
-"""Check the links and pictures of a built site: targets and anchors exist, and pictures have a description.
+"""Check the links and pictures of a built site: targets and anchors exist, and pictures have a
+description.
 
     python docs/check_site.py docs/_build/html
 
@@ -26,10 +27,15 @@ class Page(HTMLParser):
         found = dict(attributes)
         self.anchors |= {value for name in ("id", "name") if (value := found.get(name))}
         links = [value for name in ("href", "src") if (value := found.get(name))]
-        if found.get("class") == "viewcode-back":  # one package for each file, even if two document parts of it
+        # one package for each file, even if two document parts of it
+        if found.get("class") == "viewcode-back":
             links = [link.partition("#")[0] for link in links]
         self.links += links
-        if tag == "img" and not (found.get("alt") or "").strip() and "_thumb." not in (found.get("src") or ""):
+        if (
+            tag == "img"
+            and not (found.get("alt") or "").strip()
+            and "_thumb." not in (found.get("src") or "")
+        ):
             self.undescribed.append(found.get("src") or "?")
 
 
@@ -49,12 +55,18 @@ def find_faults(root: Path) -> Iterator[str]:
             target = target / "index.html" if target.is_dir() else target
             if not target.is_file():
                 yield f"{path}: {link} does not exist"
-            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
+            elif (
+                parts.fragment
+                and target in pages
+                and unquote(parts.fragment) not in pages[target].anchors
+            ):
                 yield f"{path}: {link} has no such anchor"
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", type=Path)
     faults = list(find_faults(parser.parse_args().root))
     print("\n".join(faults) or "all links are valid")

@@ -1,4 +1,5 @@
-"""Sphinx configuration: ``scripts/docs.sh`` builds the site from the pages, the docstrings and ``gallery``."""
+"""Sphinx configuration: ``scripts/docs.sh`` builds the site from the pages, the docstrings and
+``gallery``."""
 
 import re
 import sys
@@ -68,11 +69,13 @@ COPIED_PAGES = {
 """Files outside ``docs`` and the pages of the site that show them."""
 
 SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "S", "T", "V", "W", "size"}
-"""Words in docstrings that napoleon mistakes for types, type variables, torch's Module, and private types."""
+"""Words in docstrings that napoleon mistakes for types, type variables, torch's Module, and private
+types."""
 
 
 def site_links(text: str, file: Path) -> str:
-    """Rewrite the links of ``file`` between files of the repository as links between pages of the site."""
+    """Rewrite the links of ``file`` between files of the repository as links between pages of the
+    site."""
 
     def site_link(match: re.Match[str]) -> str:
         path = (file.parent / match[1]).resolve().relative_to(ROOT).as_posix()
@@ -88,8 +91,14 @@ def site_links(text: str, file: Path) -> str:
 
 def write_pages(app: Any, *_: Any) -> None:
     """Write the pages of ``docs/project``."""
-    pages = {page: site_links((ROOT / path).read_text("utf-8"), ROOT / path) for path, page in COPIED_PAGES.items()}
-    for page, text in {**pages, "project/messages.md": messages.page(ROOT / "curvireg_torch")}.items():
+    pages = {
+        page: site_links((ROOT / path).read_text("utf-8"), ROOT / path)
+        for path, page in COPIED_PAGES.items()
+    }
+    for page, text in {
+        **pages,
+        "project/messages.md": messages.page(ROOT / "curvireg_torch"),
+    }.items():
         copy = Path(app.srcdir) / page
         if not copy.is_file() or copy.read_text(encoding="utf-8") != text:
             copy.parent.mkdir(exist_ok=True)
@@ -103,15 +112,22 @@ def rewrite_links(app: Any, page: str, source: list[str]) -> None:
 
 
 def resolve_short_names(app: Any, env: Any, node: Any, text: Any) -> Any:
-    """Link a name in a docstring to the one documented object that ends with it; names of other libraries stay text."""
+    """Link a name in a docstring to the one documented object that ends with it; names of other
+    libraries stay text."""
     target = node.get("reftarget", "").strip(".")
     if node.get("refdomain") != "py":
         return None
     objects = env.get_domain("py").objects
-    found = [target] if target in objects else sorted(n for n in objects if n.endswith("." + target.rsplit(".", 1)[-1]))
+    found = (
+        [target]
+        if target in objects
+        else sorted(n for n in objects if n.endswith("." + target.rsplit(".", 1)[-1]))
+    )
     if found:
         page = app.builder.get_relative_uri(node["refdoc"], objects[found[0]].docname)
-        return nodes.reference("", "", text, internal=True, refuri=f"{page}#{objects[found[0]].node_id}")
+        return nodes.reference(
+            "", "", text, internal=True, refuri=f"{page}#{objects[found[0]].node_id}"
+        )
     ours = target.startswith("curvireg_torch") or target.isidentifier()
     return None if ours and target.rsplit(".", 1)[-1] not in SHAPES else text
 

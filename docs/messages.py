@@ -1,4 +1,5 @@
-"""The page "What does this message mean?", from the messages in the source; ``conf.py`` writes it."""
+"""The page "What does this message mean?", from the messages in the source; ``conf.py`` writes
+it."""
 
 import ast
 from collections.abc import Iterable, Iterator
@@ -6,8 +7,9 @@ from pathlib import Path
 
 HEAD = """# What does this message mean?
 
-Messages begin with the file, option or argument that they are about. They are listed without it, by the words that
-follow; … stands for a name or a number. Search this page for the words that do not change.
+Messages begin with the file, option or argument that they are about. They are listed without it,
+by the words that follow; … stands for a name or a number. Search this page for the words that do
+not change.
 """
 
 SECTIONS = {
@@ -25,9 +27,17 @@ SECTIONS = {
 
 
 def messages(package: Path) -> Iterator[tuple[str, str, str]]:
-    """Kind of error, what is wrong, and what to do, of each message that tells it after a semicolon."""
-    modules = [ast.parse(file.read_text(encoding="utf-8")) for file in sorted(package.rglob("*.py"))]
-    constants = {name: text for module in modules for name, text in assigned(module.body, {}).items() if name.isupper()}
+    """Kind of error, what is wrong, and what to do, of each message that tells it after a
+    semicolon."""
+    modules = [
+        ast.parse(file.read_text(encoding="utf-8")) for file in sorted(package.rglob("*.py"))
+    ]
+    constants = {
+        name: text
+        for module in modules
+        for name, text in assigned(module.body, {}).items()
+        if name.isupper()
+    }
     for module in modules:
         for function in ast.walk(module):
             if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
@@ -71,8 +81,13 @@ def page(package: Path) -> str:
     parts = [HEAD]
     for heading, rows in found.items():
         if rows:
-            table = [f"| {cell(wrong)} | {cell(advice)} |" for wrong, advice in sorted(rows, key=sort_key)]
-            parts.append("\n".join([f"## {heading}\n", "| message | what to do |", "|---|---|", *table, ""]))
+            table = [
+                f"| {cell(wrong)} | {cell(advice)} |"
+                for wrong, advice in sorted(rows, key=sort_key)
+            ]
+            parts.append(
+                "\n".join([f"## {heading}\n", "| message | what to do |", "|---|---|", *table, ""])
+            )
     return "\n".join(parts)
 
 

@@ -19,8 +19,13 @@ WRITTEN = ("scripts/results", "docs", "README.md")
 
 def update_page(page: Path, name: str, body: str) -> None:
     """Write ``body`` between the markers ``name:begin`` and ``name:end`` of a Markdown page."""
-    begin, end, text = f"<!-- {name}:begin -->", f"<!-- {name}:end -->", page.read_text(encoding="utf-8")
-    page.write_text(f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}", encoding="utf-8")
+    begin = f"<!-- {name}:begin -->"
+    end = f"<!-- {name}:end -->"
+    text = page.read_text(encoding="utf-8")
+    page.write_text(
+        f"{text[: text.index(begin) + len(begin)]}\n{body}{text[text.index(end) :]}",
+        encoding="utf-8",
+    )
 
 
 def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
@@ -30,7 +35,8 @@ def table_lines(cells: Sequence[Sequence[str]]) -> list[str]:
 
 
 def write_json(path: Path, content: Any, indent: int = 2) -> None:
-    """Write a record, and create its folder if needed; an interrupted run leaves no half of a file."""
+    """Write a record, and create its folder if needed; an interrupted run leaves no half of a
+    file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{os.getpid()}")
     part.write_text(json.dumps(content, indent=indent) + "\n", encoding="utf-8")
@@ -42,14 +48,22 @@ def today() -> str:
 
 
 def commit(root: Path = REPOSITORY) -> str:
-    """Short hash of the checkout, with "+" if anything outside ``WRITTEN`` was changed; "unknown" without git."""
+    """Short hash of the checkout, with "+" if anything outside ``WRITTEN`` was changed; "unknown"
+    without git."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(root), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", *(f":!{path}" for path in WRITTEN))
+        changed = git(
+            "status",
+            "--porcelain",
+            "--untracked-files=no",
+            "--",
+            ".",
+            *(f":!{path}" for path in WRITTEN),
+        )
         return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
@@ -66,19 +80,25 @@ def processor() -> str:
 def run_process(
     words: Sequence[str], folder: Path, environment: dict[str, str]
 ) -> tuple[float, resource.struct_rusage, str]:
-    """Seconds, resources and output of a Python process in a folder; the script ends if the process fails.
+    """Seconds, resources and output of a Python process in a folder; the script ends if the process
+    fails.
 
     Args:
         words: arguments of the interpreter.
     """
     start = time.perf_counter()
     with (folder / "output").open("w+") as output, (folder / "errors").open("w+") as errors:
-        process = subprocess.Popen([sys.executable, *words], env=environment, stdout=output, stderr=errors, cwd=folder)
+        process = subprocess.Popen(
+            [sys.executable, *words], env=environment, stdout=output, stderr=errors, cwd=folder
+        )
         _, status, usage = os.wait4(process.pid, 0)
         seconds = time.perf_counter() - start
         process.returncode = os.waitstatus_to_exitcode(status)
         if process.returncode:
             errors.seek(0)
-            raise SystemExit(f"{' '.join(words)} failed with PYTHONPATH={environment['PYTHONPATH']}: {errors.read()}")
+            raise SystemExit(
+                f"{' '.join(words)} failed with PYTHONPATH={environment['PYTHONPATH']}: "
+                f"{errors.read()}"
+            )
         output.seek(0)
         return seconds, usage, output.read()

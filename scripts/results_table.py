@@ -1,11 +1,12 @@
 """Write the README's table of results from ``scripts/results/evaluation_*.json``.
 
-    python scripts/results_table.py --record DIR/summary.json NAME    store a summary of ``curvireg evaluate`` as NAME
-    python scripts/results_table.py --compare DIR/summary.json ...    print them beside the stored ones
-    python scripts/results_table.py                                   write the table into the README
+    python scripts/results_table.py --record DIR/summary.json NAME    store a summary of
+    ``curvireg evaluate`` as NAME python scripts/results_table.py --compare DIR/summary.json ...
+    print them beside the stored ones python scripts/results_table.py
+       write the table into the README
 
-A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted changes), so record
-it right after measuring.
+A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted
+changes), so record it right after measuring.
 """
 
 import argparse
@@ -18,14 +19,20 @@ from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, upd
 
 PASCAL3D = (
     "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median | s/object",
-    "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is below; median: of that "
-    "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; easy: neither truncated, "
-    "occluded nor difficult. No camera is given. s/object: one thread, with other work on the machine.",
+    "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is "
+    "below; median: of that "
+    "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; "
+    "easy: neither truncated, "
+    "occluded nor difficult. No camera is given. s/object: one thread, with other work on the "
+    "machine.",
 )
 BOP = (
-    "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | Acc 30° | s/object",
-    "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean distance of model "
-    "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; unoccluded: at least 95 % "
+    "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | "
+    "Acc 30° | s/object",
+    "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean "
+    "distance of model "
+    "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; "
+    "unoccluded: at least 95 % "
     "visible. Box and camera matrix are given. s/object as above.",
 )
 
@@ -34,9 +41,19 @@ LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name")
-    parser.add_argument("--compare", nargs="+", type=Path, metavar="SUMMARY", help="print summaries beside stored ones")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--record", nargs=2, metavar=("SUMMARY", "NAME"), help="store a summary.json under a name"
+    )
+    parser.add_argument(
+        "--compare",
+        nargs="+",
+        type=Path,
+        metavar="SUMMARY",
+        help="print summaries beside stored ones",
+    )
     arguments = parser.parse_args()
     if arguments.record:
         print(record(Path(arguments.record[0]), arguments.record[1]))
@@ -68,7 +85,11 @@ def comparison(summaries: Sequence[Path], results: Path) -> str:
         name = path.parent.name
         measured = json.loads(path.read_text(encoding="utf-8"))
         stored_path = results / f"evaluation_{name}.json"
-        stored = json.loads(stored_path.read_text(encoding="utf-8"))["summary"] if stored_path.exists() else {}
+        stored = (
+            json.loads(stored_path.read_text(encoding="utf-8"))["summary"]
+            if stored_path.exists()
+            else {}
+        )
         for key in COMPARED[measured["settings"]["dataset"]]:
             values = [score(summary.get(key), key) for summary in (stored, measured)]
             rows.append([name, str(measured["n"]), key, *values])
@@ -82,7 +103,10 @@ def score(value: float | None, key: str) -> str:
 
 def table(results: Path) -> str:
     """Markdown of all stored summaries."""
-    records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(results.glob("evaluation_*.json"))]
+    records = [
+        json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(results.glob("evaluation_*.json"))
+    ]
     parts = []
     for title, kind, (columns, definition), cells in (
         ("Viewpoints on PASCAL3D+", "pascal3d", PASCAL3D, pascal3d_cells),
@@ -90,11 +114,17 @@ def table(results: Path) -> str:
     ):
         chosen = [r for r in records if r["summary"]["settings"]["dataset"] == kind]
         if chosen:
-            body = "\n".join(table_lines([columns.split(" | "), *(cells(r["name"], r["summary"]) for r in chosen)]))
+            body = "\n".join(
+                table_lines(
+                    [columns.split(" | "), *(cells(r["name"], r["summary"]) for r in chosen)]
+                )
+            )
             sets: dict[str, list[str]] = {}
             for r in chosen:
                 sets.setdefault(note(r), []).append(r["name"])
-            notes = "\n".join(f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items())
+            notes = "\n".join(
+                f"- {', '.join(names)}: {conditions}" for conditions, names in sets.items()
+            )
             parts.append(f"**{title}.** {definition}\n\n{body}\n\n{notes}\n")
     return "\n".join(parts)
 
@@ -113,22 +143,47 @@ def note(record: dict[str, Any]) -> str:
 
 
 def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
-    easy, aware = s["subsets"]["easy"], s["symmetry_aware"]
-    values = [percent(s["acc_pi_6"]), percent(s["acc_pi_18"]), degrees(s["med_err_deg"]), percent(aware["acc_pi_6"])]
-    return [name, str(s["n"]), *values, percent(easy["acc_pi_6"]), degrees(easy["med_err_deg"]), seconds_each(s)]
+    easy = s["subsets"]["easy"]
+    aware = s["symmetry_aware"]
+    values = [
+        percent(s["acc_pi_6"]),
+        percent(s["acc_pi_18"]),
+        degrees(s["med_err_deg"]),
+        percent(aware["acc_pi_6"]),
+    ]
+    return [
+        name,
+        str(s["n"]),
+        *values,
+        percent(easy["acc_pi_6"]),
+        degrees(easy["med_err_deg"]),
+        seconds_each(s),
+    ]
 
 
 def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
     whole = s["subsets"]["unoccluded"]
     values = [percent(s["acc_15_deg"]), percent(s["acc_30_deg"]), degrees(s["med_err_deg"])]
     values += [percent(s[key]) for key in ("add_recall_0.1d", "mssd_ar", "mspd_ar")]
-    return [name, counted(name, s["n"]), *values, str(whole["n"]), percent(whole["acc_30_deg"]), seconds_each(s)]
+    return [
+        name,
+        counted(name, s["n"]),
+        *values,
+        str(whole["n"]),
+        percent(whole["acc_30_deg"]),
+        seconds_each(s),
+    ]
 
 
 def counted(name: str, n: int) -> str:
-    """The number of objects, with the numbers of views and lightings if the set has several lightings."""
+    """The number of objects, with the numbers of views and lightings if the set has several
+    lightings."""
     lightings = LIGHTINGS.get(name, 1)
-    return str(n) if lightings == 1 or n % lightings else f"{n} ({n // lightings} views x {lightings} lightings)"
+    return (
+        str(n)
+        if lightings == 1 or n % lightings
+        else f"{n} ({n // lightings} views x {lightings} lightings)"
+    )
 
 
 def percent(fraction: float | None) -> str:

@@ -2,8 +2,8 @@
 
 import os
 
-# Nearly all that the tests compute is too small for several threads. Set before torch is imported, and for processes
-# that tests start.
+# Nearly all that the tests compute is too small for several threads. Set before torch is imported,
+# and for processes that tests start.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest

@@ -1,4 +1,5 @@
-"""Public names are documented, their options keyword-only, and every Module repeats its function's options."""
+"""Public names are documented, their options keyword-only, and every Module repeats its function's
+options."""
 
 import inspect
 

@@ -11,7 +11,15 @@ from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import paper_views, sample_views
 from curvireg_torch.matching.describe import depth_filter
-from curvireg_torch.pipeline import DEFAULT, DEPTH_FIELDS, FIELDS, PRESETS, BankSettings, ViewPolicy, preset_named
+from curvireg_torch.pipeline import (
+    DEFAULT,
+    DEPTH_FIELDS,
+    FIELDS,
+    PRESETS,
+    BankSettings,
+    ViewPolicy,
+    preset_named,
+)
 from curvireg_torch.terms import TERMS, Correlation, Repeatability
 from curvireg_torch.utils import choices
 
@@ -20,7 +28,11 @@ from curvireg_torch.utils import choices
 def test_fields_return_vector_fields(name):
     x = torch.zeros(1, 3, 48, 48)
     x[..., 12:36, 8:40] = torch.linspace(0.2, 1, 32)
-    field = Pipeline(field=name).photograph_field() if name in FIELDS else depth_filter(BankSettings(depth_field=name))
+    field = (
+        Pipeline(field=name).photograph_field()
+        if name in FIELDS
+        else depth_filter(BankSettings(depth_field=name))
+    )
     out = field(x if getattr(field, "colour", False) else x[:, :1])
     assert out.shape == (1, 2, 48, 48)
     assert out.isfinite().all()
@@ -59,7 +71,12 @@ def test_presets_have_the_stated_settings():
 
 def test_json_contains_every_setting():
     base = Pipeline()
-    settings = [{"field": "focus", "weights": ""}, {"terms": base.terms[:2]}, {"box_jitter": 0.2}, {"weights": "0123"}]
+    settings = [
+        {"field": "focus", "weights": ""},
+        {"terms": base.terms[:2]},
+        {"box_jitter": 0.2},
+        {"weights": "0123"},
+    ]
     settings += [{"hypotheses": 6}, {"search": True, "contours": False}, {"contours": False}]
     settings += [{"views": ViewPolicy(pose="paper")}, {"views": ViewPolicy(frame="principal")}]
     changed = [base.with_pose_prior("upright"), *(replace(base, **setting) for setting in settings)]
@@ -71,7 +88,9 @@ def test_json_contains_every_setting():
         changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
     for term in base.terms:
         for f in fields(term):
-            value = {"none": "bank", "monotone": "paper", 1000: 7, 64: 7}.get(getattr(term, f.name), 0.3)
+            value = {"none": "bank", "monotone": "paper", 1000: 7, 64: 7}.get(
+                getattr(term, f.name), 0.3
+            )
             if f.name != "weights":
                 changed.append(base.with_term(term.name, **{f.name: value}))
     texts = {pipeline.to_json() for pipeline in changed}

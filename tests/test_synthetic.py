@@ -13,7 +13,8 @@ from tests._support.scenes import CAMERA, SIZE
 
 
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():
-    generator, mesh = torch.Generator().manual_seed(3), example_mesh()
+    generator = torch.Generator().manual_seed(3)
+    mesh = example_mesh()
     mesh.visual.face_colors = np.tile(np.array([255, 0, 255, 255], np.uint8), (len(mesh.faces), 1))
     T = random_pose(mesh, CAMERA, SIZE, generator, elevations=(15.0, 45.0))
     grey = torch.full((3, *SIZE), 0.5)
@@ -36,7 +37,8 @@ def test_demo_scenes_depend_on_the_seed_alone():
 
 
 def test_painted_mesh_has_the_same_shape_and_a_red_front():
-    plain, painted = example_mesh(), example_mesh(painted=True)
+    plain = example_mesh()
+    painted = example_mesh(painted=True)
     assert np.array_equal(plain.vertices, painted.vertices)
     red = painted.visual.face_colors[:, 0] > 190
     red &= painted.visual.face_colors[:, 1] < 60
@@ -45,7 +47,9 @@ def test_painted_mesh_has_the_same_shape_and_a_red_front():
 
 @pytest.mark.slow
 def test_demo_scenes_are_registered():
-    registrar = Registrar(example_mesh(), pipeline=Pipeline().with_pose_prior("upright"), progress=False)
+    registrar = Registrar(
+        example_mesh(), pipeline=Pipeline().with_pose_prior("upright"), progress=False
+    )
     for seed in range(5):
         scene = demo_scene(seed)
         result = registrar([scene.image], scene.box[None], scene.camera_matrix)[0]

@@ -1,7 +1,8 @@
 """The command ``curvireg``.
 
-Each command has a function ``add_*`` that adds it to the subparsers, and one that runs it, which imports heavy modules,
-so that help and mistakes in options appear at once, and raises :class:`CurviregError` for unusable input.
+Each command has a function ``add_*`` that adds it to the subparsers, and one that runs it, which
+imports heavy modules, so that help and mistakes in options appear at once, and raises
+:class:`CurviregError` for unusable input.
 """
 
 import argparse
@@ -25,7 +26,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; without any, print the help.
 
     Returns:
-        The exit code: 0; 2 for input that cannot be used; 130 after Ctrl-C; 141 when the reader of a pipe has gone.
+        The exit code: 0; 2 for input that cannot be used; 130 after Ctrl-C; 141 when the reader of
+        a pipe has gone.
     """
     try:
         try:
@@ -40,7 +42,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             print(end="", flush=True)  # a closed pipe shows here and not at interpreter exit
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # takes what is still buffered
+        # takes what is still buffered
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13  # as shells report SIGPIPE
 
 
@@ -49,7 +52,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
     parser = build_parser()
     arguments, rest = parser.parse_known_args(join_numbers(argv))
     if hasattr(arguments, "paths") and not any(word.startswith("-") for word in rest):
-        arguments.paths += map(Path, rest)  # argparse does not collect positionals that follow an option
+        # argparse does not collect positionals that follow an option
+        arguments.paths += map(Path, rest)
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     arguments.argv = list(argv)
@@ -61,7 +65,8 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; parsed arguments hold ``run``, the function to be called with them."""
+    """The parser of all commands; parsed arguments hold ``run``, the function to be called with
+    them."""
     parser = Parser(prog="curvireg", description="Pose of a known 3D object from one photograph.")
     parser.add_argument("--version", action="version", version=f"curvireg_torch {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -80,18 +85,22 @@ def _run(arguments: argparse.Namespace) -> int:
     with warnings.catch_warnings(), terminable():
         if not arguments.debug:
             warnings.showwarning = _show_warning
-            os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # of videos it cannot read, our message is enough
+            # of videos it cannot read, our message is enough
+            os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         try:
             return arguments.run(arguments) or 0
         except (CurviregError, OSError) as error:
             if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
-            advice = "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
+            advice = (
+                "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
+            )
             print(f"curvireg: error: {error}{advice}", file=sys.stderr)
             return 2
 
 
 def _show_warning(message: Any, category: type[Warning], *_: Any, **__: Any) -> None:
-    """Print a warning of ours; those of libraries, such as numpy's about division by zero, are for --debug."""
+    """Print a warning of ours; those of libraries, such as numpy's about division by zero, are for
+    --debug."""
     if category is UserWarning or issubclass(category, CurviregWarning):
         print(f"curvireg: warning: {message}", file=sys.stderr)

@@ -32,10 +32,13 @@ PICTURES = {
     "viewpoints": "score over the viewing directions, and the hypotheses",
 }
 PROTOCOL = (
-    "cad=annotated|any|other: the annotated CAD model, the best of the class, or another one of it (seed=N); "
+    "cad=annotated|any|other: the annotated CAD model, the best of the class, or another one of "
+    "it (seed=N); "
     "pose=upright|any: whether objects are known to stand upright; "
-    "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of the side (seed=N); "
-    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that is off by up to DEG; "
+    "box=annotated|none|FRACTION: as annotated; detected; or each edge moved by up to FRACTION of "
+    "the side (seed=N); "
+    "hint=none|azimuth:DEG|pose:DEG: azimuth or rotation known to lie within DEG of a value that "
+    "is off by up to DEG; "
     "views=N: N photographs of one pose together (bop; seed=N)"
 )
 FORMATS = (".png", ".svg", ".pdf")
@@ -51,7 +54,9 @@ def add_bank(commands: Any) -> None:
         run=build_bank,
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help="the bank, as .safetensors"
+    )
     add_options(parser, *MESH, *METHOD)
 
 
@@ -59,7 +64,9 @@ def build_bank(arguments: argparse.Namespace) -> None:
     """Build and save a bank."""
     check_given([], [arguments.mesh])
     if arguments.out.suffix != ".safetensors" or arguments.out.is_dir():
-        raise InvalidInputError(f"--out {arguments.out}: expected the name of a file that ends in .safetensors")
+        raise InvalidInputError(
+            f"--out {arguments.out}: expected the name of a file that ends in .safetensors"
+        )
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     from ..evaluation.outputs import check_output_file
@@ -68,10 +75,15 @@ def build_bank(arguments: argparse.Namespace) -> None:
     from ..matching import ViewBank
     from ..utils.threads import one_torch_thread
 
-    start, options = time.perf_counter(), register_options(arguments)
+    start = time.perf_counter()
+    options = register_options(arguments)
     pipeline = options.open_pipeline()
     mesh = options.load_mesh(arguments.mesh)
-    settings: dict[str, Any] = {"renderer": options.renderer, "progress": options.progress, "device": options.device}
+    settings: dict[str, Any] = {
+        "renderer": options.renderer,
+        "progress": options.progress,
+        "device": options.device,
+    }
     with one_torch_thread():
         bank = ViewBank.build(mesh, pipeline=pipeline, **settings)
     bank.save(arguments.out)
@@ -80,9 +92,12 @@ def build_bank(arguments: argparse.Namespace) -> None:
 
 
 def add_cache(commands: Any) -> None:
-    text, examples = "list or clear the banks cached on disk", ("curvireg cache list", "curvireg cache clear")
+    text = "list or clear the banks cached on disk"
+    examples = ("curvireg cache list", "curvireg cache clear")
     parser = add_command(commands, "cache", *examples, help=text, run=show_cache)
-    parser.add_argument("action", nargs="?", choices=("list", "clear"), default="list", help="default: list")
+    parser.add_argument(
+        "action", nargs="?", choices=("list", "clear"), default="list", help="default: list"
+    )
     parser.add_argument("--clear", action="store_true", help="the same as clear")
 
 
@@ -96,7 +111,10 @@ def show_cache(arguments: argparse.Namespace) -> None:
     banks = list_cache()
     for bank in banks:
         used = time.strftime("%Y-%m-%d %H:%M", time.localtime(bank.used))
-        print(f"{bank.size / 1e6:8.1f} MB   last used {used}   {_mesh_of(bank.path)}   {bank.path.name}")
+        print(
+            f"{bank.size / 1e6:8.1f} MB   last used {used}   {_mesh_of(bank.path)}   "
+            f"{bank.path.name}"
+        )
     print(f"{cache_folder()}: {len(banks)} banks, {sum(bank.size for bank in banks) / 1e6:.1f} MB")
 
 
@@ -113,17 +131,19 @@ def _mesh_of(bank: Path) -> str:
 
 def add_evaluate(commands: Any) -> None:
     example = "curvireg evaluate bop data/bop/lm --out out/lm"
-    datasets = add_command(commands, "evaluate", example, help="register and score a dataset").add_subparsers(
-        required=True, metavar="DATASET"
-    )
+    datasets = add_command(
+        commands, "evaluate", example, help="register and score a dataset"
+    ).add_subparsers(required=True, metavar="DATASET")
     for name, kind in DATASETS.items():
         dataset = add_command(
             datasets,
             name,
             f"curvireg evaluate {name} {kind.example} --out out/{name}",
-            f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out out/{name}-fast",
+            f"curvireg evaluate {name} {kind.example} --jobs 2 --limit 100 --preset fast --out "
+            f"out/{name}-fast",
             help=kind.help,
-            description="Writes DIR/summary.json, DIR/predictions.csv and DIR/index.html; the same command resumes.",
+            description="Writes DIR/summary.json, DIR/predictions.csv and DIR/index.html; the "
+            "same command resumes.",
             run=run_evaluation,
         )
         dataset.set_defaults(dataset=name)
@@ -134,26 +154,46 @@ def add_evaluate(commands: Any) -> None:
         add_options(dataset, "preset", "pipeline", "renderer", "progress")
         jobs = "processes that share the objects (default: 1)"
         add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
-        add("--limit", type=whole_number(1), metavar="N", help="only N objects, spread evenly over the set")
-        add("--out", type=Path, required=True, metavar="DIR", help="folder of the results; made if it does not exist")
+        add(
+            "--limit",
+            type=whole_number(1),
+            metavar="N",
+            help="only N objects, spread evenly over the set",
+        )
+        add(
+            "--out",
+            type=Path,
+            required=True,
+            metavar="DIR",
+            help="folder of the results; made if it does not exist",
+        )
 
 
 def run_evaluation(arguments: argparse.Namespace) -> None:
     """Evaluate a dataset and print the headline."""
     if not Path(arguments.root).is_dir():
-        raise MissingFileError("no such folder; docs/datasets.md shows the layout", subject=arguments.root)
+        raise MissingFileError(
+            "no such folder; docs/datasets.md shows the layout", subject=arguments.root
+        )
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
     from ..evaluation.store import run_processes
     from ..utils.threads import one_torch_thread
 
-    kind, out, options = DATASETS[arguments.dataset], arguments.out, register_options(arguments)
-    protocol, pipeline = Protocol.parse(arguments.protocol, pose=kind.pose), options.open_pipeline()
+    kind = DATASETS[arguments.dataset]
+    out = arguments.out
+    options = register_options(arguments)
+    protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
+    pipeline = options.open_pipeline()
     if run_processes(arguments.jobs, arguments.argv):
         return
     benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
     check_writable(out, "--out")
-    how: dict[str, Any] = {"limit": arguments.limit, "renderer": options.renderer, "progress": options.progress}
+    how: dict[str, Any] = {
+        "limit": arguments.limit,
+        "renderer": options.renderer,
+        "progress": options.progress,
+    }
     with one_torch_thread():
         summary = evaluate(benchmark, out, pipeline=pipeline, **how)
     if summary is None:  # another process writes it
@@ -161,8 +201,13 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     if summary["n"] == 0:
         skipped = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items())
         reasons = skipped or "no object is annotated"
-        raise InvalidInputError(f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json")
-    print(f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} skipped")
+        raise InvalidInputError(
+            f"{arguments.root}: nothing was scored ({reasons}); see {arguments.out}/summary.json"
+        )
+    print(
+        f"{summary['n']} objects, {summary['failed']} failed, {sum(summary['skipped'].values())} "
+        f"skipped"
+    )
     numbers = {**summary, **summary.get("detection", {})}.items()
     print("   ".join(f"{name} {value:.3f}" for name, value in numbers if isinstance(value, float)))
     if "n_posed" in summary:
@@ -181,13 +226,23 @@ def add_view(commands: Any) -> None:
         run=view,
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
-    parser.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help="a mesh or a bank; both can be added later")
+    parser.add_argument(
+        "mesh",
+        type=Path,
+        nargs="?",
+        metavar="MESH",
+        help="a mesh or a bank; both can be added later",
+    )
     add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
     add_limits(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0 or ::, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)
-    parser.add_argument("--port", type=whole_number(0, 65535), default=0, help="default: a free one")
-    parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    parser.add_argument(
+        "--port", type=whole_number(0, 65535), default=0, help="default: a free one"
+    )
+    parser.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="only print the address"
+    )
 
 
 def view(arguments: argparse.Namespace) -> None:
@@ -207,7 +262,10 @@ def view(arguments: argparse.Namespace) -> None:
 
 
 def add_plot(commands: Any) -> None:
-    examples = [f"curvireg plot {kind} photo.jpg part.stl --box 410 220 890 700 --out {kind}.png" for kind in PICTURES]
+    examples = [
+        f"curvireg plot {kind} photo.jpg part.stl --box 410 220 890 700 --out {kind}.png"
+        for kind in PICTURES
+    ]
     plot = add_command(commands, "plot", *examples, help="draw a picture of a registration")
     kinds = plot.add_subparsers(required=True, metavar="KIND")
     for (kind, text), example in zip(PICTURES.items(), examples, strict=True):
@@ -217,17 +275,23 @@ def add_plot(commands: Any) -> None:
         parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
         add_options(parser, *PHOTOGRAPH)
         add_limits(parser)
-        parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=", ".join(FORMATS))
+        parser.add_argument(
+            "--out", type=Path, required=True, metavar="FILE", help=", ".join(FORMATS)
+        )
 
 
 def draw(arguments: argparse.Namespace) -> None:
     """Register one photograph and draw a picture of the result."""
     check_given([arguments.photo], [arguments.mesh])
     if arguments.out.suffix.lower() not in FORMATS:
-        raise InvalidInputError(f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}")
+        raise InvalidInputError(
+            f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"
+        )
     from ..evaluation.outputs import check_output_file
 
-    check_output_file(arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg")
+    check_output_file(
+        arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
+    )
     from ..data import read_photo
     from ..evaluation.opening import open_registrar
     from ..evaluation.photograph import register_entry
@@ -254,12 +318,17 @@ def draw(arguments: argparse.Namespace) -> None:
 
 
 def add_demo(commands: Any) -> None:
-    examples = ("curvireg demo --out out/demo", "curvireg demo --seed 7 --preset fast --out out/demo")
+    examples = (
+        "curvireg demo --out out/demo",
+        "curvireg demo --seed 7 --preset fast --out out/demo",
+    )
     text = "register a generated scene, whose true pose is known"
     parser = add_command(commands, "demo", *examples, help=text, run=demo)
     parser.set_defaults(pose="upright")
     parser.add_argument("--seed", type=int, default=2, help="number of the scene (default: 2)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the results"
+    )
     add_options(parser, *METHOD)
 
 
@@ -280,12 +349,16 @@ def demo(arguments: argparse.Namespace) -> None:
         write_file(out / "mesh.ply", scene.mesh.export(file_type="ply"))
         write_file(out / "photo.png", png(to_uint8(scene.image)))
         options = register_options(arguments, [out / "photo.png"], [out / "mesh.ply"])
-        options = replace(options, box=tuple(scene.box.tolist()), camera=Camera(scene.camera_matrix))
+        options = replace(
+            options, box=tuple(scene.box.tolist()), camera=Camera(scene.camera_matrix)
+        )
         with opened_registrar(options) as (registrar, seconds):
-            entry, photo = options.entry(out / "photo.png"), read_photo(out / "photo.png")
+            entry = options.entry(out / "photo.png")
+            photo = read_photo(out / "photo.png")
             found = register_entry(entry, photo, registrar, bank_seconds=seconds)
         assert found.translation is not None
-        R, t = scene.truth[:3, :3], scene.truth[:3, 3]
+        R = scene.truth[:3, :3]
+        t = scene.truth[:3, 3]
         degrees = float(rotation_error(found.rotation, R))
         fraction = float((found.translation - t).norm() / t.norm())
         truth = {"rotation": R.tolist(), "translation": t.tolist()}
@@ -294,7 +367,8 @@ def demo(arguments: argparse.Namespace) -> None:
         found.write(out)
     print_result(found.document, out)
     print(
-        f"error against the truth: rotation {degrees:.1f} degrees, translation {100 * fraction:.1f} % of the distance"
+        f"error against the truth: rotation {degrees:.1f} degrees, translation "
+        f"{100 * fraction:.1f} % of the distance"
     )
 
 

@@ -14,8 +14,10 @@ def add_compare(commands: Any) -> None:
         "curvireg compare out/lm-fast out/lm",
         "curvireg compare out/lm-fast out/lm --json",
         help="compare two evaluations of one dataset, object by object",
-        description="Prints each score with its 95 % interval, how often B is better than A and worse,\n"
-        "the p of a sign test, and a Markdown and a LaTeX row of each run. Objects in one run only do not count.",
+        description="Prints each score with its 95 % interval, how often B is better than A and "
+        "worse,\n"
+        "the p of a sign test, and a Markdown and a LaTeX row of each run. Objects in one run "
+        "only do not count.",
         run=compare_runs,
     )
     parser.add_argument("a", type=Path, metavar="RUN_A", help="folder of 'curvireg evaluate --out'")

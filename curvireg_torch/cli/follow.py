@@ -48,18 +48,26 @@ def add_follow(commands: Any) -> None:
         commands,
         "follow",
         "curvireg follow shots/ part.stl --unit mm --camera 1450 1450 960 540 --out out/follow",
-        "curvireg follow turn.mp4 part.stl --camera cam.yaml --box 410 220 890 700 --out out/follow",
+        "curvireg follow turn.mp4 part.stl --camera cam.yaml --box 410 220 890 700 --out "
+        "out/follow",
         "curvireg follow 0 part.stl --unit mm --camera cam.yaml --json",
         help="follow an object through a video, or live",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
-        "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, failed),\nrotation row by row, "
+        "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, "
+        "failed),\nrotation row by row, "
         "translation in the mesh's unit, confidence, edge support, and why there is no pose;\n"
         "DIR/overlay.mp4: contours of the pose and confidence on each frame.\n"
         "Ctrl-C ends it; the poses so far are kept.",
         run=run,
     )
-    frames = "a video; a folder of frames in the order of their names; the number of a camera, such as 0; or a stream, "
-    parser.add_argument("frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed")
+    frames = (
+        "a video; a folder of frames in the order of their names; the number of a camera, "
+        "such as "
+        "0; or a stream, "
+    )
+    parser.add_argument(
+        "frames", metavar="FRAMES", help=frames + "rtsp://... Live frames are dropped, not delayed"
+    )
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh or a bank")
     options = [name for name in PHOTOGRAPH if name != "mask"]
     add_options(
@@ -71,23 +79,32 @@ def add_follow(commands: Any) -> None:
         box="in px in the first frame; default: the object is detected",
     )
     add_limits(parser)
-    parser.add_argument("--json", action="store_true", help="print each pose as a line of JSON; --out is optional")
-    parser.add_argument("--show", action="store_true", help="open a page with the latest frame; --out is optional")
+    parser.add_argument(
+        "--json", action="store_true", help="print each pose as a line of JSON; --out is optional"
+    )
+    parser.add_argument(
+        "--show", action="store_true", help="open a page with the latest frame; --out is optional"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Follow the object; write its poses, and draw them."""
-    source, out = arguments.frames, arguments.out
+    source = arguments.frames
+    out = arguments.out
     live = source.isdecimal() or "://" in source
     check_given([] if live else [Path(source)], [arguments.mesh])
     if not live and not Path(source).exists():
-        raise MissingFileError("no such folder or video; or give the number of a camera, or rtsp://...", subject=source)
+        raise MissingFileError(
+            "no such folder or video; or give the number of a camera, or rtsp://...", subject=source
+        )
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
     if options.camera is None and options.guess is None:
-        raise InvalidInputError(f"follow: needs the camera, which it does not estimate; give {CAMERA_OPTIONS}")
+        raise InvalidInputError(
+            f"follow: needs the camera, which it does not estimate; give {CAMERA_OPTIONS}"
+        )
     if out is None and not (arguments.json or arguments.show):
         raise InvalidInputError("follow: give --out DIR, --show or --json")
     if arguments.show:
@@ -100,7 +117,9 @@ def run(arguments: argparse.Namespace) -> None:
             inputs = input_files(arguments, arguments.mesh, *frames)
             stack.enter_context(output_folder(out, "follow", inputs=inputs))
         stack.enter_context(one_torch_thread())
-        tally = _follow(options, source, out, live=live, as_json=arguments.json, show=arguments.show)
+        tally = _follow(
+            options, source, out, live=live, as_json=arguments.json, show=arguments.show
+        )
     files = ""
     if out is not None:
         video = out / "overlay.mp4"
@@ -108,7 +127,11 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"{tally}{files}", file=sys.stderr if arguments.json else sys.stdout)
     if not tally.counts["ok"] and not tally.counts["unsure"]:
         reason = f"; the first: {tally.first_message}" if tally.frames else ""
-        message = f"no frame could be registered{reason}; give frames that can be read, and --box of the object"
+        message = (
+            f"no frame could be registered{reason}; give frames that can be read, and "
+            f"--box of "
+            f"the object"
+        )
         raise InvalidInputError(message, subject=source)
 
 
@@ -121,7 +144,8 @@ def _files(source: Path) -> list[Path]:
 
 @dataclass
 class Tally:
-    """What became of the frames so far: all that is kept of them in memory, since a live video may last for days."""
+    """What became of the frames so far: all that is kept of them in memory, since a live video may
+    last for days."""
 
     counts: Counter[str] = field(default_factory=Counter)
     first_message: str = ""  # why the first frame has no pose
@@ -145,11 +169,19 @@ class Tally:
         rate = ""
         if self.frames > 1:
             rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
-        return f"{self.frames} frames: {self.counts['ok']} of {self.frames} believed, {others}{rate}"
+        return (
+            f"{self.frames} frames: {self.counts['ok']} of {self.frames} believed, {others}{rate}"
+        )
 
 
 def _follow(
-    options: "RegisterOptions", source: str, out: Path | None, *, live: bool, as_json: bool, show: bool
+    options: "RegisterOptions",
+    source: str,
+    out: Path | None,
+    *,
+    live: bool,
+    as_json: bool,
+    show: bool,
 ) -> Tally:
     """Follow the object; each pose is in ``out / "results.csv"`` once it is known."""
     from tqdm import tqdm
@@ -164,7 +196,9 @@ def _follow(
     tally = Tally()
     columns = ["photo", "status", *POSE_COLUMNS, *SCORES]
     table = None if out is None else CsvFile(out / "results.csv", columns)
-    start, video, page = time.monotonic(), None, None
+    start = time.monotonic()
+    video = None
+    page = None
     try:
         with ExitStack() as stack:
             if out is not None:
@@ -173,9 +207,19 @@ def _follow(
                 from ..viewer.live import LivePage
 
                 page = stack.enter_context(LivePage(registrar))
-            bar = tqdm(frames, desc="follow", unit="frame", total=count, disable=not options.progress or as_json)
+            bar = tqdm(
+                frames,
+                desc="follow",
+                unit="frame",
+                total=count,
+                disable=not options.progress or as_json,
+            )
             for name, shown, result, took in _poses(options, registrar, bar):
-                pose = {"frame": name, "seconds": round(time.monotonic() - start, 4), **_document(result)}
+                pose = {
+                    "frame": name,
+                    "seconds": round(time.monotonic() - start, 4),
+                    **_document(result),
+                }
                 if table is not None:
                     if not tally.frames:  # an older one does not belong to these poses
                         (table.path.parent / "overlay.mp4").unlink(missing_ok=True)
@@ -196,7 +240,8 @@ def _follow(
 def _poses(
     options: "RegisterOptions", registrar: "Registrar", frames: "Iterable[Frame]"
 ) -> "Iterator[tuple[str, Tensor | None, Registration | FailedRegistration, float]]":
-    """Of each frame its name, its pixels without distortion, the pose, and the seconds that this took."""
+    """Of each frame its name, its pixels without distortion, the pose, and the seconds that this
+    took."""
     import torch
 
     from ..evaluation.opening import prior_from_limits, start_in_unit
@@ -204,23 +249,33 @@ def _poses(
     from ..mesh.mesh import mesh_unit
     from ..registration import FailedRegistration, Follower
 
-    follow, prior = None, prior_from_limits(options.limits or {})
+    follow = None
+    prior = prior_from_limits(options.limits or {})
     box: Any = None if options.box is None else list(options.box)  # of the first frame
     for name, image in frames:
-        begun, result = time.perf_counter(), None
+        begun = time.perf_counter()
+        result = None
         if isinstance(image, ImageError):
             yield name, None, FailedRegistration(image), time.perf_counter() - begun
             continue
         try:
             if isinstance(options.camera, Camera):
-                seen = undistorted(image, options.camera, None if box is None else torch.tensor(box))
-                image, box = seen.image, seen.box
+                seen = undistorted(
+                    image, options.camera, None if box is None else torch.tensor(box)
+                )
+                image = seen.image
+                box = seen.box
             if follow is None:
                 follow = Follower(registrar, _camera_matrix(options, image), prior=prior)
                 if (start := options.read_start()) is not None:
                     pose = start_in_unit(start, mesh_unit(registrar.bank.mesh))
-                    follow.start(image, pose, confidence=1.0 if start.confidence is None else start.confidence)
-            first_box, box = box, None
+                    follow.start(
+                        image,
+                        pose,
+                        confidence=1.0 if start.confidence is None else start.confidence,
+                    )
+            first_box = box
+            box = None
             result = follow(image, first_box)
         except CurviregError as error:
             result = FailedRegistration(error)
@@ -233,7 +288,8 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     from ..evaluation.lists import find_photographs
     from ..evaluation.photograph import camera_of
 
-    source, photo = options.photos[0], Photo(image, 1, None, ())
+    source = options.photos[0]
+    photo = Photo(image, 1, None, ())
     if source.is_dir():
         source = find_photographs(source)[0]
         photo = read_photo(source) if options.guess == "exif" else photo
@@ -249,7 +305,11 @@ def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
 
     if is_video(path):
         video = Video(path)
-        return ((f"{path.stem}-{number:06d}", image) for number, image in video), video.count, video.fps
+        return (
+            ((f"{path.stem}-{number:06d}", image) for number, image in video),
+            video.count,
+            video.fps,
+        )
     photos = find_photographs(path)
 
     def read() -> Iterator["Frame"]:
@@ -263,14 +323,19 @@ def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
 
 
 def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
-    """Frames of a camera or a stream: a thread reads them, and the latest one is taken, so that none is late."""
+    """Frames of a camera or a stream: a thread reads them, and the latest one is taken, so that
+    none is late."""
     import cv2
     import numpy as np
     import torch
 
     file = cv2.VideoCapture(int(source) if source.isdecimal() else source)
     if not file.isOpened():
-        kind = "no such camera, or another program uses it" if source.isdecimal() else "the stream cannot be opened"
+        kind = (
+            "no such camera, or another program uses it"
+            if source.isdecimal()
+            else "the stream cannot be opened"
+        )
         raise InvalidInputError(f"{kind}; check its number or address", subject=source)
     latest: Queue[tuple[int, Any]] = Queue(maxsize=1)
     ended = threading.Event()

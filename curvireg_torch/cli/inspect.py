@@ -18,17 +18,37 @@ def add_inspect(commands: Any) -> None:
         "inspect",
         "curvireg inspect part.stl --unit mm --out out/inspect",
         "curvireg inspect chair.glb --pose upright --no-camera --n 200 --out out/chair",
-        help="what to expect of photographs of MESH: symmetries, views that look alike, share of right answers",
-        description="Writes DIR/inspect.json and DIR/inspect.html, from generated photographs of the mesh.",
+        help="what to expect of photographs of MESH: symmetries, views that look alike, share of "
+        "right answers",
+        description="Writes DIR/inspect.json and DIR/inspect.html, from generated photographs of "
+        "the mesh.",
         run=run_inspect,
     )
     parser.add_argument("mesh", type=Path, metavar="MESH")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the report")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the report"
+    )
     add = parser.add_argument
-    add("--n", type=whole_number(0), default=60, metavar="N", help="generated photographs (default: 60; 0: none)")
+    add(
+        "--n",
+        type=whole_number(0),
+        default=60,
+        metavar="N",
+        help="generated photographs (default: 60; 0: none)",
+    )
     add("--seed", type=int, default=0, help="of the photographs (default: 0)")
-    add("--no-camera", dest="with_camera", action="store_false", help="as if the camera were unknown")
-    add("--photo", type=Path, metavar="DIR", help="your own photographs without the object, as backgrounds")
+    add(
+        "--no-camera",
+        dest="with_camera",
+        action="store_false",
+        help="as if the camera were unknown",
+    )
+    add(
+        "--photo",
+        type=Path,
+        metavar="DIR",
+        help="your own photographs without the object, as backgrounds",
+    )
     add("--strict", action="store_true", help="exit code 3 for a mesh that cannot work")
     add_options(parser, *MESH, *METHOD)
 
@@ -51,7 +71,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
     options = register_options(arguments)
     mesh = options.load_mesh(arguments.mesh)
-    with output_folder(arguments.out, "inspect", inputs=input_files(arguments, arguments.mesh, *backgrounds)):
+    with output_folder(
+        arguments.out, "inspect", inputs=input_files(arguments, arguments.mesh, *backgrounds)
+    ):
         pipeline = options.open_pipeline()
         bar = tqdm(total=None, desc="photographs", unit="photograph", disable=not options.progress)
 
@@ -83,5 +105,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         write_file(arguments.out / "inspect.json", content.encode())
         page = report_page(report, registrar, title=arguments.mesh.name)
         write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
-    print("\n".join([f"{arguments.mesh}", *report_lines(report), f"see {arguments.out / 'inspect.html'}"]))
+    print(
+        "\n".join(
+            [f"{arguments.mesh}", *report_lines(report), f"see {arguments.out / 'inspect.html'}"]
+        )
+    )
     return 3 if arguments.strict and report.is_hopeless else 0

@@ -1,4 +1,5 @@
-"""Commands and their arguments, from the declarations in :mod:`curvireg_torch.evaluation.opening`."""
+"""Commands and their arguments, from the declarations in
+:mod:`curvireg_torch.evaluation.opening`."""
 
 import argparse
 import re
@@ -17,7 +18,9 @@ from ..evaluation.opening import (
     prior_from_limits,
 )
 
-FIELDS = {option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata}
+FIELDS = {
+    option.name: dict(option.metadata) for option in fields(RegisterOptions) if option.metadata
+}
 DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "link", "textures", "pose", "up")
@@ -29,7 +32,9 @@ class Parser(argparse.ArgumentParser):
     """A parser that takes no abbreviations."""
 
     def __init__(self, **how: Any) -> None:
-        super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how)
+        super().__init__(
+            allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how
+        )
 
 
 def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
@@ -46,7 +51,8 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
     """Add options of a registration; ``help_texts`` replace those of their declarations."""
     for name in names:
         how = {**DECLARED[name], **({"help": help_texts[name]} if name in help_texts else {})}
-        kind, flag = how.get("type"), how.pop("flag", f"--{name.replace('_', '-')}")
+        kind = how.get("type")
+        flag = how.pop("flag", f"--{name.replace('_', '-')}")
         if isinstance(kind, Numbers):
             how["metavar"] = re.sub(r"[][]", "", kind.names)
         elif kind is Path:
@@ -57,9 +63,14 @@ def add_options(parser: Any, *names: str, **help_texts: str) -> None:
 def add_limits(parser: Any) -> None:
     """Add the options that limit the pose."""
     text = (
-        "limits, angles in degrees; all that are given must hold; the result stays within them. Lists have columns of"
+        "limits, angles in degrees; all that are given must hold; the result stays within "
+        "them. "
+        "Lists have columns of"
     )
-    add_options(parser.add_argument_group("what is known about the pose", f"{text} these names"), *PRIOR_OPTIONS)
+    add_options(
+        parser.add_argument_group("what is known about the pose", f"{text} these names"),
+        *PRIOR_OPTIONS,
+    )
 
 
 def register_options(
@@ -68,7 +79,9 @@ def register_options(
     """The options of a command; those that it lacks have their defaults."""
     from ..utils.checks import check_device
 
-    given = {name: value for name in FIELDS if (value := getattr(arguments, name, None)) is not None}
+    given = {
+        name: value for name in FIELDS if (value := getattr(arguments, name, None)) is not None
+    }
     if given.get("camera") == "exif":
         given["guess"] = given.pop("camera")
     elif isinstance(given.get("camera"), str):
@@ -90,14 +103,20 @@ def input_files(arguments: argparse.Namespace, *more: Path) -> list[Path]:
     """The files that a command's options name, and ``more``."""
     named = [getattr(arguments, name, None) for name in ("list", "views", *FIELDS)]
     camera = getattr(arguments, "camera", None)
-    paths = [*(str(path) for path in named if isinstance(path, Path)), *([camera] if isinstance(camera, str) else [])]
+    paths = [
+        *(str(path) for path in named if isinstance(path, Path)),
+        *([camera] if isinstance(camera, str) else []),
+    ]
     named_parts = [path.rpartition(":")[0] for path in paths]  # of FILE:NAME
     return [*more, *map(Path, filter(None, [*paths, *named_parts]))]
 
 
 _ALTERNATIVES = {
     ("preset", "pipeline"): "expected one of --preset and --pipeline",
-    ("camera", "guess"): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
+    (
+        "camera",
+        "guess",
+    ): "expected one of --camera FX FY CX CY, --camera FILE, --camera exif, --fov DEG",
     ("box", "boxes"): "expected one of --box and --boxes",
     ("boxes", "mask"): "expected one of --boxes and --mask",
     ("boxes", "start"): "--start is the pose, so that no box is needed; leave --boxes out",
@@ -108,11 +127,14 @@ _ALTERNATIVES = {
 
 
 def ignored_option(arguments: argparse.Namespace) -> str | None:
-    """What is wrong with options of any command that would be ignored beside others; None if none would."""
+    """What is wrong with options of any command that would be ignored beside others; None if none
+    would."""
     for names, message in _ALTERNATIVES.items():
         if all(getattr(arguments, name, None) is not None for name in names):
             return message
-    if getattr(arguments, "box_format", None) is not None and not (arguments.box or getattr(arguments, "list", None)):
+    if getattr(arguments, "box_format", None) is not None and not (
+        arguments.box or getattr(arguments, "list", None)
+    ):
         return "--box-format: of --box or the boxes of a list; give them too"
     given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
     if given == ["front"] and getattr(arguments, "list", None) is None:
@@ -125,7 +147,11 @@ def check_viewer(command: str) -> None:
     try:
         import nicegui  # noqa: F401
     except ImportError as error:
-        message = f"curvireg {command}: {error.name} is not installed; in the folder of curvireg_torch: pip install -e "
+        message = (
+            f"curvireg {command}: {error.name} is not installed; in the folder of "
+            f"curvireg_torch: "
+            f"pip install -e "
+        )
         raise MissingDependencyError(f"{message}'.[viewer]'") from error
 
 
@@ -138,13 +164,16 @@ _COUNTS = {"--camera": 4} | {
 
 
 def join_numbers(words: Sequence[str]) -> list[str]:
-    """The command line with one word for each option of numbers, "--box=1,2,3,4", for ``--box 1 2 3 4`` too.
+    """The command line with one word for each option of numbers, "--box=1,2,3,4", for
+    ``--box 1 2 3 4`` too.
 
     Example:
-        >>> join_numbers(["a.jpg", "--box", "1,", "-2", "3", "4", "--near=5", "6", "b.stl", "--camera", "exif"])
+        >>> join_numbers(["a.jpg", "--box", "1,", "-2", "3", "4", "--near=5", "6", "b.stl",
+        ...     "--camera", "exif"])
         ['a.jpg', '--box=1,-2,3,4', '--near=5,6', 'b.stl', '--camera', 'exif']
     """
-    joined, rest = [], list(words)
+    joined = []
+    rest = list(words)
     while rest:
         word = rest.pop(0)
         option, equals, value = word.partition("=")

@@ -30,11 +30,18 @@ if TYPE_CHECKING:
     from ..evaluation.opening import RegisterOptions
     from ..registration import Registrar
 
-MAX_FAILURES = 10  # photographs of a list that could not be registered, of which the command prints the reason
-NONE_RELIABLE, SOME_FAILED = 3, 4  # exit codes of ``--strict``
+# photographs of a list that could not be registered, of which the command prints the reason
+MAX_FAILURES = 10
+# exit codes of ``--strict``
+NONE_RELIABLE = 3
+SOME_FAILED = 4
 OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
 
-STAGES = {"detection": "detecting the object", "bank": "rendering views", "contours": "fitting contours"}
+STAGES = {
+    "detection": "detecting the object",
+    "bank": "rendering views",
+    "contours": "fitting contours",
+}
 """Stages that are called otherwise than in the library."""
 
 
@@ -54,8 +61,10 @@ def add_register(commands: Any) -> None:
         usage="curvireg register PHOTO... MESH --out DIR [options]\n       "
         "curvireg register --list LIST [MESH] --out DIR [options]\n       "
         "curvireg register --views RIG MESH --out DIR [options]",
-        description="One photograph: writes DIR/result.json, DIR/overlay.png and DIR/pose.glb.\nSeveral, or a list: "
-        "DIR/results.csv, DIR/results.jsonl and DIR/index.html;\nafter an interruption the same command resumes.",
+        description="One photograph: writes DIR/result.json, DIR/overlay.png and "
+        "DIR/pose.glb.\nSeveral, or a list: "
+        "DIR/results.csv, DIR/results.jsonl and DIR/index.html;\nafter an interruption the same "
+        "command resumes.",
         run=run,
     )
     add = parser.add_argument
@@ -64,8 +73,10 @@ def add_register(commands: Any) -> None:
         type=Path,
         nargs="*",
         metavar="PHOTO... MESH",
-        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj .ply .stl .off .glb "
-        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh without colours is grey",
+        help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj "
+        ".ply .stl .off .glb "
+        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh "
+        "without colours is grey",
     )
     candidates = "a candidate mesh; repeat the option, and the best of them is reported"
     add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
@@ -73,26 +84,49 @@ def add_register(commands: Any) -> None:
         "--list",
         type=Path,
         metavar="LIST",
-        help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and azimuth,side,... (see below: what "
-        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: detect the object, "
+        help="CSV with columns photo,x0,y0,x1,y1 and optionally fx,fy,cx,cy,mesh and "
+        "azimuth,side,... (see below: what "
+        "is known about the pose). Paths are relative to the list's folder. Empty cells mean: "
+        "detect the object, "
         "EXIF or an estimated camera, MESH, what the options say",
     )
     add(
         "--views",
         type=Path,
         metavar="RIG",
-        help="photographs of one pose from cameras with known poses: CSV with columns photo,x0,y0,x1,y1 (box may be "
-        "empty), fx,fy,cx,cy or camera (a file), r11..r33 or qw,qx,qy,qz and tx,ty,tz (camera from world, in the "
-        "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP scene with cam_R_w2c",
+        help="photographs of one pose from cameras with known poses: CSV with columns "
+        "photo,x0,y0,x1,y1 (box may be "
+        "empty), fx,fy,cx,cy or camera (a file), r11..r33 or qw,qx,qy,qz and tx,ty,tz (camera "
+        "from world, in the "
+        "mesh's unit); a folder of COLMAP with images.txt and cameras.txt; or the folder of a BOP "
+        "scene with cam_R_w2c",
     )
-    add("--every", type=whole_number(1), default=1, metavar="N", help="use every N-th frame of videos (default: 1)")
+    add(
+        "--every",
+        type=whole_number(1),
+        default=1,
+        metavar="N",
+        help="use every N-th frame of videos (default: 1)",
+    )
     add_options(
-        parser, *PHOTOGRAPH, "box_format", "boxes", "start", "start_convention", "instances", "field", "top", "refine"
+        parser,
+        *PHOTOGRAPH,
+        "box_format",
+        "boxes",
+        "start",
+        "start_convention",
+        "instances",
+        "field",
+        "top",
+        "refine",
     )
     add_limits(parser)
     jobs = "processes for several photographs (default: 1)"
     add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
-    strict = f"exit code {NONE_RELIABLE} if no result is reliable, else {SOME_FAILED} if some photographs failed"
+    strict = (
+        f"exit code {NONE_RELIABLE} if no result is reliable, else {SOME_FAILED} if some "
+        f"photographs failed"
+    )
     add("--strict", action="store_true", help=strict)
     ros = "ros: also write DIR/pose.yaml, a geometry_msgs/PoseStamped, in metres"
     add("--format", choices=("ros",), help=ros)
@@ -101,15 +135,20 @@ def add_register(commands: Any) -> None:
 
 
 def complete(arguments: argparse.Namespace) -> str | None:
-    """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options together, or None."""
-    rig, listed = arguments.views, arguments.list is not None or arguments.views is not None
+    """Divide ``paths`` into ``photos`` and ``meshes``; returns what is wrong with the options
+    together, or None."""
+    rig = arguments.views
+    listed = arguments.list is not None or arguments.views is not None
     limits = [name for name in PRIOR_OPTIONS if getattr(arguments, name) is not None]
     arguments.photos = [] if listed else arguments.paths if arguments.mesh else arguments.paths[:-1]
     arguments.meshes = [*arguments.paths[len(arguments.photos) :], *arguments.mesh]
     if arguments.unit is None and rig is not None and (rig / "scene_camera.json").is_file():
         arguments.unit = "mm"  # of the models in a BOP set
     if numbers := numbers_among(arguments.paths):
-        return f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take four, --distance two"
+        return (
+            f"{' '.join(numbers)}: numbers where a file is expected; --box and --camera take "
+            f"four, --distance two"
+        )
     if not listed and not (arguments.photos and arguments.meshes):
         return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
     if arguments.out is None and not arguments.json:
@@ -119,7 +158,11 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if rig is not None and (arguments.list or arguments.start or not arguments.meshes):
         return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
-        return f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; give several by --mesh"
+        return (
+            f"with --list or --views, expected at most one MESH, got {len(arguments.paths)}; "
+            f"give "
+            f"several by --mesh"
+        )
     if (arguments.box or arguments.boxes or arguments.mask) and arguments.instances is not None:
         return "--instances applies only without a box; leave --box and --mask out"
     if arguments.instances is not None and (arguments.start or rig is not None):
@@ -129,14 +172,21 @@ def complete(arguments: argparse.Namespace) -> str | None:
     alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
     if alone and arguments.jobs > 1:
         return "--jobs: several processes share several photographs; leave it out for one result"
-    if arguments.every > 1 and not any(photo.suffix.lower() in VIDEOS for photo in arguments.photos):
+    if arguments.every > 1 and not any(
+        photo.suffix.lower() in VIDEOS for photo in arguments.photos
+    ):
         return "--every applies to the frames of videos; leave it out"
-    if arguments.start is not None and (arguments.box or arguments.mask or listed or len(arguments.meshes) > 1):
+    if arguments.start is not None and (
+        arguments.box or arguments.mask or listed or len(arguments.meshes) > 1
+    ):
         return "--start refines one mesh in one photograph; leave --box, --mask and --list out"
     if listed and (arguments.box or arguments.mask or arguments.camera not in (None, "exif")):
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
-        return "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, --azimuth, ... out"
+        return (
+            "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, "
+            "--azimuth, ... out"
+        )
     if arguments.start_convention is not None and arguments.start is None:
         return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
@@ -160,8 +210,11 @@ def run(arguments: argparse.Namespace) -> int:
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
-    _ = options.open_pipeline(), options.network  # errors in options come before any photograph is read
-    if arguments.views is not None or (arguments.list is None and is_one_photograph(options.photos)):
+    # errors in options come before any photograph is read
+    _ = options.open_pipeline(), options.network
+    if arguments.views is not None or (
+        arguments.list is None and is_one_photograph(options.photos)
+    ):
         with one_torch_thread():
             register = _register_one if arguments.views is None else _register_rig
             reliable = register(options, arguments)
@@ -234,12 +287,17 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..geometry import Camera
     from ..registration.result import camera_in_words
 
-    out, path = arguments.out, options.photos[0]
-    photo, entry = read_photo(path), options.entry(path)
+    out = arguments.out
+    path = options.photos[0]
+    photo = read_photo(path)
+    entry = options.entry(path)
     check_entry(entry, photo)
     with _one_result(arguments, *entry.files):
         if options.progress and not (options.box or options.boxes or options.mask or options.start):
-            print(f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable", file=sys.stderr)
+            print(
+                f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable",
+                file=sys.stderr,
+            )
         with opened_registrar(options) as (registrar, seconds):
             try:
                 found = register_entry(entry, photo, registrar, bank_seconds=seconds)
@@ -254,7 +312,10 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photo.notes, *camera_in_words(found.document)]
     if isinstance(options.camera, Camera) and options.camera.distorts:
-        remarks.append("distortion of the lens removed: boxes and overlay.png are of the undistorted photograph")
+        remarks.append(
+            "distortion of the lens removed: boxes and overlay.png are of the undistorted "
+            "photograph"
+        )
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
     _finish(arguments, found.document)
@@ -262,15 +323,19 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 
 
 def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
-    """Register the photographs of a rig together, write and print the result; returns whether it is reliable."""
+    """Register the photographs of a rig together, write and print the result; returns whether it is
+    reliable."""
     from ..evaluation.result_files import write_views
     from ..evaluation.rigs import read_rig, register_rig
     from ..registration.result import view_in_words
 
-    out, rig = arguments.out, read_rig(arguments.views, options.meshes[0])
+    out = arguments.out
+    rig = read_rig(arguments.views, options.meshes[0])
     with _one_result(arguments, *options.meshes, *(view.photo for view in rig)):
         with opened_registrar(options) as (registrar, seconds):
-            result, document, photographs = register_rig(arguments.views, rig, registrar, bank_seconds=seconds)
+            result, document, photographs = register_rig(
+                arguments.views, rig, registrar, bank_seconds=seconds
+            )
         document["mesh"] = str(options.meshes[result.model])
         if out is not None:
             write_views(out, document, registrar, result, photographs)
@@ -301,7 +366,9 @@ def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
         print_result(document, arguments.out)
 
 
-def _register_several(options: "RegisterOptions", arguments: argparse.Namespace, out: Path) -> "Counts | None":
+def _register_several(
+    options: "RegisterOptions", arguments: argparse.Namespace, out: Path
+) -> "Counts | None":
     """Register photographs that are named one by one, or by a list."""
     from ..evaluation.lists import list_photographs, read_list, register_list
     from ..evaluation.opening import open_registrar
@@ -310,12 +377,25 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
     if arguments.list is None:
         photos = list_photographs(options, every=arguments.every)
         source = [str(path.resolve()) for path in options.photos]
-        if given := [f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None]:
+        if given := [
+            f"--{name}" for name in ("box", "camera") if getattr(options, name) is not None
+        ]:
             print(f"{' and '.join(given)}: used for all {len(photos)} photographs", file=sys.stderr)
     else:
         photos = read_list(arguments.list, options)
         source = [str(arguments.list.resolve())]
-    names = ("bank_decides", "pose", "mesh_is", "unit", "link", "up", "top", "refine", "renderer", "device")
+    names = (
+        "bank_decides",
+        "pose",
+        "mesh_is",
+        "unit",
+        "link",
+        "up",
+        "top",
+        "refine",
+        "renderer",
+        "device",
+    )
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if options.network is None else field_digest(options.network),
@@ -323,15 +403,22 @@ def _register_several(options: "RegisterOptions", arguments: argparse.Namespace,
         **{name: getattr(options, name) for name in names},
     }
     how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}
-    return register_list(photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how)
+    return register_list(
+        photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how
+    )
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
-    """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of its files."""
+    """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of
+    its files."""
     from ..registration.result import corners, remarks, two_decimals
 
-    confidence = "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
-    print(f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}")
+    confidence = (
+        "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
+    )
+    print(
+        f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}"
+    )
     if not document["reliable"]:
         print(f"no reliable match: take the pose as a guess; {_advice(document)}")
     _print_rivals(document)
@@ -340,9 +427,15 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     for line in remarks(document):
         print(line)
     for instance in document.get("detection", {}).get("instances", []):
-        print(f"found in box {corners(instance['box'])}: there with probability {two_decimals(instance['score'])}")
+        print(
+            f"found in box {corners(instance['box'])}: there with probability "
+            f"{two_decimals(instance['score'])}"
+        )
     if document["translation"] is not None:
-        print(f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} {document['unit']}")
+        print(
+            f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} "
+            f"{document['unit']}"
+        )
     if (deviations := document["standard_deviations"]) is not None:
         rotation, translation = (
             ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
@@ -351,11 +444,16 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         values = f"{rotation} degrees; {translation} {document['unit']}"
         print(f"standard deviations: {values}   (about and along the camera's axes)")
     seconds = document["seconds"]
-    print(f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see {out}/overlay.png")
+    print(
+        f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "
+        f"{out}/overlay.png"
+    )
 
 
 def _angles(pose: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {value:.1f}" for name, value in pose["viewpoint"].items()) + " degrees"
+    return (
+        ", ".join(f"{name} {value:.1f}" for name, value in pose["viewpoint"].items()) + " degrees"
+    )
 
 
 def _print_rivals(document: Mapping[str, Any]) -> None:
@@ -364,16 +462,26 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
 
     if document["ambiguous"] is None:
         return
-    for rival, probability in list(zip(document["top"], document["probabilities"], strict=False))[1:]:
+    for rival, probability in list(zip(document["top"], document["probabilities"], strict=False))[
+        1:
+    ]:
         if probability >= RIVAL_FRACTION * document["confidence"]:
             print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
-    words = {"half turn": "differ by a half turn", "mirror": "are mirror images", "several": "differ"}
+    words = {
+        "half turn": "differ by a half turn",
+        "mirror": "are mirror images",
+        "several": "differ",
+    }
     none = f"none of them: {two_decimals(document['none'])}"
-    print(f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or --near")
+    print(
+        f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or "
+        f"--near"
+    )
 
 
 def _advice(document: Mapping[str, Any]) -> str:
-    """What to try after a registration that is not reliable, by the reason that was measured, if there is one."""
+    """What to try after a registration that is not reliable, by the reason that was measured, if
+    there is one."""
     mesh = "that the mesh is the object's, in its --unit and with its --up axis"
     features = document["confidence_features"]
     if document["warnings"]:
@@ -389,18 +497,25 @@ def _advice(document: Mapping[str, Any]) -> str:
     if document["translation"] is None:
         return f"give the --camera, and check {mesh}"
     if (features.get("undetermined") or 0.0) >= OPEN_AXES:
-        return f"the contours that were found leave its rotation open: take a sharper or closer one, and check {mesh}"
+        return (
+            f"the contours that were found leave its rotation open: take a sharper or closer "
+            f"one, "
+            f"and check {mesh}"
+        )
     return f"check that the box is tight, and {mesh}"
 
 
 @contextmanager
 def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, float]]":
-    """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows its stages."""
+    """The registrar of the options' meshes, and the seconds that it took to open. A terminal shows
+    its stages."""
     from tqdm import tqdm
 
     from ..evaluation.opening import open_registrar
 
-    start, disable = time.perf_counter(), None if options.progress else True  # None: where there is no terminal
+    # None: where there is no terminal
+    start = time.perf_counter()
+    disable = None if options.progress else True
     with tqdm(bar_format="{desc}", leave=False, disable=disable) as bar:
 
         def show(stage: str, count: int, of: int) -> None:
@@ -408,6 +523,8 @@ def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, f
             bar.set_description_str(f"{name} {count} of {of}" if of > 1 else name)
 
         show("reading the mesh", 0, 1)
-        registrar = open_registrar(options, options.meshes, progress=show if options.progress else None)
+        registrar = open_registrar(
+            options, options.meshes, progress=show if options.progress else None
+        )
         registrar.progress = show if options.progress else False
         yield registrar, time.perf_counter() - start

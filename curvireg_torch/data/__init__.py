@@ -1,7 +1,8 @@
 """Photographs with annotated objects, as torch datasets: PASCAL3D+, BOP, and folders of the user.
 
-A sample is a dict, one per object. Every dataset reports skipped objects with the reason (``skipped``,
-``skipped_items``), and ``annotation(index)`` returns a sample without its photograph. Nothing is downloaded.
+A sample is a dict, one per object. Every dataset reports skipped objects with the reason
+(``skipped``, ``skipped_items``), and ``annotation(index)`` returns a sample without its photograph.
+Nothing is downloaded.
 """
 
 from ._base import ObjectDataset

@@ -26,8 +26,9 @@ class ObjectDataset(Dataset[Sample]):
 
     Args:
         root: the folder of the dataset.
-        transform: function of the photograph (3, H, W), whose result becomes ``image``. Boxes and cameras are not
-            adapted: it may change colours, not the geometry; :func:`crops` cuts boxes out.
+        transform: function of the photograph (3, H, W), whose result becomes ``image``. Boxes and
+            cameras are not adapted: it may change colours, not the geometry; :func:`crops` cuts
+            boxes out.
         target_transform: function of the sample without its ``image``, which returns a dict.
     """
 
@@ -42,12 +43,14 @@ class ObjectDataset(Dataset[Sample]):
         self.transform = transform
         self.target_transform = target_transform
         self.skipped_items: dict[str, list[str]] = {}
-        # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker is spawned.
+        # Numbers instead of tensors: thousands of small tensors exhaust file handles when a worker
+        # is spawned.
         self._items: list[Sample] = []
 
     @property
     def skipped(self) -> Counter[str]:
-        """Number of skipped items by reason; ``missing_``, ``corrupt_`` and ``bad_`` mean a defect of the data."""
+        """Number of skipped items by reason; ``missing_``, ``corrupt_`` and ``bad_`` mean a defect
+        of the data."""
         return Counter({reason: len(items) for reason, items in self.skipped_items.items()})
 
     def _skip(self, reason: str, item: str) -> None:
@@ -89,7 +92,9 @@ class ObjectDataset(Dataset[Sample]):
             number = operator.index(index)  # type: ignore[arg-type]
         except TypeError:
             advice = "take several by torch.utils.data.Subset(dataset, numbers)"
-            raise TypeError(f"{type(self).__name__}: expected a whole number, got {index!r:.60}; {advice}") from None
+            raise TypeError(
+                f"{type(self).__name__}: expected a whole number, got {index!r:.60}; {advice}"
+            ) from None
         if not -len(self) <= number < len(self):
             raise IndexError(f"{type(self).__name__}: has {len(self)} objects, got index {number}")
         return number

@@ -26,31 +26,37 @@ class BOPDataset(ObjectDataset):
     Args:
         root: the folder that holds ``models`` and the split's folder.
         split: folder of the scenes, such as ``"test"`` or ``"train_pbr"``.
-        targets: True selects the instances of ``test_targets_bop19.json``, for each image and object the ``inst_count``
-            most visible ones; False selects all; None is True for ``split="test"`` if the file exists.
+        targets: True selects the instances of ``test_targets_bop19.json``, for each image and
+            object the ``inst_count`` most visible ones; False selects all; None is True for
+            ``split="test"`` if the file exists.
         models: folder of the meshes, such as ``"models_cad"``.
         transform, target_transform: see :class:`ObjectDataset`.
 
     Attributes:
-        models_info: obj_id -> entry of ``models/models_info.json``, symmetries included; without this file the
-            diameters and sizes of the meshes.
+        models_info: obj_id -> entry of ``models/models_info.json``, symmetries included; without
+            this file the diameters and sizes of the meshes.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1], from ``rgb`` or ``gray``; ``image_path`` str
-        - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image; ``box_visible`` (4,)
-          of its visible part, NaN if nothing is visible. BOP's width is x1 - x0. Without ``scene_gt_info.json`` the
-          first is that of the mesh at the pose, the second NaN
-        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV camera;
-          ``T_cam_from_world`` (4, 4) in mm, NaN if unknown
-        - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's list of ``scene_gt``
+        - ``box`` (4,) x0, y0, x1, y1 of the whole silhouette, which may extend beyond the image;
+          ``box_visible`` (4,) of its visible part, NaN if nothing is visible. BOP's width is x1 -
+          x0. Without ``scene_gt_info.json`` the first is that of the mesh at the pose, the second
+          NaN
+        - ``camera_matrix`` (3, 3); ``rotation`` (3, 3), ``translation`` (3,) in mm: model to OpenCV
+          camera; ``T_cam_from_world`` (4, 4) in mm, NaN if unknown
+        - ``scene_id``, ``image_id``, ``obj_id`` int; ``instance_index`` int: index in the image's
+          list of ``scene_gt``
         - ``visib_fract`` float in [0, 1], NaN if unknown; ``model_path`` str; ``model_info`` dict
 
     Reasons in ``skipped``: ``no_target``, ``bad_box`` (no area: the object is outside the image),
-    ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``, ``missing_model_info``.
+    ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``,
+    ``missing_model_info``.
 
     Raises:
-        MissingFileError: the root, the split's folder, models or a required target list does not exist.
-        InvalidInputError: one of those files is damaged, or meshes have another unit than ``models_info.json``.
+        MissingFileError: the root, the split's folder, models or a required target list does not
+            exist.
+        InvalidInputError: one of those files is damaged, or meshes have another unit than
+            ``models_info.json``.
 
     Example:
         >>> BOPDataset("data/bop/lm")[0]["translation"]  # doctest: +SKIP
@@ -66,13 +72,17 @@ class BOPDataset(ObjectDataset):
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
-        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
+        super().__init__(
+            existing_root(root, _README), transform=transform, target_transform=target_transform
+        )
         self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
             raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
         if not is_plain_name(models):
-            raise MissingFileError(f"no such folder; {_README} shows the layout", subject=self.root / models)
+            raise MissingFileError(
+                f"no such folder; {_README} shows the layout", subject=self.root / models
+            )
         self._models = BOPModels(self.root / models)
         self.models_info = self._models.info
         target_file = self.root / "test_targets_bop19.json"
@@ -84,16 +94,25 @@ class BOPDataset(ObjectDataset):
         self._check_unit()
         if counts:  # targets that were not found
             for scene_id, image_id, obj_id in sorted(counts):
-                self._skip("missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}")
+                self._skip(
+                    "missing_annotation", f"{split}/{scene_id:06d}/{image_id:06d} object {obj_id}"
+                )
 
     def _check_unit(self) -> None:
-        """Refuse meshes that would be less than a pixel wide: their unit is not that of the poses."""
+        """Refuse meshes that would be less than a pixel wide: their unit is not that of the
+        poses."""
         for item in self._items[:1]:
             depth = item["translation"][2]
             width = item["model_info"]["diameter"] * item["camera_matrix"][0][0] / max(depth, 1e-9)
             if 0 < width < 1.0:
-                message = f"at the pose of image {item['image_id']} the mesh is {width:.2g} px wide: in metres? "
-                raise InvalidInputError(f"{message}scale it to mm, as the poses are", subject=item["model_path"])
+                message = (
+                    f"at the pose of image {item['image_id']} the mesh is {width:.2g} px "
+                    f"wide: in "
+                    f"metres? "
+                )
+                raise InvalidInputError(
+                    f"{message}scale it to mm, as the poses are", subject=item["model_path"]
+                )
 
     def _index(self, folder: Path, counts: dict[tuple[int, int, int], int] | None) -> None:
         scene = f"{self.split}/{folder.name}"
@@ -110,7 +129,8 @@ class BOPDataset(ObjectDataset):
         ground_truth, cameras, infos = contents
         images = images_by_number(folder)
         for key in sorted(ground_truth, key=lambda k: int(k) if k.isdecimal() else -1):
-            item, instances = f"{scene}/{key}", ground_truth[key]
+            item = f"{scene}/{key}"
+            instances = ground_truth[key]
             if not key.isdecimal() or not isinstance(instances, list):
                 self._skip("corrupt_annotation", item)
                 continue
@@ -121,7 +141,11 @@ class BOPDataset(ObjectDataset):
                 if isinstance(parsed, str):
                     self._skip(parsed, f"{item} #{index}")
                 else:
-                    ids = {"scene_id": int(folder.name), "image_id": int(key), "instance_index": index}
+                    ids = {
+                        "scene_id": int(folder.name),
+                        "image_id": int(key),
+                        "instance_index": index,
+                    }
                     samples.append({**parsed, **ids, "image_path": str(image)})
             for sample in _mark_targets(samples, counts):
                 item_name = f"{item} #{sample['instance_index']}"
@@ -139,7 +163,8 @@ class BOPDataset(ObjectDataset):
             return "corrupt_annotation"
         if not isinstance(camera, dict):
             return "missing_annotation"
-        rotation, translation = finite_numbers(entry.get("cam_R_m2c"), 9), finite_numbers(entry.get("cam_t_m2c"), 3)
+        rotation = finite_numbers(entry.get("cam_R_m2c"), 9)
+        translation = finite_numbers(entry.get("cam_t_m2c"), 3)
         matrix = finite_numbers(camera.get("cam_K"), 9)
         if rotation is None or translation is None or matrix is None:
             return "corrupt_annotation"
@@ -175,9 +200,11 @@ class BOPDataset(ObjectDataset):
             "model_info": self.models_info[obj_id],
         }
 
-    def _box_of_mesh(self, obj_id: int, *pose_and_camera: tuple[float, ...]) -> tuple[float, ...] | None:
-        """The box around the mesh at a pose: 9, 3 and 9 numbers of rotation, translation and camera; None behind the
-        camera, NaN without a mesh."""
+    def _box_of_mesh(
+        self, obj_id: int, *pose_and_camera: tuple[float, ...]
+    ) -> tuple[float, ...] | None:
+        """The box around the mesh at a pose: 9, 3 and 9 numbers of rotation, translation and
+        camera; None behind the camera, NaN without a mesh."""
         hull = self._models.hull(obj_id) if obj_id in self._models.files else None
         if hull is None:
             return _UNKNOWN_BOX
@@ -185,12 +212,15 @@ class BOPDataset(ObjectDataset):
         points = hull @ R.view(3, 3).T + t
         if float(points[:, 2].min()) <= 0:
             return None
-        box: tuple[float, ...] = tuple(projected_boxes(hull, transform(R.view(3, 3), t), K.view(3, 3)).tolist())
+        box: tuple[float, ...] = tuple(
+            projected_boxes(hull, transform(R.view(3, 3), t), K.view(3, 3)).tolist()
+        )
         return box
 
 
 def images_by_number(scene: Path) -> dict[int, Path]:
-    """The pictures of a scene by their numbers, whatever zeros are in front; ``rgb`` takes precedence over ``gray``."""
+    """The pictures of a scene by their numbers, whatever zeros are in front; ``rgb`` takes
+    precedence over ``gray``."""
     found = {}
     for name in ("gray", "rgb"):
         for path in sorted((scene / name).glob("*")):
@@ -200,8 +230,10 @@ def images_by_number(scene: Path) -> dict[int, Path]:
 
 
 def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:
-    """(4, 4) pose of the world in a camera of ``scene_camera.json``, NaN if it is not given or not rigid."""
-    rotation, translation = finite_numbers(camera.get("cam_R_w2c"), 9), finite_numbers(camera.get("cam_t_w2c"), 3)
+    """(4, 4) pose of the world in a camera of ``scene_camera.json``, NaN if it is not given or not
+    rigid."""
+    rotation = finite_numbers(camera.get("cam_R_w2c"), 9)
+    translation = finite_numbers(camera.get("cam_t_w2c"), 3)
     try:
         if rotation is not None and translation is not None:
             check_rotation(torch.tensor(_rows(rotation), dtype=torch.float64), "cam_R_w2c")
@@ -226,17 +258,22 @@ def _targets(path: Path) -> dict[tuple[int, int, int], int]:
     for entry in read_json(path, list, _README):
         keys = ("scene_id", "im_id", "obj_id", "inst_count")
         if not isinstance(entry, dict) or not all(isinstance(entry.get(k), int) for k in keys):
-            raise InvalidInputError(f"expected entries with the numbers {', '.join(keys)}, got {entry!r}", subject=path)
+            raise InvalidInputError(
+                f"expected entries with the numbers {', '.join(keys)}, got {entry!r}", subject=path
+            )
         counts[entry["scene_id"], entry["im_id"], entry["obj_id"]] = entry["inst_count"]
     return counts
 
 
-def _mark_targets(samples: list[Sample], counts: dict[tuple[int, int, int], int] | None) -> list[Sample]:
+def _mark_targets(
+    samples: list[Sample], counts: dict[tuple[int, int, int], int] | None
+) -> list[Sample]:
     """Set ``no_target`` of the samples of one image, and remove its targets from ``counts``."""
     keys = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     remaining = {key: math.inf if counts is None else counts.pop(key, 0) for key in set(keys)}
     visibility = [-1.0 if math.isnan(s["visib_fract"]) else s["visib_fract"] for s in samples]
-    for i in sorted(range(len(samples)), key=lambda i: -visibility[i]):  # stable: ties keep their order
+    # stable: ties keep their order
+    for i in sorted(range(len(samples)), key=lambda i: -visibility[i]):
         samples[i]["no_target"] = remaining[keys[i]] <= 0
         remaining[keys[i]] -= 1
     return samples

@@ -16,19 +16,23 @@ from ..utils.checks import check_symmetries
 from ..utils.files import finite_numbers, read_json
 
 README = "datasets/bop/README.md"
-MAX_UNIT_FACTOR = 5.0  # between a mesh's diameter and the one that models_info.json names: 25.4, 10 or 1000 are units
+# between a mesh's diameter and the one that models_info.json names: 25.4, 10 or 1000 are units
+MAX_UNIT_FACTOR = 5.0
 MAX_HULL_POINTS = 3000  # of which the diameter is computed; a hull with more is thinned
 
 
 class BOPModels:
-    """The models in a folder such as ``models`` or ``models_cad``, called ``obj_000001.ply`` or with fewer digits.
+    """The models in a folder such as ``models`` or ``models_cad``, called ``obj_000001.ply`` or
+    with fewer digits.
 
     Attributes:
-        info: obj_id -> entry of ``models_info.json``, each with a diameter; without the file computed from the meshes.
+        info: obj_id -> entry of ``models_info.json``, each with a diameter; without the file
+            computed from the meshes.
 
     Raises:
         MissingFileError: neither ``models_info.json`` nor a mesh is there.
-        InvalidInputError: ``models_info.json`` is damaged, or names a diameter that does not fit the first mesh.
+        InvalidInputError: ``models_info.json`` is damaged, or names a diameter that does not fit
+            the first mesh.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,14 +44,20 @@ class BOPModels:
             self.info = read_models_info(table)
             self._check_unit()
         elif self.files:
-            self.info = {number: self._measured(number) for number in self.files if self.hull(number) is not None}
+            self.info = {
+                number: self._measured(number)
+                for number in self.files
+                if self.hull(number) is not None
+            }
         else:
             raise MissingFileError(
-                f"neither models_info.json nor obj_000001.ply; {README} shows the layout", subject=folder
+                f"neither models_info.json nor obj_000001.ply; {README} shows the layout",
+                subject=folder,
             )
 
     def hull(self, number: int) -> Tensor | None:
-        """(V, 3) float64 vertices of a model's convex hull, in the file's unit; None if it cannot be read."""
+        """(V, 3) float64 vertices of a model's convex hull, in the file's unit; None if it cannot
+        be read."""
         if number not in self._hulls:
             self._hulls[number] = self._read_hull(number)
         return self._hulls[number]
@@ -86,7 +96,8 @@ class BOPModels:
         return {"diameter": self.diameter(number), **sides}
 
     def _check_unit(self) -> None:
-        """Refuse meshes in another unit than the diameters: of all, the first that can be read is measured."""
+        """Refuse meshes in another unit than the diameters: of all, the first that can be read is
+        measured."""
         for number in sorted(self.info.keys() & self.files.keys()):
             measured = self.diameter(number)
             if measured is None:
@@ -94,7 +105,11 @@ class BOPModels:
             listed = float(self.info[number]["diameter"])
             if not 1.0 / MAX_UNIT_FACTOR < measured / listed < MAX_UNIT_FACTOR:
                 metres = "in metres? " if 500 < listed / measured < 2000 else ""
-                message = f"the mesh is {measured:.4g} across, models_info.json says {listed:.4g}: {metres}"
+                message = (
+                    f"the mesh is {measured:.4g} across, models_info.json says "
+                    f"{listed:.4g}: "
+                    f"{metres}"
+                )
                 raise InvalidInputError(
                     f"{message}scale the models to mm, as the poses are", subject=self.files[number]
                 )
@@ -103,7 +118,10 @@ class BOPModels:
 
 def model_files(folder: Path) -> dict[int, Path]:
     """obj_id -> file, of a folder that need not exist."""
-    matches = ((re.fullmatch(r"obj_(\d{1,9})\.ply", path.name), path) for path in sorted(folder.glob("obj_*.ply")))
+    matches = (
+        (re.fullmatch(r"obj_(\d{1,9})\.ply", path.name), path)
+        for path in sorted(folder.glob("obj_*.ply"))
+    )
     return {int(match[1]): path for match, path in matches if match}
 
 
@@ -113,10 +131,14 @@ def read_models_info(path: Path) -> dict[int, dict[str, Any]]:
     for key, entry in read_json(path, dict, README).items():
         name = f"entry {key[:20]!r}"
         if not (key.isdecimal() and len(key) < 10 and isinstance(entry, dict)):
-            raise InvalidInputError(f"{name}: expected an object's number and its values; {README}", subject=path)
+            raise InvalidInputError(
+                f"{name}: expected an object's number and its values; {README}", subject=path
+            )
         diameter = finite_numbers([entry.get("diameter")], 1)
         if diameter is None or diameter[0] <= 0:
-            raise InvalidInputError(f"{name}: expected a diameter > 0 in mm; {README}", subject=path)
+            raise InvalidInputError(
+                f"{name}: expected a diameter > 0 in mm; {README}", subject=path
+            )
         try:
             check_symmetries(symmetry_transforms(entry, max_step_fraction=1.0))
         except InvalidInputError as error:

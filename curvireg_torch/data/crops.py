@@ -1,4 +1,5 @@
-"""Crops of a dataset's objects with training targets, tensors of one size that torch's own loader takes."""
+"""Crops of a dataset's objects with training targets, tensors of one size that torch's own loader
+takes."""
 
 import math
 from collections import Counter
@@ -41,11 +42,15 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         transform: Callable[[Tensor], Tensor] | None,
     ) -> None:
         if not isinstance(dataset, ObjectDataset):
-            raise InvalidInputError(f"dataset: expected one of curvireg_torch.data, got {type(dataset).__name__}")
+            raise InvalidInputError(
+                f"dataset: expected one of curvireg_torch.data, got {type(dataset).__name__}"
+            )
         check_integer(size, "size")
         check_positive(margin, "margin", zero_ok=True)
         if not hasattr(bins, "__len__") or len(bins) != len(_ANGLES):
-            raise InvalidInputError(f"bins: expected a number for each of {', '.join(_ANGLES)}, got {bins!r:.40}")
+            raise InvalidInputError(
+                f"bins: expected a number for each of {', '.join(_ANGLES)}, got {bins!r:.40}"
+            )
         for name, count in zip(_ANGLES, bins, strict=True):
             check_integer(count, f"bins of {name}")
         self.dataset = dataset
@@ -57,11 +62,16 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         self.classes = sorted(set(names), key=_numeric_order)
         class_ids = {name: number for number, name in enumerate(self.classes)}
         self._class_ids = [class_ids[name] for name in names]
-        self._indices = [index for index, item in enumerate(dataset._items) if all(map(math.isfinite, item["box"]))]
+        self._indices = [
+            index
+            for index, item in enumerate(dataset._items)
+            if all(map(math.isfinite, item["box"]))
+        ]
 
     @property
     def skipped(self) -> Counter[str]:
-        """Number of objects left out because their box is unknown, beside those that the dataset skipped."""
+        """Number of objects left out because their box is unknown, beside those that the dataset
+        skipped."""
         return Counter({**self.dataset.skipped, "unknown_box": len(self.dataset) - len(self)})
 
     def __len__(self) -> int:
@@ -78,7 +88,9 @@ class ObjectCrops(Dataset[dict[str, Tensor]]):
         annotation = self.annotation(index)
         number = self._indices[index]
         sample = self.dataset[number]
-        crop = crop_images(sample["image"][None], annotation["box"][None], size=self.size, margin=self.margin)[0][0]
+        crop = crop_images(
+            sample["image"][None], annotation["box"][None], size=self.size, margin=self.margin
+        )[0][0]
         return {
             "image": crop if self.transform is None else self.transform(crop),
             "rotation": annotation["rotation"],
@@ -95,14 +107,16 @@ def crops(
     bins: Sequence[int] = (24, 12, 24),
     transform: Callable[[Tensor], Tensor] | None = None,
 ) -> ObjectCrops:
-    """The annotated objects of a dataset as square crops with training targets, for ``torch.utils.data.DataLoader``.
+    """The annotated objects of a dataset as square crops with training targets, for
+    ``torch.utils.data.DataLoader``.
 
     Args:
-        dataset: a dataset of this module; its ``transform`` is applied before cropping. To split it, take a
-            ``torch.utils.data.Subset`` of the result.
+        dataset: a dataset of this module; its ``transform`` is applied before cropping. To split
+            it, take a ``torch.utils.data.Subset`` of the result.
         size: side of the crops in px.
         margin: around the box, as a fraction of its longer side.
-        bins: number of equal bins of azimuth in [0, 360), elevation in [-90, 90] and theta in [-180, 180) degrees.
+        bins: number of equal bins of azimuth in [0, 360), elevation in [-90, 90] and theta in
+            [-180, 180) degrees.
         transform: function of each crop (3, size, size), for instance an augmentation of colours.
 
     Returns:
@@ -110,8 +124,10 @@ def crops(
 
         - ``image`` (3, size, size) float32 in [0, 1]
         - ``rotation`` (3, 3) float32 model to OpenCV camera as annotated, NaN if unknown
-        - ``viewpoint_bins`` (3,) int64, the bins of azimuth, elevation and theta from 0; -100 if unknown
-        - ``class_id`` () int64, index of ``classes``: categories, or the object's numbers of a BOP set
+        - ``viewpoint_bins`` (3,) int64, the bins of azimuth, elevation and theta from 0; -100 if
+          unknown
+        - ``class_id`` () int64, index of ``classes``: categories, or the object's numbers of a BOP
+          set
 
         Objects without a box are left out and counted in ``skipped``.
 
@@ -120,20 +136,22 @@ def crops(
 
     Example:
         >>> from torch.utils.data import DataLoader
-        >>> cars = crops(Pascal3DPlus("data/PASCAL3D+_release1.1"), 128)              # doctest: +SKIP
-        >>> next(iter(DataLoader(cars, batch_size=8)))["image"].shape                 # doctest: +SKIP
+        >>> cars = crops(Pascal3DPlus("data/PASCAL3D+_release1.1"), 128)  # doctest: +SKIP
+        >>> next(iter(DataLoader(cars, batch_size=8)))["image"].shape  # doctest: +SKIP
         torch.Size([8, 3, 128, 128])
     """
     return ObjectCrops(dataset, size, margin=margin, bins=bins, transform=transform)
 
 
 def viewpoint_bins(viewpoint: Tensor, bins: Sequence[int]) -> Tensor:
-    """(3,) int64 bins of azimuth, elevation and theta (3,) in degrees; -100 for an unknown viewpoint."""
+    """(3,) int64 bins of azimuth, elevation and theta (3,) in degrees; -100 for an unknown
+    viewpoint."""
     if not bool(viewpoint.isfinite().all()):
         return torch.full((len(_ANGLES),), UNKNOWN_CLASS)
     numbers = []
     for angle, start, extent, count in zip(viewpoint.tolist(), _START, _RANGE, bins, strict=True):
-        # Rounded, so that 30 degrees that a rotation gives back as 29.9999 lie in the bin that begins there.
+        # Rounded, so that 30 degrees that a rotation gives back as 29.9999 lie in the bin that
+        # begins there.
         degrees = round(angle - start, 3)
         if extent == 360.0:
             degrees %= extent

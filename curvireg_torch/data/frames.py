@@ -15,7 +15,8 @@ KEPT = MAX_THREADS + 1  # frames in memory: more than there are threads that ask
 
 
 class FrameReader:
-    """Frames of one video, for several threads that ask for numbers nearly in order: it is decoded once.
+    """Frames of one video, for several threads that ask for numbers nearly in order: it is decoded
+    once.
 
     Args:
         path: of the video, see :class:`Video`.

@@ -1,4 +1,5 @@
-"""HEIC and AVIF, the photographs of telephones, by optional decoders that are loaded when one is read."""
+"""HEIC and AVIF, the photographs of telephones, by optional decoders that are loaded when one is
+read."""
 
 import re
 from io import BytesIO
@@ -14,7 +15,11 @@ _START = re.compile(rb".{4}ftyp", re.DOTALL)
 _HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
 _AVIF = {b"avif", b"avis"}
 _MAX_BRANDS_BYTES = 400  # of the box that names a file's kinds
-_INSTALL = "pip install 'curvireg_torch[heic]' (in a checkout: pip install -e '.[heic]'), or save it as JPEG"
+_INSTALL = (
+    "pip install 'curvireg_torch[heic]' (in a checkout: pip install -e '.[heic]'), or "
+    "save it as "
+    "JPEG"
+)
 
 
 def heif_kind(data: bytes) -> str | None:
@@ -30,8 +35,8 @@ def heif_kind(data: bytes) -> str | None:
 
 
 def open_photograph(data: bytes) -> "Image":
-    """:func:`.open_picture`, and HEIC and AVIF too; pixels are not decoded yet. Pictures of HEIC are turned as its
-    properties say: their EXIF orientation is 1.
+    """:func:`.open_picture`, and HEIC and AVIF too; pixels are not decoded yet. Pictures of HEIC
+    are turned as its properties say: their EXIF orientation is 1.
 
     Raises:
         MissingDependencyError: the decoder is not installed.
@@ -65,5 +70,7 @@ def _avif(data: bytes) -> "Image":
     from PIL import Image, features
 
     if "avif" not in features.modules or not features.check("avif"):
-        raise MissingDependencyError("AVIF needs Pillow 11.3: pip install 'pillow>=11.3', or save it as JPEG")
+        raise MissingDependencyError(
+            "AVIF needs Pillow 11.3: pip install 'pillow>=11.3', or save it as JPEG"
+        )
     return Image.open(BytesIO(data), formats=["AVIF"])

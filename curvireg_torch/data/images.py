@@ -27,26 +27,27 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_WIDTH, _HEIGHT, _PHOTOMETRIC, _BITS, _SUBFILE, _ORIENTATION, _EXIF_DIRECTORY, _FOCAL_35MM = (
-    256,
-    257,
-    262,
-    258,
-    254,
-    0x0112,
-    0x8769,
-    0xA405,
-)
+_WIDTH = 256
+_HEIGHT = 257
+_PHOTOMETRIC = 262
+_BITS = 258
+_SUBFILE = 254
+_ORIENTATION = 0x0112
+_EXIF_DIRECTORY = 0x8769
+_FOCAL_35MM = 0xA405
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
-_TAKEN_WIDTH, _TAKEN_HEIGHT = 0xA002, 0xA003  # EXIF sizes in px of the picture that the camera took
+# EXIF sizes in px of the picture that the camera took
+_TAKEN_WIDTH = 0xA002
+_TAKEN_HEIGHT = 0xA003
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 
 EXIF_DEVIATION = 0.05
-"""Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections and stabilisers cut
-the border off, and some cameras mean the width by it, not the diagonal. An estimate, not measured."""
+"""Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections
+and stabilisers cut the border off, and some cameras mean the width by it, not the diagonal. An
+estimate, not measured."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class Photo:
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
         focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
         notes: changes to the pixels, in words.
-        taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None if it is not known.
+        taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None
+            if it is not known.
     """
 
     image: Tensor
@@ -69,9 +71,11 @@ class Photo:
 
     @property
     def is_cropped(self) -> bool:
-        """Whether the proportions of the pixels differ from those of the picture that the camera took."""
+        """Whether the proportions of the pixels differ from those of the picture that the camera
+        took."""
         H, W = self.image.shape[-2:]
-        longer, shorter = max(H, W), min(H, W)
+        longer = max(H, W)
+        shorter = min(H, W)
         if self.taken_size is None:
             return False
         taken = max(self.taken_size) / min(self.taken_size)
@@ -80,9 +84,10 @@ class Photo:
     def guessed_camera_matrix(self) -> Tensor | None:
         """Return the (3, 3) float64 camera matrix from the EXIF focal length, or None without one.
 
-        The focal length is relative to the diagonal of the picture that the camera took. A picture of its proportions
-        is taken for a resized one, with the principal point in its centre. One of other proportions is taken for a
-        part of it at full size, which is as large; None if it is larger.
+        The focal length is relative to the diagonal of the picture that the camera took. A picture
+        of its proportions is taken for a resized one, with the principal point in its centre. One
+        of other proportions is taken for a part of it at full size, which is as large; None if it
+        is larger.
         """
         if self.focal_35mm is None:
             return None
@@ -103,22 +108,29 @@ class Photo:
     def facts(self) -> dict[str, Any]:
         """Return all but the pixels, as plain JSON."""
         H, W = self.image.shape[-2:]
-        facts = {"width": W, "height": H, "orientation": self.orientation, "focal_35mm": self.focal_35mm}
+        facts = {
+            "width": W,
+            "height": H,
+            "orientation": self.orientation,
+            "focal_35mm": self.focal_35mm,
+        }
         return {**facts, "notes": list(self.notes)}
 
 
 def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Photo:
-    """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the result.
+    """Read a photograph as viewers show it: the EXIF orientation is applied, and boxes refer to the
+    result.
 
     Args:
-        path: JPEG, PNG, TIFF, WebP, BMP, PBM, PGM or PPM with up to 16 bits per channel, which are rounded to 8; HEIC
-            with the extra ``[heic]``, AVIF with a Pillow that has it. Of 16 bits of which a camera has used 8 to 14,
-            these are stretched, with a note.
+        path: JPEG, PNG, TIFF, WebP, BMP, PBM, PGM or PPM with up to 16 bits per channel, which are
+            rounded to 8; HEIC with the extra ``[heic]``, AVIF with a Pillow that has it. Of 16 bits
+            of which a camera has used 8 to 14, these are stretched, with a note.
         as_stored: leave the orientation as it is in the file, to which boxes of datasets refer.
 
     Raises:
         MissingFileError: the file does not exist.
-        ImageError: another format or bit depth, a damaged file, or one beyond :mod:`curvireg_torch.errors`.
+        ImageError: another format or bit depth, a damaged file, or one beyond
+            :mod:`curvireg_torch.errors`.
 
     Example:
         >>> import tempfile
@@ -133,10 +145,12 @@ def read_photo(path: str | os.PathLike[str], *, as_stored: bool = False) -> Phot
 
 
 def photo_of_picture(image: "Image") -> Photo:
-    """A picture that Pillow has opened, as :func:`read_photo` reads its file; of one made in memory, its pixels.
+    """A picture that Pillow has opened, as :func:`read_photo` reads its file; of one made in
+    memory, its pixels.
 
     Raises:
-        ImageError: a mode that is not read, a damaged file, or one beyond :mod:`curvireg_torch.errors`.
+        ImageError: a mode that is not read, a damaged file, or one beyond
+            :mod:`curvireg_torch.errors`.
     """
     try:
         check_pixels(image)
@@ -147,7 +161,9 @@ def photo_of_picture(image: "Image") -> Photo:
         raise damaged_picture(error) from error
 
 
-def _photo(rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_stored: bool = False) -> Photo:
+def _photo(
+    rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_stored: bool = False
+) -> Photo:
     orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
@@ -156,18 +172,22 @@ def _photo(rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_
 
 
 def read_image(path: str | os.PathLike[str]) -> Tensor:
-    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) float32 RGB in [0, 1].
+    """Read a photograph as it is stored, to which the boxes of datasets refer, as (3, H, W) float32
+    RGB in [0, 1].
 
-    Grey images get three equal channels, an alpha channel is dropped. Errors as in :func:`read_photo`.
+    Grey images get three equal channels, an alpha channel is dropped. Errors as in
+    :func:`read_photo`.
     """
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the same."""
+    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the
+    same."""
 
     def stored_size(image: "Image", *_: object) -> tuple[int, int]:
-        tags = getattr(image, "tag_v2", {})  # of a TIFF, whose size Pillow turns or not, by its version
+        # of a TIFF, whose size Pillow turns or not, by its version
+        tags = getattr(image, "tag_v2", {})
         return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
 
     (width, height), orientation = decoded(path, stored_size)
@@ -195,7 +215,8 @@ def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], _Exif, tup
 
 
 def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, int]:
-    """What ``read`` makes of the open picture of a file, its EXIF orientation and its bytes; and this orientation.
+    """What ``read`` makes of the open picture of a file, its EXIF orientation and its bytes; and
+    this orientation.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -219,8 +240,13 @@ def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, in
 
 
 def as_in_file(pixels: NDArray[Any], image: "Image", orientation: int) -> NDArray[Any]:
-    """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which is taken back."""
-    return oriented(pixels, {6: 8, 8: 6}.get(orientation, orientation)) if image.format == "TIFF" else pixels
+    """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which
+    is taken back."""
+    return (
+        oriented(pixels, {6: 8, 8: 6}.get(orientation, orientation))
+        if image.format == "TIFF"
+        else pixels
+    )
 
 
 def _seek_full_image(image: "Image") -> None:
@@ -236,7 +262,8 @@ def _seek_full_image(image: "Image") -> None:
 
 def _exif(image: "Image") -> _Exif:
     """The metadata of a picture; what is damaged gives orientation 1, and None."""
-    orientation, focal = 1, 0.0
+    orientation = 1
+    focal = 0.0
     width = height = 0
     with suppress(Exception):
         exif = image.getexif()
@@ -254,24 +281,32 @@ def _exif(image: "Image") -> _Exif:
 
 
 def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
-    """(H, W, 3), and notes; the largest value that the file's format can hold becomes 255, but of 16 bits of which the
-    upper ones are empty, as cameras of 10 and 12 bits write them, the largest of the used bits."""
+    """(H, W, 3), and notes; the largest value that the file's format can hold becomes 255, but of
+    16 bits of which the upper ones are empty, as cameras of 10 and 12 bits write them, the largest
+    of the used bits."""
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format in ("PNG", "PPM")):
         tags = getattr(image, "tag_v2", {})
         bits = tags.get(_BITS, (16,))[0]
         grey = np.asarray(image).astype(np.uint32)
-        grey = 2**bits - 1 - grey if tags.get(_PHOTOMETRIC) == 0 else grey  # Pillow inverts 8 bits only
-        used = _used_bits(grey, bits) if image.format != "PPM" else bits  # PGM names its largest value
+        # Pillow inverts 8 bits only
+        grey = 2**bits - 1 - grey if tags.get(_PHOTOMETRIC) == 0 else grey
+        # PGM names its largest value
+        used = _used_bits(grey, bits) if image.format != "PPM" else bits
         return np.repeat(_eight_bits(grey, used)[..., None], 3, axis=2), _stretched(used, bits)
     if image.mode in ("I", "F", "LAB", "HSV"):
         kind = {"I": "32 bits", "F": "floating values"}.get(image.mode, f"CIE{image.mode}")
-        raise ImageError(f"expected RGB or grey of 8 or 16 bits per channel, got {kind}; save it as PNG")
+        raise ImageError(
+            f"expected RGB or grey of 8 or 16 bits per channel, got {kind}; save it as PNG"
+        )
     rgb = np.asarray(image.convert("RGB"))
     upper_bits = USED_BITS[-1] - 8
     if not _is_deep(image, data) or int(rgb.max(initial=0)) >= 2**upper_bits:
         return rgb, ()
     if image.format != "PNG":
-        note = f"16 bits, of which the lower ones are used: {len(np.unique(rgb))} levels remain; save it as PNG"
+        note = (
+            f"16 bits, of which the lower ones are used: {len(np.unique(rgb))} levels remain; "
+            f"save it as PNG"
+        )
         return rgb, (note,)
     # Pillow drops the lower 8 bits of colours.
     how = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -281,7 +316,8 @@ def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[s
 
 
 def _is_deep(image: "Image", data: bytes) -> bool:
-    """Whether a colour picture has 16 bits for each channel, of which Pillow keeps the upper 8; False without data."""
+    """Whether a colour picture has 16 bits for each channel, of which Pillow keeps the upper 8;
+    False without data."""
     if not data:
         return False
     if image.format == "PNG":
@@ -291,7 +327,8 @@ def _is_deep(image: "Image", data: bytes) -> bool:
 
 
 def _used_bits(values: NDArray[Any], bits: int) -> int:
-    """The bits that hold all values, 8, 10, 12 or 14; ``bits`` of a black picture, and where more are needed."""
+    """The bits that hold all values, 8, 10, 12 or 14; ``bits`` of a black picture, and where more
+    are needed."""
     largest = int(values.max(initial=0))
     fewer = [used for used in USED_BITS if used < bits and largest < 2**used]
     return fewer[0] if fewer and largest else bits
@@ -300,7 +337,9 @@ def _used_bits(values: NDArray[Any], bits: int) -> int:
 def _eight_bits(values: NDArray[Any], bits: int) -> NDArray[np.uint8]:
     """Values of ``bits`` bits, rounded to 8."""
     largest = 2**bits - 1
-    rounded: NDArray[np.uint8] = ((values.astype(np.uint32) * 255 + largest // 2) // largest).astype(np.uint8)
+    rounded: NDArray[np.uint8] = (
+        (values.astype(np.uint32) * 255 + largest // 2) // largest
+    ).astype(np.uint8)
     return rounded
 
 
@@ -310,10 +349,12 @@ def _stretched(used: int, bits: int) -> tuple[str, ...]:
 
 def _notes(image: "Image") -> tuple[str, ...]:
     notes = {
-        "grey: three equal channels": image.mode in ("1", "L", "LA", "I") or image.mode.startswith("I;16"),
+        "grey: three equal channels": image.mode in ("1", "L", "LA", "I")
+        or image.mode.startswith("I;16"),
         "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
         "alpha channel dropped": image.has_transparency_data,
-        "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",  # previews of phones
+        # previews of phones
+        "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",
     }
     return tuple(text for text, applies in notes.items() if applies)
 
@@ -325,14 +366,16 @@ def oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
 
 
 _CONTAINERS = re.compile(
-    rb"RIFF....AVI |....(ftyp|moov|mdat|wide|free|skip)|\x1a\x45\xdf\xa3|\0\0\1[\xba\xb3]|\x47.{187}\x47", re.DOTALL
+    rb"RIFF....AVI |....(ftyp|moov|mdat|wide|free|skip)|\x1a\x45\xdf\xa3|\0\0\1[\xba\xb3]|\x47.{187}\x47",  # noqa: E501
+    re.DOTALL,
 )
-"""Starts of AVI, MP4 and QuickTime, Matroska and WebM, and MPEG files. Text that FFmpeg reads as a playlist, such as
-``ffconcat``, would make it open other files."""
+"""Starts of AVI, MP4 and QuickTime, Matroska and WebM, and MPEG files. Text that FFmpeg reads as a
+playlist, such as ``ffconcat``, would make it open other files."""
 
 
 class Video:
-    """The frames of a video, decoded one after the other: pairs of a frame's number and its (3, H, W) uint8 RGB pixels.
+    """The frames of a video, decoded one after the other: pairs of a frame's number and its (3, H,
+    W) uint8 RGB pixels.
 
     Args:
         path: an AVI, MP4, MOV, MKV, WebM or MPEG file in a format that OpenCV decodes.
@@ -343,8 +386,8 @@ class Video:
         count: number of frames that it announces; some files announce a wrong one.
 
     Raises:
-        ImageError: not a video, or one beyond :mod:`curvireg_torch.errors`; while iterating, a frame that cannot be
-            decoded, or a video without frames.
+        ImageError: not a video, or one beyond :mod:`curvireg_torch.errors`; while iterating, a
+            frame that cannot be decoded, or a video without frames.
 
     Example:
         >>> import tempfile
@@ -358,25 +401,34 @@ class Video:
     """
 
     def __init__(self, path: Path, *, every: int = 1) -> None:
-        self.path, self.every = path, check_integer(every, "every")
+        self.path = path
+        self.every = check_integer(every, "every")
         file = self._open()
-        self.fps, self.count = float(file.get(cv2.CAP_PROP_FPS)), int(file.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.fps = float(file.get(cv2.CAP_PROP_FPS))
+        self.count = int(file.get(cv2.CAP_PROP_FRAME_COUNT))
         file.release()
 
     def __iter__(self) -> Iterator[tuple[int, Tensor]]:
         for number, file in self._grabbed():
             known, pixels = file.retrieve()
             if not known:
-                raise ImageError(f"frame {number} cannot be read; save the video again", subject=self.path)
-            yield number, torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1)))
+                raise ImageError(
+                    f"frame {number} cannot be read; save the video again", subject=self.path
+                )
+            yield (
+                number,
+                torch.from_numpy(np.ascontiguousarray(pixels[..., ::-1].transpose(2, 0, 1))),
+            )
 
     def numbers(self) -> list[int]:
-        """Return the numbers of the frames that are yielded, which are counted: ``count`` may be wrong."""
+        """Return the numbers of the frames that are yielded, which are counted: ``count`` may be
+        wrong."""
         return [number for number, _ in self._grabbed()]
 
     def _grabbed(self) -> Iterator[tuple[int, cv2.VideoCapture]]:
         """Yield each frame's number, and the file that it can be retrieved from."""
-        file, number = self._open(), 0
+        file = self._open()
+        number = 0
         try:
             while file.grab():
                 if number % self.every == 0:
@@ -397,7 +449,9 @@ class Video:
         if known is None:
             raise ImageError(message, subject=self.path)
         file = cv2.VideoCapture(str(self.path))
-        width, height = (int(file.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        width, height = (
+            int(file.get(k)) for k in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
         if not file.isOpened() or not 0 < width * height <= MAX_IMAGE_PIXELS:
             file.release()
             raise ImageError(message, subject=self.path)

@@ -31,12 +31,13 @@ def mask_file(mask: str | os.PathLike[str]) -> tuple[Path, int | None]:
 
 
 def read_mask(mask: str | os.PathLike[str]) -> NDArray[np.float32]:
-    """(H, W) in [0, 1], 1 = object, of a picture in which the object is white, or one of several labels.
+    """(H, W) in [0, 1], 1 = object, of a picture in which the object is white, or one of several
+    labels.
 
     Args:
-        mask: ``FILE``, or ``FILE:LABEL`` for the pixels of that value: of the palette's index, of grey of 8 or 16
-            bits. Without a label: an alpha channel that varies is the mask; else the brightest channel; pixels of a
-            single dark value beside 0 are the object.
+        mask: ``FILE``, or ``FILE:LABEL`` for the pixels of that value: of the palette's index, of
+            grey of 8 or 16 bits. Without a label: an alpha channel that varies is the mask; else
+            the brightest channel; pixels of a single dark value beside 0 are the object.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -65,7 +66,8 @@ def read_mask(mask: str | os.PathLike[str]) -> NDArray[np.float32]:
 
 
 def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:
-    """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of its only label."""
+    """(H, W) in [0, 1] of a picture's values, of which ``largest`` is white; of a label image, of
+    its only label."""
     if values.size == 0 or int(values.max()) > largest * MAX_LABEL / 255:
         return np.asarray(values / largest, dtype=np.float32)
     labels = np.unique(values)
@@ -73,7 +75,9 @@ def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:
     if len(labels) == 1:
         return np.asarray(values == labels[0], dtype=np.float32)
     if len(labels) > 1:
-        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (", ..." if len(labels) > MAX_LISTED else "")
+        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (
+            ", ..." if len(labels) > MAX_LISTED else ""
+        )
         raise InvalidInputError(
             f"mask: no white pixel, but labels {listed}; choose one as FILE:LABEL, or mask == LABEL"
         )
@@ -84,8 +88,12 @@ def _labelled(values: NDArray[Any], label: int, file: Path) -> NDArray[np.float3
     chosen = np.equal(values, label)
     if not chosen.any():
         labels = np.unique(values)
-        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (", ..." if len(labels) > MAX_LISTED else "")
-        raise InvalidInputError(f"mask: no pixel has the label {label}; it has {listed}", subject=file)
+        listed = ", ".join(map(str, labels[:MAX_LISTED])) + (
+            ", ..." if len(labels) > MAX_LISTED else ""
+        )
+        raise InvalidInputError(
+            f"mask: no pixel has the label {label}; it has {listed}", subject=file
+        )
     return np.asarray(chosen, dtype=np.float32)
 
 

@@ -1,8 +1,9 @@
 """A bounded reader for MATLAB 5 annotation files.
 
-``scipy.io.loadmat`` is not used because files are untrusted: a number of an unknown type or a deeply nested cell ends
-the process by a segmentation fault, and 200 bytes that claim a large array take all memory. This reader knows structs,
-text and real numbers; all else (cells, objects, sparse) becomes None.
+``scipy.io.loadmat`` is not used because files are untrusted: a number of an unknown type or a
+deeply nested cell ends the process by a segmentation fault, and 200 bytes that claim a large array
+take all memory. This reader knows structs, text and real numbers; all else (cells, objects, sparse)
+becomes None.
 """
 
 import math
@@ -24,17 +25,40 @@ MatValue = list[MatStruct] | str | NDArray[np.float64] | None
 MAX_DEPTH = 16
 """Nesting of structs."""
 
-_MATRIX, _COMPRESSED = 14, 15
-_STRUCT, _CHAR, _NUMERIC, _COMPLEX = 2, 4, range(6, 16), 0x0800
-_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-_CODECS = {1: "latin-1", 2: "latin-1", 4: "utf-16-le", 16: "utf-8", 17: "utf-16-le", 18: "utf-32-le"}
+_MATRIX = 14
+_COMPRESSED = 15
+_STRUCT = 2
+_CHAR = 4
+_NUMERIC = range(6, 16)
+_COMPLEX = 0x0800
+_NUMBERS = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}
+_CODECS = {
+    1: "latin-1",
+    2: "latin-1",
+    4: "utf-16-le",
+    16: "utf-8",
+    17: "utf-16-le",
+    18: "utf-32-le",
+}
 
 
 def read_mat(path: Path, variable: str) -> MatValue:
     """Return the value of ``variable`` in a little-endian MATLAB 5 to 7.2 file.
 
     Raises:
-        InvalidInputError: any other file, a damaged one, or one of more than ``MAX_MAT_BYTES``, packed or not.
+        InvalidInputError: any other file, a damaged one, or one of more than ``MAX_MAT_BYTES``,
+            packed or not.
     """
     try:
         with path.open("rb") as file:
@@ -48,7 +72,9 @@ def read_mat(path: Path, variable: str) -> MatValue:
                 return value
         raise ValueError(f"holds no variable {variable!r}")
     except (OSError, ValueError, struct.error, zlib.error) as error:
-        raise InvalidInputError(f"not a MATLAB 5 file, or damaged: {error}", subject=path) from error
+        raise InvalidInputError(
+            f"not a MATLAB 5 file, or damaged: {error}", subject=path
+        ) from error
 
 
 def _variables(data: bytes) -> Iterator[tuple[str, MatValue]]:
@@ -70,7 +96,8 @@ def _elements(data: bytes, *, padded: bool = True) -> Iterator[tuple[int, bytes]
     position = 0
     while position + 8 <= len(data):
         kind, size = struct.unpack_from("<II", data, position)
-        start, end = position + 8, position + 8 + size + (-size % 8 if padded else 0)
+        start = position + 8
+        end = position + 8 + size + (-size % 8 if padded else 0)
         if kind >> 16:  # small form: size and type share a word, content in the next four bytes
             kind, size, start, end = kind & 0xFFFF, kind >> 16, position + 4, position + 8
         if start + size > len(data) or start + size > end:
@@ -87,7 +114,8 @@ def _array(body: bytes, depth: int) -> tuple[str, MatValue]:
         raise ValueError(f"nested more than {MAX_DEPTH} deep")
     elements = _elements(body)
     (_, flags), (_, sizes), (_, label) = islice(elements, 3)
-    flag, name = struct.unpack_from("<I", flags)[0], label.decode("latin-1")
+    flag = struct.unpack_from("<I", flags)[0]
+    name = label.decode("latin-1")
     count = math.prod(struct.unpack(f"<{len(sizes) // 4}i", sizes))
     if flag & 0xFF == _STRUCT:
         return name, _structs(elements, count, len(body), depth)
@@ -106,7 +134,9 @@ def _array(body: bytes, depth: int) -> tuple[str, MatValue]:
     return name, numbers
 
 
-def _structs(elements: Iterator[tuple[int, bytes]], count: int, size: int, depth: int) -> list[MatStruct]:
+def _structs(
+    elements: Iterator[tuple[int, bytes]], count: int, size: int, depth: int
+) -> list[MatStruct]:
     (_, content), (_, names) = islice(elements, 2)
     (width,) = struct.unpack_from("<i", content)
     if width < 1:

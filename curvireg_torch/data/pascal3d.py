@@ -1,4 +1,5 @@
-"""PASCAL3D+ 1.1: category-level CAD models aligned with photographs of PASCAL VOC 2012 and ImageNet."""
+"""PASCAL3D+ 1.1: category-level CAD models aligned with photographs of PASCAL VOC 2012 and
+ImageNet."""
 
 import math
 import os
@@ -21,10 +22,10 @@ _VOC_LISTS = Path("PASCAL", "VOCdevkit", "VOC2012", "ImageSets", "Main")
 class Pascal3DPlus(ObjectDataset):
     """The annotated objects of PASCAL3D+, one sample each.
 
-    The tree is that of the release: ``Annotations/<class>_<part>/<id>.mat``, ``Images/<class>_<part>/<id>.*``,
-    ``CAD/<class>/<NN>.off``. The ids of a class are those not marked -1 in
-    ``PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_<split>.txt``; without that list, and for the ImageNet part, those
-    of ``Image_sets/<class>_<part>_<split>.txt``.
+    The tree is that of the release: ``Annotations/<class>_<part>/<id>.mat``,
+    ``Images/<class>_<part>/<id>.*``, ``CAD/<class>/<NN>.off``. The ids of a class are those not
+    marked -1 in ``PASCAL/VOCdevkit/VOC2012/ImageSets/Main/<class>_<split>.txt``; without that list,
+    and for the ImageNet part, those of ``Image_sets/<class>_<part>_<split>.txt``.
 
     Args:
         root: the folder that holds ``Annotations``, ``Images`` and ``CAD``.
@@ -32,29 +33,36 @@ class Pascal3DPlus(ObjectDataset):
         categories: class names; None for all that have a list for ``split``, in alphabetical order.
         part: ``"pascal"`` (photographs of VOC 2012) or ``"imagenet"``.
         occluded, truncated, difficult: False skips objects with that flag.
-        pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release (MATLAB), 0 in sets
-            written from Python. It is subtracted.
+        pixel_origin: coordinate of the first pixel in ``bbox``, ``px`` and ``py``: 1 in the release
+            (MATLAB), 0 in sets written from Python. It is subtracted.
         transform, target_transform: see :class:`ObjectDataset`.
 
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
-        - ``box`` (4,) x0, y0, x1, y1: centres of the outermost labelled pixels; may extend beyond the image
-        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera
-        - ``distance`` float, ``translation`` (3,) = (0, 0, distance), in units of the CAD (about its diagonal)
-        - ``camera_matrix`` (3, 3): the virtual camera of the annotation, its principal point at the object's centre
+        - ``box`` (4,) x0, y0, x1, y1: centres of the outermost labelled pixels; may extend beyond
+          the image
+        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to
+          OpenCV camera
+        - ``distance`` float, ``translation`` (3,) = (0, 0, distance), in units of the CAD (about
+          its diagonal)
+        - ``camera_matrix`` (3, 3): the virtual camera of the annotation, its principal point at the
+          object's centre
         - ``category`` str, ``cad_index`` int from 1, ``cad_path`` str
-        - ``object_index`` int: index in the annotation file; ``truncated``, ``occluded``, ``difficult`` bool
+        - ``object_index`` int: index in the annotation file; ``truncated``, ``occluded``,
+          ``difficult`` bool
 
-    Reasons in ``skipped``: ``other_class`` (a file lists all objects of the photograph), ``occluded``, ``truncated``,
-    ``difficult``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse bins were labelled), ``bad_box`` (no
-    area), ``missing_annotation``, ``corrupt_annotation``, ``missing_image``, ``missing_mesh``.
+    Reasons in ``skipped``: ``other_class`` (a file lists all objects of the photograph),
+    ``occluded``, ``truncated``, ``difficult``, ``no_viewpoint``, ``coarse_viewpoint`` (only coarse
+    bins were labelled), ``bad_box`` (no area), ``missing_annotation``, ``corrupt_annotation``,
+    ``missing_image``, ``missing_mesh``.
 
     Raises:
         MissingFileError: the root or an image list does not exist.
         InvalidInputError: an option is out of range.
 
     Example:
-        >>> Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])[0]["rotation"]  # doctest: +SKIP
+        >>> Pascal3DPlus("data/PASCAL3D+_release1.1",
+        ...     categories=["car"])[0]["rotation"]  # doctest: +SKIP
     """
 
     def __init__(
@@ -71,17 +79,25 @@ class Pascal3DPlus(ObjectDataset):
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
-        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
+        super().__init__(
+            existing_root(root, _README), transform=transform, target_transform=target_transform
+        )
         check_option(part, ("pascal", "imagenet"), "part")
         if pixel_origin not in (0, 1):
             raise InvalidInputError(f"pixel_origin: expected 0 or 1, got {pixel_origin}")
         if isinstance(categories, str):
-            raise InvalidInputError(f"categories: expected a list of names, got the text {categories!r}")
+            raise InvalidInputError(
+                f"categories: expected a list of names, got the text {categories!r}"
+            )
         self.split = split
         self.part = part
         self.categories = sorted(self._listed() if categories is None else set(categories))
         self.pixel_origin = pixel_origin
-        self._excluded = {"occluded": not occluded, "truncated": not truncated, "difficult": not difficult}
+        self._excluded = {
+            "occluded": not occluded,
+            "truncated": not truncated,
+            "difficult": not difficult,
+        }
         for name in (split, *self.categories):
             if not is_plain_name(name):
                 raise InvalidInputError(f"split, categories: expected plain names, got {name!r}")
@@ -89,26 +105,40 @@ class Pascal3DPlus(ObjectDataset):
             self._index(category)
 
     def _list_files(self, category: str) -> list[Path]:
-        voc = [self.root / _VOC_LISTS / f"{category}_{self.split}.txt"] if self.part == "pascal" else []
+        voc = (
+            [self.root / _VOC_LISTS / f"{category}_{self.split}.txt"]
+            if self.part == "pascal"
+            else []
+        )
         return [*voc, self.root / "Image_sets" / f"{category}_{self.part}_{self.split}.txt"]
 
     def _listed(self) -> list[str]:
         ending = f"_{self.part}"
-        folders = [p.name.removesuffix(ending) for p in (self.root / "Annotations").glob("*" + ending) if p.is_dir()]
+        folders = [
+            p.name.removesuffix(ending)
+            for p in (self.root / "Annotations").glob("*" + ending)
+            if p.is_dir()
+        ]
         names = [name for name in folders if any(p.is_file() for p in self._list_files(name))]
         if not names:
             raise MissingFileError(
-                f"no {self.part} image list for split {self.split!r}; {_README} shows the layout", subject=self.root
+                f"no {self.part} image list for split {self.split!r}; {_README} shows the layout",
+                subject=self.root,
             )
         return names
 
     def _ids(self, category: str) -> list[str]:
         for path in self._list_files(category):
             if path.is_file():
-                lines = [line.split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines()]
+                lines = [
+                    line.split()
+                    for line in path.read_text(encoding="utf-8", errors="replace").splitlines()
+                ]
                 return [fields[0] for fields in lines if fields and fields[1:2] != ["-1"]]
         names = " or ".join(str(p.relative_to(self.root)) for p in self._list_files(category))
-        raise MissingFileError(f"no image list {names}; {_README} shows the layout", subject=self.root)
+        raise MissingFileError(
+            f"no image list {names}; {_README} shows the layout", subject=self.root
+        )
 
     def _index(self, category: str) -> None:
         folder = f"{category}_{self.part}"
@@ -118,7 +148,9 @@ class Pascal3DPlus(ObjectDataset):
             if not is_plain_name(image_id) or not annotation.is_file():
                 self._skip("missing_annotation", item)
                 continue
-            candidates = (self.root / "Images" / folder / (image_id + suffix) for suffix in IMAGE_SUFFIXES)
+            candidates = (
+                self.root / "Images" / folder / (image_id + suffix) for suffix in IMAGE_SUFFIXES
+            )
             image = next((path for path in candidates if path.is_file()), None)
             if image is None:
                 self._skip("missing_image", item)
@@ -146,7 +178,9 @@ class Pascal3DPlus(ObjectDataset):
         views = entry.get("viewpoint")
         if not isinstance(views, list) or not views:
             return "no_viewpoint"
-        azimuth, elevation, distance = (_number(views[0].get(key)) for key in ("azimuth", "elevation", "distance"))
+        azimuth, elevation, distance = (
+            _number(views[0].get(key)) for key in ("azimuth", "elevation", "distance")
+        )
         if azimuth is None or elevation is None or not distance:
             return "coarse_viewpoint"
         cad_index = _number(entry.get("cad_index")) or 0.0
@@ -189,10 +223,14 @@ def _box(value: MatValue, origin: int) -> tuple[float, float, float, float] | No
     return (x0, y0, x1, y1) if x1 > x0 and y1 > y0 else None
 
 
-def _camera(view: MatStruct, box: tuple[float, float, float, float], origin: int) -> tuple[tuple[float, ...], ...]:
-    """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the box."""
+def _camera(
+    view: MatStruct, box: tuple[float, float, float, float], origin: int
+) -> tuple[tuple[float, ...], ...]:
+    """K of the annotation. Defaults: focal 1, viewport 3000, principal point at the centre of the
+    box."""
     focal = (_number(view.get("focal")) or 1.0) * (_number(view.get("viewport")) or 3000.0)
-    px, py = _number(view.get("px")), _number(view.get("py"))
+    px = _number(view.get("px"))
+    py = _number(view.get("py"))
     cx = (box[0] + box[2]) / 2 if px is None else px - origin
     cy = (box[1] + box[3]) / 2 if py is None else py - origin
     return (focal, 0.0, cx), (0.0, focal, cy), (0.0, 0.0, 1.0)

@@ -18,10 +18,17 @@ from .calibrations.documents import read_document
 from .calibrations.record import flattened, plain
 
 _README = "docs/guides/known-pose.md"
-_MATRICES = {plain(name) for name in ("T_cam_from_model", "T_cam_from_object", "cam_from_model", "T_cam_obj", "T_co")}
-_MATRICES |= {plain(name) for name in ("T", "pose", "matrix", "transform", "transform_matrix", "ob_in_cam", "K")}
+_MATRICES = {
+    plain(name)
+    for name in ("T_cam_from_model", "T_cam_from_object", "cam_from_model", "T_cam_obj", "T_co")
+}
+_MATRICES |= {
+    plain(name)
+    for name in ("T", "pose", "matrix", "transform", "transform_matrix", "ob_in_cam", "K")
+}
 FORMATS = (
-    "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; scene_gt.json:IMAGE_ID "
+    "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; "
+    "scene_gt.json:IMAGE_ID "
     "of BOP; pose.yaml of ROS"
 )
 
@@ -45,10 +52,11 @@ def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> Pose
     """Read the pose of an object in a camera.
 
     Args:
-        path: ``FILE``, or ``FILE:NAME`` of one with several poses: the label of MegaPose, the image of BOP, or
-            ``IMAGE:INDEX`` where it shows several objects.
+        path: ``FILE``, or ``FILE:NAME`` of one with several poses: the label of MegaPose, the image
+            of BOP, or ``IMAGE:INDEX`` where it shows several objects.
         convention: "opengl" for poses whose camera looks along -z; x points right and y up.
-        mesh: name of the mesh's file without its ending, as ``obj_000001``: it chooses among the objects of an image.
+        mesh: name of the mesh's file without its ending, as ``obj_000001``: it chooses among the
+            objects of an image.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -96,9 +104,13 @@ def _named(content: Any, name: str, mesh: str) -> Any:
     """The part of a file with several poses that is meant."""
     if isinstance(content, list) and all(isinstance(item, dict) for item in content) and content:
         return _item(content, name, mesh)
-    if not isinstance(content, dict) or not any(isinstance(value, list) for value in content.values()):
+    if not isinstance(content, dict) or not any(
+        isinstance(value, list) for value in content.values()
+    ):
         return content
-    images = {key: value for key, value in content.items() if key.isdecimal() and isinstance(value, list)}
+    images = {
+        key: value for key, value in content.items() if key.isdecimal() and isinstance(value, list)
+    }
     if len(images) < len(content):
         return content
     image, _, index = name.partition(":")
@@ -107,32 +119,44 @@ def _named(content: Any, name: str, mesh: str) -> Any:
     chosen = {key.lstrip("0"): value for key, value in images.items()}.get(image.lstrip("0"))
     if chosen is None or not image:
         listed = ", ".join(list(images)[:8]) + (", ..." if len(images) > 8 else "")
-        raise InvalidInputError(f"poses of several images; choose one as FILE:IMAGE_ID from {listed}")
+        raise InvalidInputError(
+            f"poses of several images; choose one as FILE:IMAGE_ID from {listed}"
+        )
     return _item(chosen, index, mesh)
 
 
 def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
-    """The pose of a list with this label or index, or of the mesh's number; the only one without a name."""
+    """The pose of a list with this label or index, or of the mesh's number; the only one without a
+    name."""
     number = re.search(r"obj_(\d+)$", mesh)
     labels = [str(item.get("label", "")) if isinstance(item, dict) else "" for item in items]
     if name:
         chosen = [item for item, label in zip(items, labels, strict=True) if label == name]
-        chosen = chosen or ([items[int(name)]] if name.isdecimal() and int(name) < len(items) else [])
+        chosen = chosen or (
+            [items[int(name)]] if name.isdecimal() and int(name) < len(items) else []
+        )
     elif len(items) > 1 and number:
-        chosen = [item for item in items if isinstance(item, dict) and item.get("obj_id") == int(number[1])]
+        chosen = [
+            item
+            for item in items
+            if isinstance(item, dict) and item.get("obj_id") == int(number[1])
+        ]
     else:
-        chosen = [item for item, label in zip(items, labels, strict=True) if label and label == mesh] or list(items)
+        chosen = [
+            item for item, label in zip(items, labels, strict=True) if label and label == mesh
+        ] or list(items)
     if len(chosen) != 1:
         names = ", ".join(label or str(index) for index, label in enumerate(labels[:8]))
         raise InvalidInputError(
-            f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: {names}"
+            f"expected one pose, got {len(chosen)} of {len(items)}; choose one as FILE:NAME: "
+            f"{names}"
         )
     return chosen[0]
 
 
 def pose_matrix(numbers: Sequence[Any]) -> Tensor:
-    """(4, 4) float64 of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1 in the last column
-    and the translation in the last row."""
+    """(4, 4) float64 of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1
+    in the last column and the translation in the last row."""
     values = check_numbers(list(numbers), "pose")
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
     if len(values) == 12:
@@ -141,24 +165,34 @@ def pose_matrix(numbers: Sequence[Any]) -> Tensor:
     by_column = torch.equal(T[:, 3], last) and not torch.equal(T[3], last)
     T = T.T.contiguous() if by_column else T
     if not torch.equal(T[3], last):
-        raise InvalidInputError("pose: expected a last row of 0 0 0 1; give T_cam_from_model row by row")
+        raise InvalidInputError(
+            "pose: expected a last row of 0 0 0 1; give T_cam_from_model row by row"
+        )
     return T
 
 
 def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
     if content.get("frame") == "world":
-        message = "a result of several photographs, whose pose is in the world; give that in one camera, as in 'views'"
+        message = (
+            "a result of several photographs, whose pose is in the world; give that in one "
+            "camera, as in 'views'"
+        )
         raise InvalidInputError(message)
     if "rotation" in content and content.get("translation", ...) is None:
         raise InvalidInputError(
-            "a result without a translation, as of a photograph without a camera; register with --camera first"
+            "a result without a translation, as of a photograph without a camera; register with "
+            "--camera first"
         )
     rotation, translation = (
         next((content[key] for key in keys if key in content), None)
         for keys in (("rotation", "R"), ("translation", "t"))
     )
     R = check_numbers(_flat(rotation), "rotation", 9).view(3, 3)
-    return PoseFile(transform(R, check_numbers(_flat(translation), "translation", 3)), None, _confidence(content))
+    return PoseFile(
+        transform(R, check_numbers(_flat(translation), "translation", 3)),
+        None,
+        _confidence(content),
+    )
 
 
 def _flat(values: Any) -> Any:
@@ -173,14 +207,19 @@ def _confidence(content: Mapping[str, Any]) -> float | None:
 def _bop(content: Mapping[str, Any]) -> PoseFile:
     """An entry of scene_gt.json: millimetres."""
     R = check_numbers(_flat(content.get("cam_R_m2c")), "cam_R_m2c", 9).view(3, 3)
-    return PoseFile(transform(R, check_numbers(_flat(content.get("cam_t_m2c")), "cam_t_m2c", 3)), "mm")
+    return PoseFile(
+        transform(R, check_numbers(_flat(content.get("cam_t_m2c")), "cam_t_m2c", 3)), "mm"
+    )
 
 
 def _megapose(content: Mapping[str, Any]) -> PoseFile:
-    """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the world."""
+    """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the
+    world."""
     numbers = check_numbers(flattened(content.get("TWO")), "TWO", 7)
     if "TWC" in content:
-        raise InvalidInputError("TWO: in the world of TWC; give the pose in the camera, TWC^-1 TWO, without TWC")
+        raise InvalidInputError(
+            "TWO: in the world of TWC; give the pose in the camera, TWC^-1 TWO, without TWC"
+        )
     return PoseFile(transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
 
 
@@ -189,9 +228,13 @@ def _ros(content: Mapping[str, Any]) -> PoseFile:
     pose = content.get("pose")
     while isinstance(pose, dict) and "pose" in pose:  # with a covariance beside it
         pose = pose["pose"]
-    place, turn = (pose.get(name) if isinstance(pose, dict) else None for name in ("position", "orientation"))
+    place, turn = (
+        pose.get(name) if isinstance(pose, dict) else None for name in ("position", "orientation")
+    )
     if not isinstance(place, dict) or not isinstance(turn, dict):
-        raise InvalidInputError("pose: expected position and orientation; or a matrix of 4 x 4 numbers")
+        raise InvalidInputError(
+            "pose: expected position and orientation; or a matrix of 4 x 4 numbers"
+        )
     t = check_numbers([place.get(axis) for axis in "xyz"], "position", 3)
     q = check_numbers([turn.get(axis) for axis in "xyzw"], "orientation", 4)
     return PoseFile(transform(_rotation(q, "orientation"), t), "m")
@@ -201,7 +244,8 @@ def _rotation(quaternion: Tensor, name: str) -> Tensor:
     """(3, 3) of x, y, z, w."""
     if abs(float(quaternion.norm()) - 1.0) > 1e-2:
         raise InvalidInputError(
-            f"{name}: expected a quaternion x, y, z, w of length 1, got {float(quaternion.norm()):.3g}"
+            f"{name}: expected a quaternion x, y, z, w of length 1, got "
+            f"{float(quaternion.norm()):.3g}"
         )
     return torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
 

@@ -20,10 +20,11 @@ _COLUMNS = ["image", "x0", "y0", "x1", "y1", "azimuth", "elevation", "theta", "d
 class PoseFolder(ObjectDataset):
     """One folder per object, with ``mesh.*``, photographs, and ``views.csv`` with boxes and poses.
 
-    ``views.csv`` is UTF-8 with the header ``image,x0,y0,x1,y1,azimuth,elevation,theta,distance``: a file of the
-    folder, the box in pixels (centre of the first pixel = 0), PASCAL3D+ viewpoint angles in degrees, distance in units
-    of the mesh. Pose columns may be empty: without azimuth and elevation there is no pose, an empty theta is 0. A
-    photograph may have several lines. The mesh is one file in any format of :func:`curvireg_torch.load_mesh`.
+    ``views.csv`` is UTF-8 with the header ``image,x0,y0,x1,y1,azimuth,elevation,theta,distance``: a
+    file of the folder, the box in pixels (centre of the first pixel = 0), PASCAL3D+ viewpoint
+    angles in degrees, distance in units of the mesh. Pose columns may be empty: without azimuth and
+    elevation there is no pose, an empty theta is 0. A photograph may have several lines. The mesh
+    is one file in any format of :func:`curvireg_torch.load_mesh`.
 
     Args:
         root: the folder of the objects' folders.
@@ -32,13 +33,14 @@ class PoseFolder(ObjectDataset):
     Samples are dicts (tensors are float32):
         - ``image`` (3, H, W) RGB in [0, 1]; ``image_path``, ``image_id`` str
         - ``box`` (4,) x0, y0, x1, y1
-        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to OpenCV camera; NaN if
-          the pose is unknown
+        - ``viewpoint`` (3,) azimuth, elevation, theta in degrees; ``rotation`` (3, 3) model to
+          OpenCV camera; NaN if the pose is unknown
         - ``distance`` float, NaN if unknown
-        - ``category`` str, the object's folder; ``mesh_path`` str; ``object_index`` int: line of ``views.csv`` from 0
+        - ``category`` str, the object's folder; ``mesh_path`` str; ``object_index`` int: line of
+          ``views.csv`` from 0
 
-    Reasons in ``skipped``: ``missing_annotation`` (no ``views.csv``), ``corrupt_annotation``, ``missing_image``,
-    ``missing_mesh``, ``bad_box`` (no area).
+    Reasons in ``skipped``: ``missing_annotation`` (no ``views.csv``), ``corrupt_annotation``,
+    ``missing_image``, ``missing_mesh``, ``bad_box`` (no area).
 
     Raises:
         MissingFileError: the root does not exist, or holds no folder.
@@ -55,18 +57,28 @@ class PoseFolder(ObjectDataset):
         transform: Callable[[Tensor], Any] | None = None,
         target_transform: Callable[[Sample], Sample] | None = None,
     ) -> None:
-        super().__init__(existing_root(root, _README), transform=transform, target_transform=target_transform)
-        folders = sorted(p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith("."))
+        super().__init__(
+            existing_root(root, _README), transform=transform, target_transform=target_transform
+        )
+        folders = sorted(
+            p for p in self.root.iterdir() if p.is_dir() and not p.name.startswith(".")
+        )
         if not folders:
-            raise MissingFileError(f"holds no folder of an object; {_README} shows the layout", subject=self.root)
+            raise MissingFileError(
+                f"holds no folder of an object; {_README} shows the layout", subject=self.root
+            )
         self.categories = [folder.name for folder in folders]
         for folder in folders:
             self._index(folder)
 
     def _index(self, folder: Path) -> None:
-        meshes = [folder / f"mesh{suffix}" for suffix in MESHES if (folder / f"mesh{suffix}").is_file()]
+        meshes = [
+            folder / f"mesh{suffix}" for suffix in MESHES if (folder / f"mesh{suffix}").is_file()
+        ]
         if len(meshes) > 1:
-            raise InvalidInputError(f"expected one mesh, got {', '.join(p.name for p in meshes)}", subject=folder)
+            raise InvalidInputError(
+                f"expected one mesh, got {', '.join(p.name for p in meshes)}", subject=folder
+            )
         if not meshes:
             return self._skip("missing_mesh", folder.name)
         table = folder / "views.csv"
@@ -75,7 +87,8 @@ class PoseFolder(ObjectDataset):
         try:
             header, *lines = ([cell.strip() for cell in line] for line in read_csv(table))
         except ValueError:  # damaged, or empty
-            header, lines = [], []
+            header = []
+            lines = []
         if header != _COLUMNS:
             return self._skip("corrupt_annotation", f"{folder.name}/views.csv")
         for index, line in enumerate(lines):

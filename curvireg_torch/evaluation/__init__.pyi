@@ -3,4 +3,12 @@ from .datasets import evaluate
 from .protocol import Protocol
 from .registry import DATASETS
 
-__all__ = ["DATASETS", "BOPBenchmark", "Benchmark", "Pascal3DBenchmark", "PoseFolderBenchmark", "Protocol", "evaluate"]
+__all__ = [
+    "DATASETS",
+    "BOPBenchmark",
+    "Benchmark",
+    "Pascal3DBenchmark",
+    "PoseFolderBenchmark",
+    "Protocol",
+    "evaluate",
+]

@@ -34,9 +34,12 @@ MIN_IOU = 0.5  # intersection over union from which a box is right
 UNOCCLUDED = 0.95  # visible fraction from which an object of a BOP set counts as whole
 RESULTS_OF_BOP = "curvireg-*_*-*.csv"  # results by the name that bop_toolkit asks for
 NO_VSD = (
-    "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used here: ar_rgb is without it"
+    "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used "
+    "here: "
+    "ar_rgb is without it"
 )
-SAME_PLACE = 0.1  # diameters within which the positions in the world of one instance agree, in different photographs
+# diameters within which the positions in the world of one instance agree, in different photographs
+SAME_PLACE = 0.1
 
 Errors = Mapping[str, Tensor]
 
@@ -53,14 +56,17 @@ class Benchmark(ABC):
         groups: name of the groups that are scored by themselves, and key of the group in a sample.
         columns: of the table of predictions.
         reports: names of the files that are written from all results.
-        page_error: name of the error by which the page of the best and the worst marks an object: that up to
-            symmetries, where they are known.
-        measures: scores that are means over the objects: name of the error, and thresholds below which it is right.
+        page_error: name of the error by which the page of the best and the worst marks an object:
+            that up to symmetries, where they are known.
+        measures: scores that are means over the objects: name of the error, and thresholds below
+            which it is right.
         dataset, protocol: as given.
-        samples, entries: annotations without photographs, and what is registered, in the order of the dataset.
+        samples, entries: annotations without photographs, and what is registered, in the order of
+            the dataset.
 
     Raises:
-        InvalidInputError: a ``cad`` that the dataset cannot offer, or ``views`` without poses of the cameras.
+        InvalidInputError: a ``cad`` that the dataset cannot offer, or ``views`` without poses of
+            the cameras.
     """
 
     name: ClassVar[str]
@@ -71,7 +77,12 @@ class Benchmark(ABC):
     thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
     groups: ClassVar[tuple[str, str]] = ("per_object", "category")
     columns: ClassVar[Sequence[str]] = ()
-    reports: ClassVar[Sequence[str]] = ("summary.json", "predictions.csv", "errors.csv", "index.html")
+    reports: ClassVar[Sequence[str]] = (
+        "summary.json",
+        "predictions.csv",
+        "errors.csv",
+        "index.html",
+    )
     page_error: ClassVar[str] = "error_deg"
     measures: ClassVar[Mapping[str, tuple[str, Sequence[float]]]] = {
         "acc_15_deg": ("error_deg", (15.0,)),
@@ -80,8 +91,11 @@ class Benchmark(ABC):
 
     def __init__(self, dataset: Pascal3DPlus | BOPDataset | PoseFolder, protocol: Protocol) -> None:
         if protocol.views > 1 and not self.gives_camera:
-            raise InvalidInputError("protocol: views needs a dataset with cameras, such as a BOP set; leave it out")
-        self.dataset, self.protocol = dataset, protocol
+            raise InvalidInputError(
+                "protocol: views needs a dataset with cameras, such as a BOP set; leave it out"
+            )
+        self.dataset = dataset
+        self.protocol = protocol
         self.samples = [dataset.annotation(i) for i in range(len(dataset))]
         self.entries = [self._entry(sample) for sample in self.samples]
 
@@ -92,11 +106,16 @@ class Benchmark(ABC):
         return [i * n // count for i in range(count)]
 
     def copies(self, samples: Sequence[Row]) -> list[list[Row]]:
-        """For each of some samples, all samples of the same object or class in its photograph, itself first."""
-        groups, key = defaultdict[Any, list[Row]](list), self.groups[1]
+        """For each of some samples, all samples of the same object or class in its photograph,
+        itself first."""
+        groups = defaultdict[Any, list[Row]](list)
+        key = self.groups[1]
         for sample in self.samples:
             groups[sample["image_path"], sample[key]].append(sample)
-        return [[one, *(s for s in groups[one["image_path"], one[key]] if s is not one)] for one in samples]
+        return [
+            [one, *(s for s in groups[one["image_path"], one[key]] if s is not one)]
+            for one in samples
+        ]
 
     def settings(self) -> Row:
         """What results depend on besides pipeline and protocol."""
@@ -107,13 +126,17 @@ class Benchmark(ABC):
         """Meshes that an object is registered to: its own; other datasets may offer more."""
         if self.protocol.cad != "annotated":
             raise InvalidInputError(
-                f"protocol: each object of this dataset has one mesh, so cad=annotated; got cad={self.protocol.cad}"
+                f"protocol: each object of this dataset has one mesh, so cad=annotated; got "
+                f"cad={self.protocol.cad}"
             )
         return (Path(sample[self.mesh]),)
 
     def _entry(self, sample: Row) -> Entry:
-        label, meshes, photo = self.label.format_map(sample), self.meshes(sample), Path(sample["image_path"])
-        box, protocol = sample["box"], self.protocol
+        label = self.label.format_map(sample)
+        meshes = self.meshes(sample)
+        photo = Path(sample["image_path"])
+        box = sample["box"]
+        protocol = self.protocol
         error = "" if meshes else "no_other_cad"
         if protocol.box is not None and not bool(box.isfinite().all()):
             error = "unknown_box"
@@ -122,7 +145,9 @@ class Benchmark(ABC):
             name=str(photo.relative_to(self.dataset.root)),
             photo=photo,
             meshes=meshes,
-            box=None if protocol.box is None else tuple(perturbed_box(box, protocol, label).tolist()),
+            box=None
+            if protocol.box is None
+            else tuple(perturbed_box(box, protocol, label).tolist()),
             camera=Camera(sample["camera_matrix"]) if self.gives_camera else None,
             prior=hint_of_truth(sample["rotation"], frame, protocol, label),
             as_stored=True,
@@ -132,7 +157,8 @@ class Benchmark(ABC):
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
         """Errors (N,) by name, float64: ``inf`` for a miss, NaN where the truth is unknown."""
-        R, truth = estimated_rotations(rows), true_rotations(samples)
+        R = estimated_rotations(rows)
+        truth = true_rotations(samples)
         known = truth.isfinite().flatten(1).all(1)
         errors = torch.full((len(rows),), torch.nan, dtype=torch.float64)
         errors[known] = symmetric_rotation_error(R[known], truth[known], _HALF_TURN[:0])
@@ -147,8 +173,13 @@ class Benchmark(ABC):
         return {}
 
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
-        """Scores of the results ``rows``, none of them skipped: of all, of subsets, and of each group."""
-        numbers, (name, key), groups = range(len(rows)), self.groups, defaultdict[Any, list[int]](list)
+        """Scores of the results ``rows``, none of them skipped: of all, of subsets, and of each
+        group."""
+        numbers, (name, key), groups = (
+            range(len(rows)),
+            self.groups,
+            defaultdict[Any, list[int]](list),
+        )
         for i, sample in enumerate(samples):
             groups[sample[key]].append(i)
         subsets = {
@@ -158,31 +189,51 @@ class Benchmark(ABC):
         return {
             **self.scores(rows, errors, list(numbers)),
             **({"subsets": subsets} if subsets else {}),
-            name: {str(group): self.scores(rows, errors, groups[group]) for group in sorted(groups)},
+            name: {
+                str(group): self.scores(rows, errors, groups[group]) for group in sorted(groups)
+            },
         }
 
     def rotation_scores(self, errors: Tensor) -> Row:
         """``n``, an accuracy for each threshold, and ``med_err_deg``, of errors (N,) in degrees."""
-        accuracies = {name: metrics.average_recall(errors, (degrees,)) for name, degrees in self.thresholds.items()}
+        accuracies = {
+            name: metrics.average_recall(errors, (degrees,))
+            for name, degrees in self.thresholds.items()
+        }
         return {"n": len(errors), **accuracies, "med_err_deg": metrics.median_error(errors)}
 
-    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
-        """Write one line for each object: its annotation, the estimate, errors, the true angles, ``true_azimuth``..."""
-        names, R = ("azimuth", "elevation", "theta"), estimated_rotations(rows)
+    def write_predictions(
+        self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors
+    ) -> None:
+        """Write one line for each object: its annotation, the estimate, errors, the true angles,
+        ``true_azimuth``..."""
+        names = ("azimuth", "elevation", "theta")
+        R = estimated_rotations(rows)
         lines: list[Sequence[object]] = [self.columns]
         for i, (sample, row) in enumerate(zip(samples, rows, strict=True)):
-            line = {**sample, **row, "seconds": row["seconds"]["register"], "failed": row["message"]}
-            line |= {f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)}
+            line = {
+                **sample,
+                **row,
+                "seconds": row["seconds"]["register"],
+                "failed": row["message"],
+            }
+            line |= {
+                f"true_{name}": float(v) for name, v in zip(names, sample["viewpoint"], strict=True)
+            }
             line |= {name: float(values[i]) for name, values in errors.items()}
             if "rotation" in row:
-                line |= {n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)}
+                line |= {
+                    n: float(v) for n, v in zip(names, viewpoint_from_rotation(R[i]), strict=True)
+                }
                 line["mesh"] = Path(row["mesh"]).name
             lines.append([_cell(line.get(name, "")) for name in self.columns])
         write_csv(path, lines)
 
-    def write_errors(self, path: Path, keys: Sequence[str], samples: Sequence[Row], errors: Errors) -> None:
-        """Write one line for each object with all digits of its errors: ``inf`` for a miss, empty where the truth is
-        unknown."""
+    def write_errors(
+        self, path: Path, keys: Sequence[str], samples: Sequence[Row], errors: Errors
+    ) -> None:
+        """Write one line for each object with all digits of its errors: ``inf`` for a miss, empty
+        where the truth is unknown."""
         lines: list[Sequence[object]] = [("key", "group", *errors)]
         for i, (key, sample) in enumerate(zip(keys, samples, strict=True)):
             values = [float(error[i]) for error in errors.values()]
@@ -191,7 +242,8 @@ class Benchmark(ABC):
         write_csv(path, lines)
 
     def results_name(self, settings: Row) -> str | None:
-        """Name of a copy of the predictions that a benchmark's own tools ask for, if there are such tools."""
+        """Name of a copy of the predictions that a benchmark's own tools ask for, if there are such
+        tools."""
         return None
 
 
@@ -207,7 +259,8 @@ _HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))[No
 
 
 def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
-    """Angles (N,) in degrees between the z axes of models: the least rotation error over all rotations about z.
+    """Angles (N,) in degrees between the z axes of models: the least rotation error over all
+    rotations about z.
 
     Computed from the chord, since ``acos`` loses digits near 0.
     """
@@ -217,15 +270,22 @@ def _axis_error(R: Tensor, truth: Tensor) -> Tensor:
 
 SYMMETRIES: dict[str, tuple[str, Callable[[Tensor, Tensor], Tensor]]] = {
     "bottle": ("any rotation about z", _axis_error),
-    "diningtable": ("half a rotation about z", lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN)),
+    "diningtable": (
+        "half a rotation about z",
+        lambda R, truth: symmetric_rotation_error(R, truth, _HALF_TURN),
+    ),
 }
-"""Classes of PASCAL3D+ whose objects have the same, or nearly the same, appearance from several azimuths."""
+"""Classes of PASCAL3D+ whose objects have the same, or nearly the same, appearance from several
+azimuths."""
 
 
 class Pascal3DBenchmark(Benchmark):
-    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that looks at the box."""
+    """Viewpoints on PASCAL3D+. The method gets no camera: viewpoints are relative to a camera that
+    looks at the box."""
 
-    name, label, mesh = "pascal3d", "{category}/{image_id}/{object_index}", "cad_path"
+    name = "pascal3d"
+    label = "{category}/{image_id}/{object_index}"
+    mesh = "cad_path"
     thresholds: ClassVar = {"acc_pi_6": 30.0, "acc_pi_18": 10.0}
     groups = ("per_class", "category")
     page_error = "symmetric_error_deg"
@@ -237,8 +297,25 @@ class Pascal3DBenchmark(Benchmark):
     }
     flags = ("truncated", "occluded", "difficult")
     columns = (
-        *("image_id", "object_index", "category", "cad_index", "mesh", "azimuth", "elevation", "theta"),
-        *("true_azimuth", "true_elevation", "true_theta", "error_deg", "symmetric_error_deg", "score", "confidence"),
+        *(
+            "image_id",
+            "object_index",
+            "category",
+            "cad_index",
+            "mesh",
+            "azimuth",
+            "elevation",
+            "theta",
+        ),
+        *(
+            "true_azimuth",
+            "true_elevation",
+            "true_theta",
+            "error_deg",
+            "symmetric_error_deg",
+            "score",
+            "confidence",
+        ),
         *(*flags, "failed", "seconds"),
     )
     dataset: Pascal3DPlus
@@ -256,10 +333,15 @@ class Pascal3DBenchmark(Benchmark):
         return tuple(others[k] for k in order[:1])
 
     def settings(self) -> Row:
-        return {**super().settings(), "part": self.dataset.part, "pixel_origin": self.dataset.pixel_origin}
+        return {
+            **super().settings(),
+            "part": self.dataset.part,
+            "pixel_origin": self.dataset.pixel_origin,
+        }
 
     def errors(self, samples: Sequence[Row], rows: Sequence[Row]) -> dict[str, Tensor]:
-        R, truth = estimated_rotations(rows), true_rotations(samples)
+        R = estimated_rotations(rows)
+        truth = true_rotations(samples)
         plain = symmetric = super().errors(samples, rows)["error_deg"]
         for category, (_, error) in SYMMETRIES.items():
             mask = torch.tensor([s["category"] == category for s in samples], dtype=torch.bool)
@@ -277,8 +359,8 @@ class Pascal3DBenchmark(Benchmark):
         return {"easy": easy, **{flag: [s[flag] for s in samples] for flag in self.flags}}
 
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
-        """Scores as :meth:`Benchmark.summary`, also as plain means over the classes, and those of easy objects by
-        class, as some tables have them."""
+        """Scores as :meth:`Benchmark.summary`, also as plain means over the classes, and those of
+        easy objects by class, as some tables have them."""
         summary = super().summary(samples, rows, errors)
         easy = self.subsets(samples)["easy"]
         classes = defaultdict[str, list[int]](list)
@@ -286,14 +368,18 @@ class Pascal3DBenchmark(Benchmark):
             if easy[i]:
                 classes[sample["category"]].append(i)
         easy_scores = {name: self.scores(rows, errors, classes[name]) for name in sorted(classes)}
-        summary["subsets"]["easy"] |= {"per_class": easy_scores, "mean_over_classes": mean_scores(easy_scores)}
+        summary["subsets"]["easy"] |= {
+            "per_class": easy_scores,
+            "mean_over_classes": mean_scores(easy_scores),
+        }
         summary["mean_over_classes"] = mean_scores(summary["per_class"])
         summary["symmetries"] = {name: text for name, (text, _) in SYMMETRIES.items()}
         return summary
 
 
 def mean_scores(groups: Mapping[str, Row]) -> Row:
-    """Plain means of the scores of some groups, which may hold scores themselves, and ``n_classes``, their number.
+    """Plain means of the scores of some groups, which may hold scores themselves, and
+    ``n_classes``, their number.
 
     Groups of few objects count as much as others.
     """
@@ -311,24 +397,40 @@ def mean_scores(groups: Mapping[str, Row]) -> Row:
 
 
 class PoseFolderBenchmark(Benchmark):
-    """Viewpoints in folders of the user. The method is given the box and the object's mesh, and no camera.
+    """Viewpoints in folders of the user. The method is given the box and the object's mesh, and no
+    camera.
 
-    Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and ``mean_confidence``; accuracy
-    and errors are those of the ``n_posed`` others.
+    Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and
+    ``mean_confidence``; accuracy and errors are those of the ``n_posed`` others.
     """
 
-    name, label = "web", "{category}/{object_index}"
+    name = "web"
+    label = "{category}/{object_index}"
     columns = (
-        *("category", "object_index", "image_id", "azimuth", "elevation", "theta", "true_azimuth", "true_elevation"),
+        *(
+            "category",
+            "object_index",
+            "image_id",
+            "azimuth",
+            "elevation",
+            "theta",
+            "true_azimuth",
+            "true_elevation",
+        ),
         *("true_theta", "error_deg", "score", "confidence", "reliable", "failed", "seconds"),
     )
     dataset: PoseFolder
 
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
-        """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of all."""
+        """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of
+        all."""
         posed = errors["error_deg"][chosen]
         posed = posed[~posed.isnan()]
-        scores = self.rotation_scores(posed) if len(posed) else dict.fromkeys((*self.thresholds, "med_err_deg"))
+        scores = (
+            self.rotation_scores(posed)
+            if len(posed)
+            else dict.fromkeys((*self.thresholds, "med_err_deg"))
+        )
         confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
         return {
             **scores,
@@ -340,9 +442,13 @@ class PoseFolderBenchmark(Benchmark):
 
 
 class BOPBenchmark(Benchmark):
-    """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera matrix."""
+    """Poses on one BOP dataset. The method gets the box of the whole silhouette and the camera
+    matrix."""
 
-    name, unit, mesh, gives_camera = "bop", "mm", "model_path", True
+    name = "bop"
+    unit = "mm"
+    mesh = "model_path"
+    gives_camera = True
     groups = ("per_object", "obj_id")
     label = "{scene_id}/{image_id}/{instance_index}"
     reports = (*Benchmark.reports, RESULTS_OF_BOP)
@@ -369,7 +475,8 @@ class BOPBenchmark(Benchmark):
                     self.entries[i] = replace(self.entries[i], views=others)
 
     def _views(self, first: int, group: Sequence[int]) -> tuple[View, ...]:
-        """Photographs drawn from those of ``group`` to be registered together with that of the sample ``first``."""
+        """Photographs drawn from those of ``group`` to be registered together with that of the
+        sample ``first``."""
         image = self.samples[first]["image_id"]
         others = [i for i in group if self.samples[i]["image_id"] != image]
         generator = random_numbers(self.protocol, f"views {self.entries[first].label}")
@@ -378,9 +485,13 @@ class BOPBenchmark(Benchmark):
 
     def _other_view(self, first: int, other: int) -> View:
         entry, (one, two) = self.entries[other], (self.samples[i] for i in (first, other))
-        T_one, T_two = one["T_cam_from_world"].double(), two["T_cam_from_world"].double()
-        if not bool((T_one.isfinite() & T_two.isfinite()).all()):  # the object stands still: it is the world
-            T_one, T_two = (transform(s["rotation"].double(), s["translation"].double()) for s in (one, two))
+        T_one = one["T_cam_from_world"].double()
+        T_two = two["T_cam_from_world"].double()
+        # the object stands still: it is the world
+        if not bool((T_one.isfinite() & T_two.isfinite()).all()):
+            T_one, T_two = (
+                transform(s["rotation"].double(), s["translation"].double()) for s in (one, two)
+            )
         assert isinstance(entry.camera, Camera)
         box = None if entry.error else entry.box
         return View(entry.name, entry.photo, box, entry.camera, T_two @ torch.linalg.inv(T_one))
@@ -394,7 +505,9 @@ class BOPBenchmark(Benchmark):
             if "rotation" in row:
                 objects[sample["obj_id"]].append(i)
         for chosen in objects.values():
-            errors[:, chosen] = self._errors_of_one_object([samples[i] for i in chosen], [rows[i] for i in chosen])
+            errors[:, chosen] = self._errors_of_one_object(
+                [samples[i] for i in chosen], [rows[i] for i in chosen]
+            )
         return dict(zip(names, errors, strict=True))
 
     def _errors_of_one_object(self, samples: Sequence[Row], rows: Sequence[Row]) -> Tensor:
@@ -402,19 +515,28 @@ class BOPBenchmark(Benchmark):
         points = torch.from_numpy(load_mesh(path, unit=self.unit).vertices.copy())
         symmetries = symmetry_transforms(info)
         t = torch.tensor([row["translation"] for row in rows], dtype=torch.float64)
-        t_true, K = (torch.stack([s[name].double() for s in samples]) for name in ("translation", "camera_matrix"))
-        R, R_true = estimated_rotations(rows), true_rotations(samples)
-        T, T_true = transform(R, t), transform(R_true, t_true)
+        t_true, K = (
+            torch.stack([s[name].double() for s in samples])
+            for name in ("translation", "camera_matrix")
+        )
+        R = estimated_rotations(rows)
+        R_true = true_rotations(samples)
+        T = transform(R, t)
+        T_true = transform(R_true, t_true)
         rotation = symmetric_rotation_error(R, R_true, symmetries[:, :3, :3])
         add = (metrics.adds_error if len(symmetries) > 1 else metrics.add_error)(T, T_true, points)
         mssd = metrics.mssd_error(T, T_true, points, symmetries=symmetries)
         mspd = metrics.mspd_error(T, T_true, points, K, symmetries=symmetries)
-        width = torch.tensor([row["inputs"]["picture"]["width"] for row in rows], dtype=torch.float64)
-        return torch.stack([rotation, add / info["diameter"], mssd / info["diameter"], mspd / width])
+        width = torch.tensor(
+            [row["inputs"]["picture"]["width"] for row in rows], dtype=torch.float64
+        )
+        return torch.stack(
+            [rotation, add / info["diameter"], mssd / info["diameter"], mspd / width]
+        )
 
     def _scored_model(self, sample: Row) -> tuple[Path, Row]:
-        """The model that errors are of, with its diameter and symmetries: that of ``models_eval``, as the BOP challenge
-        has it, where there is one."""
+        """The model that errors are of, with its diameter and symmetries: that of ``models_eval``,
+        as the BOP challenge has it, where there is one."""
         number = sample["obj_id"]
         info: Row = sample["model_info"]
         if number not in self._scored_files:
@@ -422,8 +544,8 @@ class BOPBenchmark(Benchmark):
         return self._scored_files[number], self._scored_infos.get(number, info)
 
     def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
-        """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD, and ``ar_rgb``, the
-        mean of these two."""
+        """Rotation errors up to the symmetries, ADD(-S) recall, average recall of MSSD and MSPD,
+        and ``ar_rgb``, the mean of these two."""
         recalls = {}
         for name in ("add_recall_0.1d", "mssd_ar", "mspd_ar"):
             error, thresholds = self.measures[name]
@@ -433,7 +555,10 @@ class BOPBenchmark(Benchmark):
 
     def summary(self, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> Row:
         folders = {s["obj_id"]: self._scored_model(s)[0].parent.name for s in samples}
-        models = {name: sorted(key for key, folder in folders.items() if folder == name) for name in folders.values()}
+        models = {
+            name: sorted(key for key, folder in folders.items() if folder == name)
+            for name in folders.values()
+        }
         return {**super().summary(samples, rows, errors), "models": models, "vsd": NO_VSD}
 
     def results_name(self, settings: Row) -> str:
@@ -445,42 +570,54 @@ class BOPBenchmark(Benchmark):
     def subsets(self, samples: Sequence[Row]) -> dict[str, list[bool]]:
         return {"unoccluded": [s["visib_fract"] >= UNOCCLUDED for s in samples]}
 
-    def write_predictions(self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors) -> None:
-        """The results file of the BOP challenge, with all digits; it omits objects without an estimate."""
+    def write_predictions(
+        self, path: Path, samples: Sequence[Row], rows: Sequence[Row], errors: Errors
+    ) -> None:
+        """The results file of the BOP challenge, with all digits; it omits objects without an
+        estimate."""
         images = [(s["scene_id"], s["image_id"]) for s in samples]
-        times: dict[tuple[int, int], float] = defaultdict(float)  # BOP wants equal seconds in all lines of an image
+        # BOP wants equal seconds in all lines of an image
+        times: dict[tuple[int, int], float] = defaultdict(float)
         for image, row in zip(images, rows, strict=True):
             times[image] += row["seconds"]["register"]
         lines: list[Sequence[object]] = [("scene_id", "im_id", "obj_id", "score", "R", "t", "time")]
         for image, s, row in zip(images, samples, rows, strict=True):
             if "rotation" in row:
-                R, t = (" ".join(map(str, v)) for v in (chain(*row["rotation"]), row["translation"]))
+                R, t = (
+                    " ".join(map(str, v)) for v in (chain(*row["rotation"]), row["translation"])
+                )
                 lines.append((*image, s["obj_id"], row["score"], R, t, times[image]))
         write_csv(path, lines)
 
 
 def copy_shown(copies: Sequence[Row], row: Row) -> Row:
-    """Of the ``copies`` of an object in a photograph, that which the box of a result overlaps most; the first one if it
-    overlaps none. Where no box is given, each of them is a right answer."""
+    """Of the ``copies`` of an object in a photograph, that which the box of a result overlaps most;
+    the first one if it overlaps none. Where no box is given, each of them is a right answer."""
     if "rotation" not in row:
         return copies[0]
     boxes = torch.stack([copy["box"].double() for copy in copies])
-    overlap = box_iou(boxes, torch.tensor([row["inputs"]["box"]], dtype=torch.float64))[:, 0].nan_to_num(0.0)
+    overlap = box_iou(boxes, torch.tensor([row["inputs"]["box"]], dtype=torch.float64))[
+        :, 0
+    ].nan_to_num(0.0)
     return copies[int(overlap.argmax())]
 
 
 def detection_recall(copies: Sequence[Sequence[Row]], rows: Sequence[Row]) -> Row:
-    """``recall_1``, ``recall_5``, ``recall_20``: fractions of ``n`` objects one of whose annotated ``copies`` is among
-    the best proposals.
+    """``recall_1``, ``recall_5``, ``recall_20``: fractions of ``n`` objects one of whose annotated
+    ``copies`` is among the best proposals.
 
-    Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the whole object. A row
-    that failed has no proposals, unless the object was not found among them. Recalls are None if no box is annotated.
+    Boxes are clipped to the image on both sides: some datasets annotate the visible part, some the
+    whole object. A row that failed has no proposals, unless the object was not found among them.
+    Recalls are None if no box is annotated.
     """
     ranks = []
     for group, row in zip(copies, rows, strict=True):
         if boxes := [copy["box"] for copy in group if bool(copy["box"].isfinite().all())]:
             ranks.append(min(_rank(box, row) for box in boxes))
-    recalls = {f"recall_{k}": sum(rank <= k for rank in ranks) / len(ranks) if ranks else None for k in (1, 5, 20)}
+    recalls = {
+        f"recall_{k}": sum(rank <= k for rank in ranks) / len(ranks) if ranks else None
+        for k in (1, 5, 20)
+    }
     return {"n": len(ranks), **recalls}
 
 
@@ -492,28 +629,37 @@ def _rank(box: Tensor, row: Row) -> float:
     proposals = torch.tensor(boxes, dtype=torch.float64).view(-1, 4)
     picture = row["inputs"]["picture"]
     end = torch.tensor([picture["width"], picture["height"]] * 2, dtype=torch.float64) - 0.5
-    clipped = [torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])]
+    clipped = [
+        torch.minimum(boxes.clamp(min=-0.5), end) for boxes in (proposals, box.double()[None])
+    ]
     right = (box_iou(*clipped)[:, 0] >= MIN_IOU).nonzero()[:, 0]
     return float(right[0]) + 1 if len(right) else math.inf
 
 
 def same_instances(samples: Sequence[Row]) -> list[list[int]]:
-    """Groups of the samples of a BOP set that show the same instance of an object in photographs of one scene.
+    """Groups of the samples of a BOP set that show the same instance of an object in photographs of
+    one scene.
 
-    Where the poses of the cameras are known, an instance is told by its place in the world. Elsewhere, objects of one
-    kind in the same photograph are told apart by their place in its list.
+    Where the poses of the cameras are known, an instance is told by its place in the world.
+    Elsewhere, objects of one kind in the same photograph are told apart by their place in its list.
     """
     counts = Counter((s["scene_id"], s["obj_id"], s["image_id"]) for s in samples)
     repeated = {key[:2] for key, count in counts.items() if count > 1}
     groups: dict[tuple[int, ...], list[list[int]]] = defaultdict(list)
     worlds = [s["T_cam_from_world"].double() for s in samples]
-    places = [T[:3, :3].mT @ (s["translation"].double() - T[:3, 3]) for T, s in zip(worlds, samples, strict=True)]
+    places = [
+        T[:3, :3].mT @ (s["translation"].double() - T[:3, 3])
+        for T, s in zip(worlds, samples, strict=True)
+    ]
     for i, (sample, place) in enumerate(zip(samples, places, strict=True)):
         kind: tuple[int, ...] = (sample["scene_id"], sample["obj_id"])
         if bool(place.isnan().any()):
             kind = (*kind, sample["instance_index"] if kind in repeated else -1)
         reach = SAME_PLACE * sample["model_info"]["diameter"]
-        near = [group for group in groups[kind] if not float((place - places[group[0]]).norm()) > reach]  # or NaN
+        # or NaN
+        near = [
+            group for group in groups[kind] if not float((place - places[group[0]]).norm()) > reach
+        ]
         if near:
             near[0].append(i)
         else:
@@ -524,7 +670,9 @@ def same_instances(samples: Sequence[Row]) -> list[list[int]]:
 def estimated_rotations(rows: Sequence[Row]) -> Tensor:
     """(N, 3, 3) float64; NaN for rows without an estimate."""
     missing = [[math.nan] * 3] * 3
-    return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(-1, 3, 3)
+    return torch.tensor([row.get("rotation", missing) for row in rows], dtype=torch.float64).view(
+        -1, 3, 3
+    )
 
 
 def true_rotations(samples: Sequence[Row]) -> Tensor:

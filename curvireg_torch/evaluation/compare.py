@@ -20,7 +20,9 @@ Interval = tuple[float, float]
 CONFIDENCE = 0.95
 RESAMPLES = 2000  # of the bootstrap
 SEED = 0
-ADVICE = "docs/evaluation.md; the same 'curvireg evaluate' again writes it without registering anything"
+ADVICE = (
+    "docs/evaluation.md; the same 'curvireg evaluate' again writes it without registering anything"
+)
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Comparison:
     Attributes:
         score: its key in ``summary.json``.
         a, b: its values.
-        a_interval, b_interval: 95 % intervals: Wilson's of a fraction, else by bootstrap over the objects.
+        a_interval, b_interval: 95 % intervals: Wilson's of a fraction, else by bootstrap over the
+            objects.
         difference: b - a, and its paired bootstrap interval.
         wins, losses: objects at which B is better than A, and worse; the others are ties.
         p: of the two-sided sign test.
@@ -78,7 +81,9 @@ def read_run(folder: Path) -> Run:
         errors = {row[0]: _numbers(header[2:], row[2:]) for row in rows}
     except (ValueError, IndexError) as error:
         raise InvalidInputError(f"damaged ({error}); {ADVICE}", subject=path) from error
-    return Run(str(folder), settings["dataset"], {**settings, "protocol": summary.get("protocol")}, errors)
+    return Run(
+        str(folder), settings["dataset"], {**settings, "protocol": summary.get("protocol")}, errors
+    )
 
 
 def _numbers(names: Sequence[str], cells: Sequence[str]) -> dict[str, float]:
@@ -102,9 +107,15 @@ def compare(a: Run, b: Run) -> list[Comparison]:
     measures = DATASETS[a.dataset].scored.measures
     for score, (error, thresholds) in measures.items():
         pair = _paired(a, b, keys, error)
-        successes = [np.mean([errors < threshold for threshold in thresholds], axis=0) for errors in pair]
-        comparisons.append(_compared(score, successes[0], successes[1], np.mean, is_fraction=len(thresholds) == 1))
-    medians = dict.fromkeys(error for error, _ in measures.values() if error in ("error_deg", "rotation"))
+        successes = [
+            np.mean([errors < threshold for threshold in thresholds], axis=0) for errors in pair
+        ]
+        comparisons.append(
+            _compared(score, successes[0], successes[1], np.mean, is_fraction=len(thresholds) == 1)
+        )
+    medians = dict.fromkeys(
+        error for error, _ in measures.values() if error in ("error_deg", "rotation")
+    )
     for error in medians:
         first, second = _paired(a, b, keys, error)
         comparisons.append(_compared("med_err_deg", first, second, np.median, lower_is_better=True))
@@ -116,7 +127,9 @@ def _paired(a: Run, b: Run, keys: Sequence[str], error: str) -> tuple[Array, Arr
     try:
         both = np.array([[run.errors[key][error] for key in keys] for run in (a, b)])
     except KeyError:
-        raise InvalidInputError(f"compare: no column {error} in errors.csv of both runs; {ADVICE}") from None
+        raise InvalidInputError(
+            f"compare: no column {error} in errors.csv of both runs; {ADVICE}"
+        ) from None
     known = ~np.isnan(both).any(axis=0)
     return both[0, known], both[1, known]
 
@@ -138,7 +151,9 @@ def _compared(
     p = float(binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0
     if len(a) == 0:
         unknown = (math.nan, math.nan)
-        return Comparison(score, 0, math.nan, math.nan, unknown, unknown, math.nan, unknown, 0, 0, p)
+        return Comparison(
+            score, 0, math.nan, math.nan, unknown, unknown, math.nan, unknown, 0, 0, p
+        )
     chosen = np.random.default_rng(SEED).integers(0, len(a), (RESAMPLES, len(a)))
     with np.errstate(invalid="ignore"):  # a miss has an infinite error, and a median may be one
         first = np.array([summarise(a[some]) for some in chosen])
@@ -169,7 +184,9 @@ def _quantiles(values: Array) -> Interval:
 
 
 def _wilson(successes: Array) -> Interval:
-    interval = binomtest(int(successes.sum()), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
+    interval = binomtest(int(successes.sum()), len(successes)).proportion_ci(
+        CONFIDENCE, method="wilson"
+    )
     return float(interval.low), float(interval.high)
 
 
@@ -178,16 +195,26 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     only = [len(run.errors.keys() - other.errors.keys()) for run, other in ((a, b), (b, a))]
     common = len(a.errors.keys() & b.errors.keys())
     lines = [f"A {a.name}: {_how(a)}", f"B {b.name}: {_how(b)}"]
-    lines.append(f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count")
+    lines.append(
+        f"{common} objects in both; {only[0]} only in A and {only[1]} only in B do not count"
+    )
     lines.append("")
     for each in comparisons:
         digits = _digits(each)
-        values = f"A {_value(each.a, each.a_interval, digits)}   B {_value(each.b, each.b_interval, digits)}"
+        values = (
+            f"A {_value(each.a, each.a_interval, digits)}   B "
+            f"{_value(each.b, each.b_interval, digits)}"
+        )
         difference = _value(each.difference, each.difference_interval, f"+{digits}")
         signs = f"B wins {each.wins}, loses {each.losses}, p {each.p:.2g}"
         lines.append(f"{each.score}: {values}   B - A {difference}   {signs}")
     names = [each.score for each in comparisons]
-    lines += ["", "Markdown:", _markdown("run", "N", names), _markdown("---", "---", ["---"] * len(names))]
+    lines += [
+        "",
+        "Markdown:",
+        _markdown("run", "N", names),
+        _markdown("---", "---", ["---"] * len(names)),
+    ]
     lines += [_markdown(*row) for row in _rows(a, b, comparisons)]
     lines += ["", "LaTeX:", _latex("run", "N", names)]
     lines += [_latex(*row) for row in _rows(a, b, comparisons)]
@@ -198,7 +225,9 @@ def to_document(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     """The comparison as JSON."""
     from .store import to_json
 
-    return to_json({"a": a.name, "b": b.name, "comparisons": [asdict(each) for each in comparisons]})
+    return to_json(
+        {"a": a.name, "b": b.name, "comparisons": [asdict(each) for each in comparisons]}
+    )
 
 
 def _how(run: Run) -> str:
@@ -228,5 +257,8 @@ def _markdown(name: str, count: str, cells: Sequence[str]) -> str:
 
 
 def _latex(name: str, count: str, cells: Sequence[str]) -> str:
-    escaped = [cell.replace("_", r"\_").replace("%", r"\%").replace("&", r"\&") for cell in (name, count, *cells)]
+    escaped = [
+        cell.replace("_", r"\_").replace("%", r"\%").replace("&", r"\&")
+        for cell in (name, count, *cells)
+    ]
     return f"{' & '.join(escaped)} \\\\"

@@ -28,7 +28,8 @@ from .store import ResultStore, Row, to_json
 __all__ = ["evaluate", "report"]
 
 NOT_EVALUATED = ("other_class", "no_target")
-"""Reasons by which datasets leave out objects that are not to be evaluated; nothing is wrong with these."""
+"""Reasons by which datasets leave out objects that are not to be evaluated; nothing is wrong with
+these."""
 
 SHOWN_EACH = 30  # best objects on the page, and worst ones
 RIGHT_DEG = 30.0  # error of the rotation below which the page calls a pose right
@@ -45,9 +46,9 @@ def evaluate(
 ) -> Row | None:
     """Register the objects of a benchmark and score the results.
 
-    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``errors.csv``, ``summary.json`` and ``index.html``. A second
-    call registers only what is new, or depends on files or settings that have changed. Under ``torchrun``, each process
-    registers a part of the objects.
+    ``out`` gets ``results.jsonl``, ``predictions.csv``, ``errors.csv``, ``summary.json`` and
+    ``index.html``. A second call registers only what is new, or depends on files or settings that
+    have changed. Under ``torchrun``, each process registers a part of the objects.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
@@ -65,8 +66,8 @@ def evaluate(
     Example:
         >>> from curvireg_torch.data import Pascal3DPlus
         >>> from curvireg_torch.evaluation import Pascal3DBenchmark, Protocol
-        >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])            # doctest: +SKIP
-        >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]          # doctest: +SKIP
+        >>> cars = Pascal3DPlus("data/PASCAL3D+_release1.1", categories=["car"])  # doctest: +SKIP
+        >>> evaluate(Pascal3DBenchmark(cars, Protocol()), Path("out"))["acc_pi_6"]  # doctest: +SKIP
     """
     pipeline = pipeline or PRESETS[DEFAULT]
     name = next((known for known, settings in PRESETS.items() if settings is pipeline), "custom")
@@ -76,7 +77,8 @@ def evaluate(
         check_positive(limit, "limit")
     if (out / "results.csv").exists():
         raise InvalidInputError(f"{out}: holds the results of a list; choose another --out")
-    settings = {  # all that results depend on besides their files; --limit and --categories only select objects
+    # all that results depend on besides their files; --limit and --categories only select objects
+    settings = {
         **benchmark.settings(),
         "protocol": str(benchmark.protocol),
         "preset": name,
@@ -88,13 +90,23 @@ def evaluate(
 
     def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
         loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
-        banks = [cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded]
+        banks = [
+            cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False)
+            for mesh in loaded
+        ]
         # Without cameras, the datasets have meshes of similar objects.
         mesh_is = "exact" if benchmark.gives_camera else "similar"
         return Registrar(banks, pipeline=pipeline, renderer=renderer, mesh_is=mesh_is)
 
-    entries = [entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error]
-    how: Row = {"settings": settings, "label": benchmark.name, "progress": progress, "reports": benchmark.reports}
+    entries = [
+        entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error
+    ]
+    how: Row = {
+        "settings": settings,
+        "label": benchmark.name,
+        "progress": progress,
+        "reports": benchmark.reports,
+    }
     files = chain.from_iterable(entry.files for entry in entries)
     source = ["{dataset} {root} {split}".format_map(settings)]
     with output_folder(out, "evaluate", inputs=files, source=source):
@@ -102,10 +114,15 @@ def evaluate(
         return None if store is None else report(benchmark, store, settings, limit)
 
 
-def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None) -> Row:
-    """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the summary."""
+def report(
+    benchmark: Benchmark, store: ResultStore, settings: Row, limit: int | None = None
+) -> Row:
+    """Write ``predictions.csv``, ``index.html`` and ``summary.json`` from results; returns the
+    summary."""
     located = benchmark.protocol.box is None and benchmark.protocol.views == 1
-    skipped = Counter({k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED})
+    skipped = Counter(
+        {k: n for k, n in benchmark.dataset.skipped.items() if k not in NOT_EVALUATED}
+    )
     scored: list[int] = []
     rows: list[Row] = []
     for i in benchmark.selection(limit):
@@ -116,7 +133,8 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
         else:
             scored.append(i)
             rows.append(row)
-    samples, detection = [benchmark.samples[i] for i in scored], {}
+    samples = [benchmark.samples[i] for i in scored]
+    detection = {}
     if located:
         copies = benchmark.copies(samples)
         detection = {"detection": detection_recall(copies, rows)}
@@ -132,7 +150,11 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
         "protocol": settings["protocol"],
         "limit": limit,
         "settings": settings,
-        "versions": {"curvireg_torch": __version__, "python": platform.python_version(), "torch": torch.__version__},
+        "versions": {
+            "curvireg_torch": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        },
         "seconds": {**seconds, "register_each": seconds["register"] / len(rows) if rows else None},
     }
     for name in filter(None, ("predictions.csv", benchmark.results_name(settings))):
@@ -144,23 +166,39 @@ def report(benchmark: Benchmark, store: ResultStore, settings: Row, limit: int |
     return summary
 
 
-def _write_page(benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Sequence[Row], errors: Tensor) -> None:
-    """The best and the worst objects: by error; then those of unknown pose, by confidence; then those that failed."""
+def _write_page(
+    benchmark: Benchmark, out: Path, scored: Sequence[int], rows: Sequence[Row], errors: Tensor
+) -> None:
+    """The best and the worst objects: by error; then those of unknown pose, by confidence; then
+    those that failed."""
     shown = []
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
         number = row.get("confidence")
         confidence = "not calibrated" if number is None else f"confidence {two_decimals(number)}"
         if row["status"] == "failed":
-            kind, caption, rank = "failed", row["message"], (2.0, 0.0)
+            kind = "failed"
+            caption = row["message"]
+            rank = (2.0, 0.0)
         elif math.isnan(error):
-            kind, caption = "reliable" if row["reliable"] else "doubtful", f"pose unknown, {confidence}"
+            kind = "reliable" if row["reliable"] else "doubtful"
+            caption = f"pose unknown, {confidence}"
             rank = 1.0, -(number or 0.0)
         else:
-            kind, caption = "right" if error < RIGHT_DEG else "wrong", f"{error:.1f} degrees off, {confidence}"
+            kind = "right" if error < RIGHT_DEG else "wrong"
+            caption = f"{error:.1f} degrees off, {confidence}"
             rank = 0.0, error
-        name, picture = benchmark.entries[i].key, thumbnail_of(out, row)
-        shown.append(SheetEntry(number=i + 1, name=name, caption=caption, kind=kind, picture=picture, rank=rank))
+        name = benchmark.entries[i].key
+        picture = thumbnail_of(out, row)
+        shown.append(
+            SheetEntry(
+                number=i + 1, name=name, caption=caption, kind=kind, picture=picture, rank=rank
+            )
+        )
     known = [error for error in errors.tolist() if not math.isnan(error)]
-    right, failed = sum(error < RIGHT_DEG for error in known), sum(row["status"] == "failed" for row in rows)
-    title = f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} failed"
+    right = sum(error < RIGHT_DEG for error in known)
+    failed = sum(row["status"] == "failed" for row in rows)
+    title = (
+        f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} "
+        f"failed"
+    )
     write_sheet(out / "index.html", title, shown, table="predictions.csv", each=SHOWN_EACH)

@@ -1,4 +1,5 @@
-"""``python -m curvireg_torch.evaluation.launch WORDS`` is ``torchrun WORDS`` without its traceback and its log.
+"""``python -m curvireg_torch.evaluation.launch WORDS`` is ``torchrun WORDS`` without its traceback
+and its log.
 
 A process that fails has printed its own message.
 """

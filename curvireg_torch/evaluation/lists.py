@@ -24,11 +24,15 @@ from .photograph import Entry
 from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row
 
-BOX, CAMERA = ("x0", "y0", "x1", "y1"), ("fx", "fy", "cx", "cy")
+BOX = ("x0", "y0", "x1", "y1")
+CAMERA = ("fx", "fy", "cx", "cy")
 _REQUIRED = ("photo", *BOX)
 _KNOWN = (*_REQUIRED, *CAMERA, "camera", "mask", "mesh", *PRIOR_OPTIONS)
 
-POSE_COLUMNS = (*("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"), *("tx", "ty", "tz"))
+POSE_COLUMNS = (
+    *("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33"),
+    *("tx", "ty", "tz"),
+)
 """Columns of a pose: the rotation row by row, and the translation."""
 
 RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
@@ -48,12 +52,15 @@ def _entry(
 ) -> Entry:
     """The entry of a row; ``columns`` are the names in the file, by the plain ones."""
     find = found_in(folder)
-    cells, count = _without_empty_end(cells, len(columns)), len(columns)
+    cells = _without_empty_end(cells, len(columns))
+    count = len(columns)
     shown = dict(zip(columns.values(), cells + [""] * count, strict=False))
     values = {name: shown[column].strip() for name, column in columns.items()}
     try:
         if len(cells) != count:
-            raise InvalidInputError(f"{len(cells)} cells, the header has {count}; quote texts with commas")
+            raise InvalidInputError(
+                f"{len(cells)} cells, the header has {count}; quote texts with commas"
+            )
         if not values["photo"]:
             raise InvalidInputError("photo: empty; name a file")
         meshes = (find(values["mesh"]),) if values.get("mesh") else options.meshes
@@ -71,7 +78,9 @@ def _entry(
     return Entry(shown, values["photo"], photo, meshes, box, camera, mask, options.instances, prior)
 
 
-def camera_of(values: Mapping[str, str], find: FindFile, calibrations: Calibrations) -> Camera | None:
+def camera_of(
+    values: Mapping[str, str], find: FindFile, calibrations: Calibrations
+) -> Camera | None:
     """The camera of a row: of numbers, or of a calibration that ``find`` finds by its name."""
     numbers = numbers_of(values, CAMERA)
     if not values.get("camera"):
@@ -102,17 +111,27 @@ def numbers_of(values: Mapping[str, str], names: Sequence[str]) -> tuple[float, 
 def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]:
     """The photographs of the options, which have the same box, camera and limits on the pose.
 
-    A photograph is called by its path as it was given, or that of its folder; a frame of a video by the video's path
-    and its number, as in ``left/cam.avi:000012``. So no two of them share a name. ``every`` n-th frame of videos is
-    taken. Errors are those of :func:`find_photographs`, and of :class:`.Video`.
+    A photograph is called by its path as it was given, or that of its folder; a frame of a video by
+    the video's path and its number, as in ``left/cam.avi:000012``. So no two of them share a name.
+    ``every`` n-th frame of videos is taken. Errors are those of :func:`find_photographs`, and of
+    :class:`.Video`.
     """
-    fours = (BOX, options.box), (CAMERA, None if isinstance(options.camera, Camera) else options.camera)
-    numbers = {name: str(v) for names, four in fours for name, v in zip(names, four or [""] * 4, strict=True)}
+    fours = (
+        (BOX, options.box),
+        (CAMERA, None if isinstance(options.camera, Camera) else options.camera),
+    )
+    numbers = {
+        name: str(v)
+        for names, four in fours
+        for name, v in zip(names, four or [""] * 4, strict=True)
+    }
     entries = []
     for path in options.photos:
         if is_video(path):
             common = options.entry(path)
-            entries += [replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)]
+            entries += [
+                replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)
+            ]
         else:
             entries += [_entry_of(photo, options) for photo in find_photographs(path)]
     return [replace(entry, cells={"photo": entry.name, **numbers}) for entry in entries]
@@ -141,7 +160,8 @@ def video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
 
 
 def find_photographs(path: Path) -> list[Path]:
-    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frame-2 before frame-10; or ``path``."""
+    """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frame-2 before frame-10;
+    or ``path``."""
     if not (path.is_dir() or is_pattern(path)):
         return [path]
     inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
@@ -158,11 +178,12 @@ def _counting_order(path: Path) -> tuple[list[str | int], str]:
 
 
 def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
-    """Read a list of photographs: a CSV file with the columns that docs/results.md describes, in any order.
+    """Read a list of photographs: a CSV file with the columns that docs/results.md describes, in
+    any order.
 
-    Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options. Blank lines, and
-    empty cells beyond the last named column, as spreadsheets write them, do not count. The ``error`` of a row that
-    cannot be used is the reason.
+    Empty cells mean: detect the object, and the guessed camera, meshes and limits of the options.
+    Blank lines, and empty cells beyond the last named column, as spreadsheets write them, do not
+    count. The ``error`` of a row that cannot be used is the reason.
     """
     header, *rows = read_csv(path) or [[]]
     header = _without_empty_end(header, 0)
@@ -175,12 +196,18 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     if len(names) > MAX_LIST_COLUMNS:
         raise InvalidInputError(f"{path}: more than {MAX_LIST_COLUMNS:,} columns; leave some out")
     if twice := sorted({column for column in names if names.count(column) > 1}):
-        raise InvalidInputError(f"{path}: two columns {', '.join(twice) or 'without a name'}; keep one of each")
+        raise InvalidInputError(
+            f"{path}: two columns {', '.join(twice) or 'without a name'}; keep one of each"
+        )
     for column in set(names) - set(_KNOWN):
         if meant := get_close_matches(column, PRIOR_OPTIONS, 1, 0.8):
-            raise InvalidInputError(f"{path}: unknown column {column!r}; rename it to {meant[0]}, or otherwise")
+            raise InvalidInputError(
+                f"{path}: unknown column {column!r}; rename it to {meant[0]}, or otherwise"
+            )
     if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
-        raise InvalidInputError(f"{path}: {', '.join(reserved)}: names of result columns; rename those of the list")
+        raise InvalidInputError(
+            f"{path}: {', '.join(reserved)}: names of result columns; rename those of the list"
+        )
     if not rows:
         raise InvalidInputError(f"{path}: no photographs; give one row for each")
     columns = dict(zip(names, header, strict=True))
@@ -196,7 +223,8 @@ def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of rows with a pose, and with a reliable one; ``failures``: number, name and reason of each other row."""
+    """Numbers of rows with a pose, and with a reliable one; ``failures``: number, name and reason
+    of each other row."""
 
     ok: int
     reliable: int
@@ -204,7 +232,10 @@ class Counts:
 
     def __str__(self) -> str:
         failed = len(self.failures)
-        return f"{self.ok + failed} photographs: {self.ok} ok, {failed} failed, {self.reliable} reliable"
+        return (
+            f"{self.ok + failed} photographs: {self.ok} ok, {failed} failed, {self.reliable} "
+            f"reliable"
+        )
 
 
 def register_list(
@@ -217,38 +248,53 @@ def register_list(
     inputs: Sequence[Path] = (),
     source: Sequence[str] = (),
 ) -> Counts | None:
-    """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and ``index.html``.
+    """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and
+    ``index.html``.
 
-    A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose arguments and errors
-    are the same. ``inputs`` are files besides those of the entries, and ``source`` is what the entries are of, see
-    :func:`.outputs.output_folder`. Returns None in processes that do not write the tables.
+    A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose
+    arguments and errors are the same. ``inputs`` are files besides those of the entries, and
+    ``source`` is what the entries are of, see :func:`.outputs.output_folder`. Returns None in
+    processes that do not write the tables.
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
     if (out / "summary.json").exists():
         raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
     files = chain(inputs, chain.from_iterable(entry.files for entry in usable))
-    how: dict[str, Any] = {"settings": settings, "label": "register", "progress": progress, "reports": REPORTS}
+    how: dict[str, Any] = {
+        "settings": settings,
+        "label": "register",
+        "progress": progress,
+        "reports": REPORTS,
+    }
     with output_folder(out, "register several", inputs=files, source=source):
         store = run_entries(usable, out, open_registrar, **how)
         return None if store is None else _write_tables(entries, out, store)
 
 
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:
-    shown, failures = [], []
+    shown = []
+    failures = []
     more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
     lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
     for entry, row in zip(entries, _rows(entries, store), strict=True):
-        number, message = row["row"], row["message"]
-        reliable, confidence = row.get("reliable", False), row.get("confidence") or 0.0
+        number = row["row"]
+        message = row["message"]
+        reliable = row.get("reliable", False)
+        confidence = row.get("confidence") or 0.0
         kind = "failed" if message else "reliable" if reliable else "doubtful"
-        caption, picture = message or f"confidence {two_decimals(confidence)}, {kind}", thumbnail_of(out, row)
+        caption = message or f"confidence {two_decimals(confidence)}, {kind}"
+        picture = thumbnail_of(out, row)
         rank = bool(message), not reliable, -confidence, number
         shown.append(SheetEntry(number, entry.name, caption, kind, picture, rank))
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
-        lines.append([*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)])
-    counts = Counts(len(shown) - len(failures), sum(shot.kind == "reliable" for shot in shown), tuple(failures))
+        lines.append(
+            [*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)]
+        )
+    counts = Counts(
+        len(shown) - len(failures), sum(shot.kind == "reliable" for shot in shown), tuple(failures)
+    )
     write_sheet(out / "index.html", str(counts), shown, table="results.csv")
     store.rewrite(_rows(entries, store))
     write_csv(out / "results.csv", lines)
@@ -268,4 +314,10 @@ def _result_cells(row: Row) -> list[str]:
         return [row["status"], row["message"], "", "false", *[""] * 12]
     confidence = "" if row["confidence"] is None else str(row["confidence"])
     pose = [*(v for line in row["rotation"] for v in line), *(row["translation"] or [""] * 3)]
-    return ["ok", "; ".join(row["warnings"]), confidence, "true" if row["reliable"] else "false", *map(str, pose)]
+    return [
+        "ok",
+        "; ".join(row["warnings"]),
+        confidence,
+        "true" if row["reliable"] else "false",
+        *map(str, pose),
+    ]

@@ -1,7 +1,8 @@
-"""Errors and recalls of 6D poses (ADD, ADD-S, MSSD, MSPD) and of viewpoints, as functions of a whole set.
+"""Errors and recalls of 6D poses (ADD, ADD-S, MSSD, MSPD) and of viewpoints, as functions of a
+whole set.
 
-An average over no items is NaN. A missing estimate, a pose of NaN, has the error ``inf`` and counts as a miss.
-Thresholds are strict: an error equal to the threshold is a miss.
+An average over no items is NaN. A missing estimate, a pose of NaN, has the error ``inf`` and counts
+as a miss. Thresholds are strict: an error equal to the threshold is a miss.
 """
 
 import math
@@ -14,7 +15,14 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..geometry import rotation_error
-from ..utils.checks import check_camera_matrix, check_finite, check_pose, check_rotation, check_symmetries, check_tensor
+from ..utils.checks import (
+    check_camera_matrix,
+    check_finite,
+    check_pose,
+    check_rotation,
+    check_symmetries,
+    check_tensor,
+)
 
 __all__ = [
     "ADD_THRESHOLDS",
@@ -32,7 +40,8 @@ __all__ = [
 BOUNDING_POINTS = 300  # points by which symmetries are compared before all points are
 _CHUNK = 1 << 22  # points transformed at once: 50 MB of float32 coordinates
 ADD_THRESHOLDS = (0.1,)  #: diameters: a pose with a smaller ADD or ADD-S is right
-MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))  #: diameters of BOP's average recall of MSSD
+#: diameters of BOP's average recall of MSSD
+MSSD_THRESHOLDS = tuple(step / 20.0 for step in range(1, 11))
 
 MSPD_THRESHOLDS = tuple(5.0 * step / 640.0 for step in range(1, 11))
 """Image widths of BOP's average recall of MSPD: 5, 10, ..., 50 px times width / 640."""
@@ -62,8 +71,8 @@ def add_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
 def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     """ADD-S: mean over the points x of the distance of ``T_gt x`` to the nearest ``T_est y``.
 
-    Arguments and result are those of :func:`add_error`. Computed in float64 on the CPU with one k-d tree in the model
-    frame, since rigid poses preserve distances.
+    Arguments and result are those of :func:`add_error`. Computed in float64 on the CPU with one k-d
+    tree in the model frame, since rigid poses preserve distances.
 
     Example:
         >>> T = torch.eye(4)[None]
@@ -79,8 +88,11 @@ def adds_error(T_est: Tensor, T_gt: Tensor, points: Tensor) -> Tensor:
     return _inf_unless(valid, torch.tensor(means, dtype=T_est.dtype, device=T_est.device))
 
 
-def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None) -> Tensor:
-    """MSSD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of ``|T_est x - T_gt S x|``.
+def mssd_error(
+    T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tensor | None = None
+) -> Tensor:
+    """MSSD (Hodan et al. 2020): minimum over the symmetries S of the maximum over x of
+    ``|T_est x - T_gt S x|``.
 
     Args:
         T_est, T_gt, points: as in :func:`add_error`.
@@ -99,13 +111,20 @@ def mssd_error(T_est: Tensor, T_gt: Tensor, points: Tensor, *, symmetries: Tenso
 
     def largest(which: Tensor, points: Tensor) -> Tensor:
         moved = difference.flatten(0, 1)[which]
-        return torch.cat([_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)])
+        return torch.cat(
+            [_transform(d, points).norm(dim=1).amax(1) for d in _chunks(moved, points)]
+        )
 
     return _inf_unless(valid, _least_maximum(largest, difference.shape[:2], points))
 
 
 def mspd_error(
-    T_est: Tensor, T_gt: Tensor, points: Tensor, camera_matrix: Tensor, *, symmetries: Tensor | None = None
+    T_est: Tensor,
+    T_gt: Tensor,
+    points: Tensor,
+    camera_matrix: Tensor,
+    *,
+    symmetries: Tensor | None = None,
 ) -> Tensor:
     """MSPD (Hodan et al. 2020): as MSSD, of the points projected into the image.
 
@@ -134,18 +153,23 @@ def mspd_error(
     def largest(which: Tensor, points: Tensor) -> Tensor:
         found = []
         for some in _chunks(which, points):
-            (xy_a, front_a), (xy_b, front_b) = (_project(p.flatten(0, 1)[some], points) for p in (estimated, true))
+            (xy_a, front_a), (xy_b, front_b) = (
+                _project(p.flatten(0, 1)[some], points) for p in (estimated, true)
+            )
             found.append(_inf_unless(front_a & front_b, (xy_a - xy_b).norm(dim=1)).amax(1))
         return torch.cat(found)
 
     return _inf_unless(valid, _least_maximum(largest, true.shape[:2], points))
 
 
-def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor) -> Tensor:
+def _least_maximum(
+    largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[int], points: Tensor
+) -> Tensor:
     """(B,) minima over S symmetries of the largest distance of a point, for a ``shape`` of (B, S).
 
-    ``largest`` maps indices (M,) into the flattened ``shape``, and some points, to the largest distances (M,). A few of
-    the points bound the maximum of all from below; all are compared only where a bound is the least one.
+    ``largest`` maps indices (M,) into the flattened ``shape``, and some points, to the largest
+    distances (M,). A few of the points bound the maximum of all from below; all are compared only
+    where a bound is the least one.
     """
     everything = torch.arange(shape[0] * shape[1], device=points.device)
     distances = largest(everything, points[:: max(1, len(points) // BOUNDING_POINTS)]).view(*shape)
@@ -162,20 +186,25 @@ def _least_maximum(largest: Callable[[Tensor, Tensor], Tensor], shape: Sequence[
 
 
 def average_recall(errors: Tensor, thresholds: Sequence[float]) -> float:
-    """Fraction of the errors (N,) below a threshold, averaged over the thresholds in the same unit; NaN for N = 0.
+    """Fraction of the errors (N,) below a threshold, averaged over the thresholds in the same unit;
+    NaN for N = 0.
 
     With one threshold of 30 or 10 degrees it is Acc(pi/6) or Acc(pi/18).
 
     Example:
-        >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)      # below 0.30, 0.35, 0.40, 0.45 and 0.50
+        >>> # below 0.30, 0.35, 0.40, 0.45 and 0.50
+        >>> average_recall(torch.tensor([0.26]), MSSD_THRESHOLDS)
         0.5
     """
     _check_errors(errors)
-    return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(thresholds)
+    return sum(float((errors < threshold).double().mean()) for threshold in thresholds) / len(
+        thresholds
+    )
 
 
 def _checked(T_est: Tensor, T_gt: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """In the dtype of ``T_est``, missing estimates replaced by the truth; and a mask of valid estimates."""
+    """In the dtype of ``T_est``, missing estimates replaced by the truth; and a mask of valid
+    estimates."""
     check_tensor(T_est, "T_est", (None, 4, 4))
     check_tensor(T_gt, "T_gt", (len(T_est), 4, 4))
     check_tensor(points, "points", (None, 3))
@@ -198,7 +227,8 @@ def _checked_symmetries(symmetries: Tensor | None, like: Tensor) -> Tensor:
 
 
 def _chunks(transforms: Tensor, points: Tensor) -> list[Tensor]:
-    """Split (N, ...) so that at most ``_CHUNK`` points are transformed at once; at least one chunk."""
+    """Split (N, ...) so that at most ``_CHUNK`` points are transformed at once; at least one
+    chunk."""
     step = max(1, _CHUNK // len(points))
     return [transforms[start : start + step] for start in range(0, max(1, len(transforms)), step)]
 
@@ -209,14 +239,18 @@ def _transform(T: Tensor, points: Tensor) -> Tensor:
 
 
 def _project(projections: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, 3, 4) projections -> pixels (N, 2, P), and which points (N, P) are in front of the camera."""
+    """(N, 3, 4) projections -> pixels (N, 2, P), and which points (N, P) are in front of the
+    camera."""
     image = _transform(projections, points)
     front = image[:, 2] > 0
-    return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(1), front
+    return image[:, :2] / torch.where(front, image[:, 2], torch.ones_like(image[:, 2])).unsqueeze(
+        1
+    ), front
 
 
 def median_error(errors: Tensor) -> float:
-    """Median of the errors (N,) (MedErr): the mean of the middle two for an even number, NaN for N = 0.
+    """Median of the errors (N,) (MedErr): the mean of the middle two for an even number, NaN for N
+    = 0.
 
     Example:
         >>> median_error(torch.tensor([40.0, 5.0, 12.0, 170.0]))
@@ -230,9 +264,10 @@ def symmetric_rotation_error(R_est: Tensor, R_gt: Tensor, symmetries: Tensor) ->
     """Rotation error of an object with discrete symmetries: ``min_S angle(R_est, R_gt S)``.
 
     Args:
-        R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing estimate.
-        symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0: the whole group, since products are not
-            formed. The identity is always included.
+        R_est, R_gt: (..., 3, 3), broadcast against each other; NaN in ``R_est`` for a missing
+            estimate.
+        symmetries: (S, 3, 3) rotations of the model onto itself, S >= 0: the whole group, since
+            products are not formed. The identity is always included.
 
     Returns:
         (...) degrees in [0, 180]; ``inf`` for a missing estimate.
@@ -256,7 +291,8 @@ def _check_errors(errors: Tensor) -> None:
     check_tensor(errors, "errors", (None,))
     if bad := int((~(errors >= 0)).sum()):
         raise InvalidInputError(
-            f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing estimate counts as inf"
+            f"errors: expected numbers >= 0, got {bad} that are negative or NaN; a missing "
+            f"estimate counts as inf"
         )
 
 

@@ -1,7 +1,8 @@
 """Options of a registration, each declared once, and the registrar that they ask for.
 
-The command line and the viewer read the declarations, lists those of the limits on the pose. Nothing heavy is imported
-before a file is opened, so that help and mistakes in options appear at once.
+The command line and the viewer read the declarations, lists those of the limits on the pose.
+Nothing heavy is imported before a file is opened, so that help and mistakes in options appear at
+once.
 """
 
 import argparse
@@ -46,7 +47,8 @@ QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by 
 
 
 class Numbers:
-    """Type of an option: finite numbers separated by blanks or commas, one for each name; those in brackets may lack.
+    """Type of an option: finite numbers separated by blanks or commas, one for each name; those in
+    brackets may lack.
 
     Example:
         >>> Numbers("AZIMUTH ELEVATION [THETA]")("300, 20"), Numbers("DEG")("45")
@@ -54,7 +56,8 @@ class Numbers:
     """
 
     def __init__(self, names: str) -> None:
-        self.names, self.most = names, len(names.split())
+        self.names = names
+        self.most = len(names.split())
         self.least = self.most - names.count("[")
 
     def __call__(self, text: str) -> Any:
@@ -63,7 +66,9 @@ class Numbers:
         except ValueError:
             values = ()
         if not self.least <= len(values) <= self.most or not all(map(math.isfinite, values)):
-            raise argparse.ArgumentTypeError(f"expected {self.names}, finite numbers, got {text[:40]!r}")
+            raise argparse.ArgumentTypeError(
+                f"expected {self.names}, finite numbers, got {text[:40]!r}"
+            )
         return values if self.most > 1 else values[0]
 
 
@@ -87,12 +92,14 @@ def camera_option(text: str) -> Any:
     try:
         return Numbers("FX FY CX CY")(text)
     except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; or give FILE (a calibration), exif, or --fov DEG") from None
+        raise argparse.ArgumentTypeError(
+            f"{error}; or give FILE (a calibration), exif, or --fov DEG"
+        ) from None
 
 
 def _option(default: Any, text: str, **how: Any) -> Any:
-    """A field that is an option: its default, its help, and other arguments of ``ArgumentParser.add_argument``;
-    ``flag`` is its name where that is not the field's."""
+    """A field that is an option: its default, its help, and other arguments of
+    ``ArgumentParser.add_argument``; ``flag`` is its name where that is not the field's."""
     return field(default=default, metadata={"help": text, **how})
 
 
@@ -100,100 +107,139 @@ PRIOR_OPTIONS: dict[str, dict[str, Any]] = {
     "azimuth": {"type": Numbers("LOW HIGH"), "help": "counted upwards; 300 60 goes through 0"},
     "elevation": {"type": Numbers("LOW HIGH"), "help": "-90 below to 90 above the object"},
     "theta": {"type": Numbers("LOW HIGH"), "help": "in-plane rotation"},
-    "side": {"choices": SIDE_NAMES, "help": "side that faces the camera, 45 degrees to either side of it"},
+    "side": {
+        "choices": SIDE_NAMES,
+        "help": "side that faces the camera, 45 degrees to either side of it",
+    },
     "near": {"type": Numbers("AZIMUTH ELEVATION [THETA]"), "help": "a viewpoint nearby"},
     "within": {"type": Numbers("DEG"), "help": f"largest angle from --near (default: {WITHIN:g})"},
     "distance": {"type": Numbers("NEAR FAR"), "help": "of the object's centre, in the mesh's unit"},
-    "front": {"choices": UP_AXES, "help": "axis of the mesh file that points out of its front, at azimuth 0"},
+    "front": {
+        "choices": UP_AXES,
+        "help": "axis of the mesh file that points out of its front, at azimuth 0",
+    },
 }
 """What may be known about the pose: options of the command line, and columns of lists."""
 
 
 @dataclass(frozen=True)
 class RegisterOptions:
-    """What to register, and how; names, defaults and help texts are those of ``curvireg register``."""
+    """What to register, and how; names, defaults and help texts are those of
+    ``curvireg register``."""
 
     photos: tuple[Path, ...] = ()  # photographs, folders, patterns or videos
-    meshes: tuple[Path, ...] = ()  # mesh files or banks; of several, each photograph is registered to the best
+    # mesh files or banks; of several, each photograph is registered to the best
+    meshes: tuple[Path, ...] = ()
     box: tuple[float, float, float, float] | None = _option(
-        None, "in px of the photograph; default: the object is detected", type=Numbers("X0 Y0 X1 Y1")
+        None,
+        "in px of the photograph; default: the object is detected",
+        type=Numbers("X0 Y0 X1 Y1"),
     )
     box_format: str | None = _option(
         None,
-        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, height in px; fractions: "
+        "of --box or of a list's boxes: xyxy, corners in px (default); xywh: corner, width, "
+        "height in px; fractions: "
         "corners; yolo: centre, width, height in fractions of the picture",
         choices=BOX_FORMATS,
     )
     boxes: Path | None = _option(
         None,
-        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file of YOLO, or a folder "
+        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file "
+        "of YOLO, or a folder "
         "of these; PATH:LABEL takes one label",
         type=Path,
     )
     camera: Any = _option(  # four numbers, a Camera, or None
         None,
-        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or other tools, whose "
-        "distortion is removed. exif insists on the focal length of the photograph's file (default: this one, if it "
+        "FX FY CX CY in px, or FILE or FILE:NAME, a calibration of OpenCV, ROS, COLMAP, BOP or "
+        "other tools, whose "
+        "distortion is removed. exif insists on the focal length of the photograph's file "
+        "(default: this one, if it "
         "has one; else the focal length is estimated, and the distance with it)",
         type=camera_option,
     )
     mask: Path | None = _option(
         None,
-        "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of --box or beside it",
+        "picture in which the object is white, or opaque; FILE:2 for its label 2; instead of "
+        "--box or beside it",
         type=Path,
     )
     guess: str | float | None = _option(
-        None, "horizontal field of view of the camera, if it is about known", flag="--fov", type=Numbers("DEG")
+        None,
+        "horizontal field of view of the camera, if it is about known",
+        flag="--fov",
+        type=Numbers("DEG"),
     )
     start: Path | None = _option(
         None,
-        "refine this pose; needs no box: result.json, or JSON with rotation and translation or T_cam_from_model, 4 x 4 "
-        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the format has none",
+        "refine this pose; needs no box: result.json, or JSON with rotation and translation or "
+        "T_cam_from_model, 4 x 4 "
+        "numbers, TWO of MegaPose, scene_gt.json:IMAGE_ID of BOP; in the mesh's unit where the "
+        "format has none",
         type=Path,
     )
     start_convention: str | None = _option(
         None,
-        "axes of the camera of --start: opencv, x right, y down, z forward (default); opengl, x right, y up, z back",
+        "axes of the camera of --start: opencv, x right, y down, z forward (default); opengl, x "
+        "right, y up, z back",
         choices=START_CONVENTIONS,
     )
     limits: Mapping[str, Any] | None = None  # on the pose, arguments of PosePrior
     unit: str | None = _option(
         None,
-        "of the mesh file, and of lengths in and out (default: that which the file states, as STEP, IGES, 3MF, Collada "
+        "of the mesh file, and of lengths in and out (default: that which the file states, as "
+        "STEP, IGES, 3MF, Collada "
         "and URDF do; else m; for a BOP scene mm)",
         choices=sorted(UNITS),
     )
-    link: str | None = _option(None, "link of a URDF whose mesh is registered (default: all, joints at zero)")
+    link: str | None = _option(
+        None, "link of a URDF whose mesh is registered (default: all, joints at zero)"
+    )
     textures: Path | None = _option(
-        None, "folder with files that the mesh names and that do not lie beside it", type=Path, metavar="DIR"
+        None,
+        "folder with files that the mesh names and that do not lie beside it",
+        type=Path,
+        metavar="DIR",
     )
     unit_is_given: bool = False  # by the user, who means banks too
     pose: str | None = _option(
         None,
-        "any: no assumption. upright: the mesh's up axis points up in the photograph and the object is seen from 10 "
+        "any: no assumption. upright: the mesh's up axis points up in the photograph and the "
+        "object is seen from 10 "
         "degrees below to 60 above; faster, and right more often where it is true (default: any)",
         choices=("any", "upright"),
     )
     up: str | None = _option(
-        None, "axis of the mesh file that points up, as --up=-y; default: y for glTF, else z", choices=UP_AXES
+        None,
+        "axis of the mesh file that points up, as --up=-y; default: y for glTF, else z",
+        choices=UP_AXES,
     )
     mesh_is: str | None = _option(
         None,
-        "exact: the mesh of this very object. similar: of another one of its kind; answers are then less certain "
+        "exact: the mesh of this very object. similar: of another one of its kind; answers are "
+        "then less certain "
         "(default: exact)",
         choices=MESH_KINDS,
     )
     preset: str | None = _option(
         None,
-        "learned: with networks, the most accurate. classical: nothing learned. fast: the best view, without "
-        f"contour fit. paper: the published method, to the letter (default: that of a bank, else {DEFAULT})",
+        "learned: with networks, the most accurate. classical: nothing learned. fast: the best "
+        "view, without "
+        f"contour fit. paper: the published method, to the letter (default: that of a bank, else "
+        f"{DEFAULT})",
         choices=PRESET_NAMES,
     )
     pipeline: Path | None = _option(None, "JSON of a pipeline, instead of --preset", type=Path)
-    instances: int = _option(1, "without a box: up to so many objects (default: 1)", type=whole_number(1))
+    instances: int = _option(
+        1, "without a box: up to so many objects (default: 1)", type=whole_number(1)
+    )
     field: Path | None = _option(None, "weights of a learned field", type=Path)
-    top: int | None = _option(None, "hypotheses to carry and report (default: 5)", type=whole_number(1))
-    refine: bool = _option(True, "stop at the best view of the bank", flag="--no-refine", action="store_false")
+    top: int | None = _option(
+        None, "hypotheses to carry and report (default: 5)", type=whole_number(1)
+    )
+    refine: bool = _option(
+        True, "stop at the best view of the bank", flag="--no-refine", action="store_false"
+    )
     renderer: str = _option("auto", "default: auto", choices=RENDERER_NAMES)
     device: str = _option("cpu", "device of modules, bank and search (default: cpu)")
     progress: bool = _option(True, "no progress bars", flag="--quiet", action="store_false")
@@ -213,7 +259,11 @@ class RegisterOptions:
         """The pipeline that ``preset``, ``pipeline`` and ``pose`` choose."""
         from ..pipeline import Pipeline, preset_named
 
-        chosen = preset_named(self.preset or DEFAULT) if self.pipeline is None else Pipeline.read(self.pipeline)
+        chosen = (
+            preset_named(self.preset or DEFAULT)
+            if self.pipeline is None
+            else Pipeline.read(self.pipeline)
+        )
         return chosen if self.pose is None else chosen.with_pose_prior(self.pose)
 
     @cached_property
@@ -230,7 +280,8 @@ class RegisterOptions:
         return None if self.boxes is None else BoxFile(self.boxes)
 
     def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Box | None":
-        """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that of a detector."""
+        """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that
+        of a detector."""
         from ..data.box_files import pixel_box
         from ..data.images import photo_size
 
@@ -256,16 +307,23 @@ class RegisterOptions:
         from .photograph import Entry
 
         camera = self.guess if self.camera is None else self.camera
-        camera = Camera(camera_matrix(*camera)) if isinstance(camera, Sequence) and camera != "exif" else camera
+        camera = (
+            Camera(camera_matrix(*camera))
+            if isinstance(camera, Sequence) and camera != "exif"
+            else camera
+        )
         start = self.read_start()
         box = self.box_of(photo)
-        same: dict[str, Any] = {name: getattr(self, name) for name in ("meshes", "mask", "instances")}
+        same: dict[str, Any] = {
+            name: getattr(self, name) for name in ("meshes", "mask", "instances")
+        }
         same |= {"box": box, "start": start, "prior": prior_from_limits(self.limits or {})}
         return Entry(name=str(photo), photo=photo, camera=camera, **same)
 
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None means: not given."""
+    """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None
+    means: not given."""
     given = {name: options[name] for name in PRIOR_OPTIONS if options.get(name) is not None}
     side, near, within = (given.pop(name, None) for name in ("side", "near", "within"))
     if side is not None:
@@ -327,7 +385,8 @@ def open_registrar(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> "Registrar":
-    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead of showing a bar."""
+    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead
+    of showing a bar."""
     from ..registration import Registrar
 
     pipeline = options.open_pipeline()
@@ -347,7 +406,10 @@ def open_registrar(
 
 
 def _open_bank(
-    options: RegisterOptions, mesh: Path, pipeline: "Pipeline", progress: bool | Callable[[str, int, int], object]
+    options: RegisterOptions,
+    mesh: Path,
+    pipeline: "Pipeline",
+    progress: bool | Callable[[str, int, int], object],
 ) -> "ViewBank":
     from ..matching import ViewBank, cached_bank
 
@@ -357,7 +419,11 @@ def _open_bank(
     bank = ViewBank.load(mesh)
     check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
     if options.pose not in (None, bank.pipeline.views.pose):
-        built = "given views" if bank.pipeline.views.pose == "given" else f"--pose {bank.pipeline.views.pose}"
+        built = (
+            "given views"
+            if bank.pipeline.views.pose == "given"
+            else f"--pose {bank.pipeline.views.pose}"
+        )
         message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
         raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
     return bank
@@ -372,6 +438,10 @@ def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None
     again = "or build it again with 'curvireg bank'"
     if unit not in (None, built_unit):
         kind = f"with --unit {built_unit}" if built_unit else "without a unit"
-        raise BankError(f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path)
+        raise BankError(
+            f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path
+        )
     if up not in (None, built_up):
-        raise BankError(f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path)
+        raise BankError(
+            f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path
+        )

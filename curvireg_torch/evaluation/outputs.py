@@ -1,8 +1,8 @@
 """The one rule for files that commands write.
 
-No input is ever written or removed, and a command replaces only what it wrote itself: the file ``.curvireg.json`` in
-the folder of the results says which command wrote what. Anything else in the way of a result is an error that names it,
-before any work.
+No input is ever written or removed, and a command replaces only what it wrote itself: the file
+``.curvireg.json`` in the folder of the results says which command wrote what. Anything else in the
+way of a result is an error that names it, before any work.
 """
 
 import json
@@ -49,13 +49,13 @@ def output_folder(
         folder: of the results.
         command: a key of ``FILES``.
         inputs: files that the command reads.
-        source: what the results are of, for results that several runs share: a later run must name all of it again,
-            since it keeps no other rows.
+        source: what the results are of, for results that several runs share: a later run must name
+            all of it again, since it keeps no other rows.
         more: names of further files.
 
     Raises:
-        InvalidInputError: a file in the way that is an input, or that this command did not write; or results of
-            another source.
+        InvalidInputError: a file in the way that is an input, or that this command did not write;
+            or results of another source.
         OutputError: the folder cannot be written to.
 
     Of several processes that share the results, the first one checks.
@@ -72,7 +72,9 @@ def output_folder(
         _check_owner(path, command, written)
     lost = [name for name in before.get("source", ()) if name not in source]
     if lost and source and in_the_way:
-        raise InvalidInputError(f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}")
+        raise InvalidInputError(
+            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}"
+        )
     check_writable(folder, "--out")
     kept = list(source or before.get("source", ()))
     _mark(folder, command, names, kept)
@@ -84,14 +86,17 @@ def output_folder(
 
 
 def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> None:
-    """Refuse to write a file that is an input, or that exists without ``mark``, by which this program's own are known.
+    """Refuse to write a file that is an input, or that exists without ``mark``, by which this
+    program's own are known.
 
     The folder is checked too, so that no work is lost.
     """
     if path.exists():
         _check_inputs([path], inputs)
         if not path.is_file() or mark not in path.read_bytes():
-            raise InvalidInputError(f"{path}: exists, and this command did not write it; {ELSEWHERE}")
+            raise InvalidInputError(
+                f"{path}: exists, and this command did not write it; {ELSEWHERE}"
+            )
     check_writable(path.parent, "--out")
 
 
@@ -110,7 +115,9 @@ def _check_inputs(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
         return
     for path in inputs:
         if path.exists() and _identity(path) in identities:
-            raise InvalidInputError(f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}")
+            raise InvalidInputError(
+                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}"
+            )
 
 
 def _identity(path: Path) -> object:
@@ -123,7 +130,11 @@ def _identity(path: Path) -> object:
 
 def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
     """Refuse a file that ``command`` did not write."""
-    owners = [name for name, run in written.items() if any(fnmatch(path.name, pattern) for pattern in run["files"])]
+    owners = [
+        name
+        for name, run in written.items()
+        if any(fnmatch(path.name, pattern) for pattern in run["files"])
+    ]
     if command in owners:
         return
     if owners:
@@ -147,7 +158,9 @@ def _is_run(run: object) -> bool:
     if not isinstance(run, dict):
         return False
     texts = [run.get("files"), run.get("source", [])]
-    return all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in texts)
+    return all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in texts
+    )
 
 
 def _mark(folder: Path, command: str, files: Sequence[str], source: Sequence[str]) -> None:
@@ -158,4 +171,6 @@ def _mark(folder: Path, command: str, files: Sequence[str], source: Sequence[str
         runs[name] = {**run, "files": [file for file in run["files"] if file not in files]}
     runs[command] = {"files": list(files), "source": list(source)}
     if runs != before:
-        write_file(folder / MARKER, (json.dumps({"schema": 1, "commands": runs}, indent=2) + "\n").encode())
+        write_file(
+            folder / MARKER, (json.dumps({"schema": 1, "commands": runs}, indent=2) + "\n").encode()
+        )

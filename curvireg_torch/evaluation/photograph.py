@@ -41,7 +41,8 @@ from .result_files import View, write_result
 
 __all__ = ["RegisteredPhotograph", "register"]
 
-VIEW_DEVIATION = 0.1  # standard deviation of the focal length of a given field of view, as a fraction of it
+# standard deviation of the focal length of a given field of view, as a fraction of it
+VIEW_DEVIATION = 0.1
 THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
 
 
@@ -49,18 +50,22 @@ THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
 class Entry:
     """One object in one photograph, to register."""
 
-    cells: Mapping[str, str] = field(default_factory=dict)  # of a list: the texts of the row by column
+    # of a list: the texts of the row by column
+    cells: Mapping[str, str] = field(default_factory=dict)
     name: str = ""  # as the user calls the photograph
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()  # of several the best is found
     box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
-    camera: Camera | str | float | None = None  # "exif" insists on the file's; or a horizontal field of view in degrees
+    # "exif" insists on the file's; or a horizontal field of view in degrees
+    camera: Camera | str | float | None = None
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
     start: PoseFile | None = None  # the pose that is refined; nothing is searched for
-    views: tuple[View, ...] = ()  # other photographs, found together with this one, whose camera is their world
-    as_stored: bool = False  # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    # other photographs, found together with this one, whose camera is their world
+    views: tuple[View, ...] = ()
+    # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    as_stored: bool = False
     label: str = ""  # of a dataset's object: a name that no other object has
     frame: VideoFrame | None = None  # of the video ``photo``
     error: str = ""  # why the object cannot be registered
@@ -70,9 +75,16 @@ class Entry:
         prior = None if self.prior is None else self.prior.to_dict()
         camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
         given = [self.name, self.box, camera, self.instances, prior]
-        views = [(view.box, view.camera.describe(), view.T_cam_from_world.tolist()) for view in self.views]
+        views = [
+            (view.box, view.camera.describe(), view.T_cam_from_world.tolist())
+            for view in self.views
+        ]
         mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
-        start = None if self.start is None else (self.start.T.tolist(), self.start.unit, self.start.confidence)
+        start = (
+            None
+            if self.start is None
+            else (self.start.T.tolist(), self.start.unit, self.start.confidence)
+        )
         return [*given, start, views, self.as_stored, *mask]
 
     def read(self) -> Photo:
@@ -90,7 +102,8 @@ class Entry:
 
     @property
     def key(self) -> str:
-        """The label, or a digest of the request and the mesh files: equal rows of a list are registered once."""
+        """The label, or a digest of the request and the mesh files: equal rows of a list are
+        registered once."""
         return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
@@ -100,7 +113,8 @@ class RegisteredPhotograph(Registration):
 
     Attributes:
         registrar: of the mesh.
-        image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the object was found.
+        image, box: the photograph, without distortion; (4,) x0, y0, x1, y1 in px in which the
+            object was found.
         document: the content of ``result.json``.
         inputs: files that were read.
     """
@@ -112,7 +126,8 @@ class RegisteredPhotograph(Registration):
     inputs: tuple[Path, ...] = ()
 
     def overlay(self) -> np.ndarray:
-        """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the box."""
+        """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the
+        box."""
         return contour_overlay(self.registrar, self, self.image, self.box)
 
     def plot(self) -> Any:
@@ -120,23 +135,29 @@ class RegisteredPhotograph(Registration):
         return plots.picture(self.overlay())
 
     def save(self, folder: str | PathLike[str]) -> None:
-        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out`` does.
+        """Write ``result.json``, ``overlay.png`` and ``pose.glb`` as ``curvireg register --out``
+        does.
 
         Raises:
-            InvalidInputError: a file in the way that is an input, or no result of this method or that command.
+            InvalidInputError: a file in the way that is an input, or no result of this method or
+                that command.
             OutputError: a file cannot be written.
         """
         with output_folder(Path(folder), "register", inputs=self.inputs):
             self.write(Path(folder))
 
     def write(self, folder: Path) -> None:
-        """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has checked."""
+        """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has
+        checked."""
         write_result(folder, self.document, self.registrar, self, self.image, self.box)
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""
         data = base64.b64encode(jpeg(shrink(self.overlay(), THUMBNAIL_SIDE), 85)).decode()
-        return f'<img alt="contours on the photograph" src="data:image/jpeg;base64,{data}">{super()._repr_html_()}'
+        return (
+            f'<img alt="contours on the photograph" '
+            f'src="data:image/jpeg;base64,{data}">{super()._repr_html_()}'
+        )
 
 
 def register(
@@ -156,16 +177,18 @@ def register(
 
     Args:
         image: a path, a PIL image, an (H, W) or (H, W, 3) RGB array, or a (1 or 3, H, W) tensor.
-        mesh: a mesh or a bank, or the path of one, see :class:`Registrar`; or a registrar, which is faster for several
-            photographs.
+        mesh: a mesh or a bank, or the path of one, see :class:`Registrar`; or a registrar, which is
+            faster for several photographs.
         box: x0, y0, x1, y1 in px; without box and mask the object is searched for.
-        camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a calibration file;
-            "exif" insists on the focal length of the photograph's EXIF data. None: this one, if there is one, or else
-            the focal length is estimated in the photograph; ``result.camera`` tells which.
-        mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of labels.
+        camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a
+            calibration file; "exif" insists on the focal length of the photograph's EXIF data.
+            None: this one, if there is one, or else the focal length is estimated in the
+                photograph; ``result.camera`` tells which.
+        mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of
+            labels.
         prior: limits on the pose.
-        unit, up: of a mesh file, see :func:`load_mesh`; None: "m", and the usual axis. A bank must have been built with
-            those that are given.
+        unit, up: of a mesh file, see :func:`load_mesh`; None: "m", and the usual axis. A bank must
+            have been built with those that are given.
         pipeline: the default is that of :class:`Registrar`.
         progress: show progress while the views of a mesh are rendered, the first time.
 
@@ -186,14 +209,21 @@ def register(
     meshes: tuple[Path, ...] = ()
     if isinstance(image, str | PathLike):
         path = Path(image)
-        name, photo = str(image), read_photo(image)
+        name = str(image)
+        photo = read_photo(image)
     else:
         is_picture = isinstance(image, Image.Image)
-        photo = photo_of_picture(image) if is_picture else Photo(image_item(image, None).image, 1, None, ())
+        photo = (
+            photo_of_picture(image)
+            if is_picture
+            else Photo(image_item(image, None).image, 1, None, ())
+        )
     if isinstance(camera, str | PathLike):
         camera = camera if camera == "exif" else load_camera(camera)
     elif camera is not None and not isinstance(camera, Camera):
-        camera = Camera(camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera)
+        camera = Camera(
+            camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera
+        )
     if isinstance(mesh, str | PathLike):
         meshes = (Path(mesh),)
         if meshes[0].suffix == ".safetensors":
@@ -202,18 +232,29 @@ def register(
         else:
             mesh = load_mesh(mesh, unit=unit, up=up)
     elif unit is not None or up is not None:
-        raise InvalidInputError("unit, up: of a mesh file; what is given as mesh has its own, leave them out")
-    registrar = mesh if isinstance(mesh, Registrar) else Registrar(mesh, pipeline=pipeline, progress=progress)
-    entry = Entry(name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior)
+        raise InvalidInputError(
+            "unit, up: of a mesh file; what is given as mesh has its own, leave them out"
+        )
+    registrar = (
+        mesh
+        if isinstance(mesh, Registrar)
+        else Registrar(mesh, pipeline=pipeline, progress=progress)
+    )
+    entry = Entry(
+        name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior
+    )
     return register_entry(entry, photo, registrar)
 
 
 def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
-    """The photograph and what is known about it; refuses what cannot be used, as before meshes are opened."""
+    """The photograph and what is known about it; refuses what cannot be used, as before meshes are
+    opened."""
     if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
-    item = image_items([photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks)[0]
+    item = image_items(
+        [photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks
+    )[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
     return item
@@ -222,9 +263,11 @@ def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> Ima
 def register_entry(
     entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> RegisteredPhotograph:
-    """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to open.
+    """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to
+    open.
 
-    The ``document`` of the result is the content of ``result.json``, and of a line of ``results.jsonl``.
+    The ``document`` of the result is the content of ``result.json``, and of a line of
+    ``results.jsonl``.
     """
     start = time.perf_counter()
     camera, source = camera_of(entry, photo)
@@ -233,51 +276,70 @@ def register_entry(
     if entry.start is not None:
         start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
         confidences = [entry.start.confidence]
-        results = refine(registrar, [photo.image], camera, [start_pose], start_confidences=confidences)
+        results = refine(
+            registrar, [photo.image], camera, [start_pose], start_confidences=confidences
+        )
     elif entry.views:
         assert camera is not None  # of datasets with cameras only
         first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))
         together, _ = register_views([first, *entry.views], registrar, as_stored=entry.as_stored)
         best, *others = together.hypotheses
-        best = replace(best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix))
+        best = replace(
+            best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix)
+        )
         results = [replace(together, hypotheses=(best, *others))]
     elif entry.box is None and entry.mask is None and entry.instances > 1:
-        results = detect(registrar, [photo.image], camera, instances=entry.instances, prior=entry.prior)[0]
+        results = detect(
+            registrar, [photo.image], camera, instances=entry.instances, prior=entry.prior
+        )[0]
     else:
         boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
         results = registrar([photo.image], boxes, camera, prior=entry.prior, masks=masks)
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
-    box, K = item.box, item.camera_matrix
+    box = item.box
+    K = item.camera_matrix
     if result.detection is not None:
         box = result.detection.box
     elif entry.box is None and entry.mask is None:
         box = projected_box(registrar.of_model(result.model).describer, result.projection)
     document = {
-        **result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}),
+        **result_document(
+            result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
+        ),
         "mesh": str(entry.meshes[result.model]) if entry.meshes else None,
         "inputs": {
             "photo": entry.name,
             "mesh": ", ".join(map(str, entry.meshes)),
             "box": box.tolist(),
-            "camera": None if K is None else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
+            "camera": None
+            if K is None
+            else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
             "camera_source": source,
             "picture": photo.facts(),
         },
         **_camera_document(result.camera, camera and camera.at(item.size)),
     }
     if result.detection is not None:
-        document["detection"] = detection_document([r for r in results if isinstance(r, Registration)])
+        document["detection"] = detection_document(
+            [r for r in results if isinstance(r, Registration)]
+        )
     box = box.double() if result.corrected_box is None else result.corrected_box
     files = entry.files
     return RegisteredPhotograph(
-        **vars(result), registrar=registrar, image=item.image, box=box, document=document, inputs=files
+        **vars(result),
+        registrar=registrar,
+        image=item.image,
+        box=box,
+        document=document,
+        inputs=files,
     )
 
 
 def _camera_document(found: Camera | None, given: Camera | None) -> dict[str, Any]:
-    """The keys ``camera`` and ``camera_source``: the camera found, with the distortion of a ``given`` one."""
+    """The keys ``camera`` and ``camera_source``: the camera found, with the distortion of a
+    ``given`` one."""
     if found is None:
         found = given
     elif given is not None:
@@ -288,21 +350,25 @@ def _camera_document(found: Camera | None, given: Camera | None) -> dict[str, An
 def register_views(
     views: Sequence[View], registrar: Registrar, *, as_stored: bool = False
 ) -> tuple[Registration, list[View]]:
-    """Register several photographs together, see :meth:`.Registrar.register_views`, without their distortion.
+    """Register several photographs together, see :meth:`.Registrar.register_views`, without their
+    distortion.
 
     Returns:
-        The registration; and the photographs with their pixels without distortion, cameras and boxes of these. One
-        that could not be read has no pixels.
+        The registration; and the photographs with their pixels without distortion, cameras and
+        boxes of these. One that could not be read has no pixels.
     """
     seen = []
     for view in views:
         image = view.image
-        with suppress(CurviregError, OSError):  # the registrar reports what cannot be read, and goes on without it
+        # the registrar reports what cannot be read, and goes on without it
+        with suppress(CurviregError, OSError):
             image = read_photo(view.photo, as_stored=as_stored).image if image is None else image
         if image is not None:
             try:
                 camera = view.camera.at((image.shape[-2], image.shape[-1]))
-                straight = undistorted(image, camera, None if view.box is None else torch.tensor(view.box))
+                straight = undistorted(
+                    image, camera, None if view.box is None else torch.tensor(view.box)
+                )
             except CurviregError as error:
                 raise error.with_subject(view.name) from error
             box = None if straight.box is None else straight.box.tolist()
@@ -310,7 +376,8 @@ def register_views(
         seen.append(view)
     images = [view.photo if view.image is None else view.image for view in seen]
     boxes = [None if view.image is None else view.box for view in seen]
-    matrices, poses = torch.stack([v.camera.matrix for v in seen]), torch.stack([v.T_cam_from_world for v in seen])
+    matrices = torch.stack([v.camera.matrix for v in seen])
+    poses = torch.stack([v.T_cam_from_world for v in seen])
     try:
         return registrar.register_views(images, boxes, matrices, poses), seen
     except CurviregError as error:
@@ -319,14 +386,16 @@ def register_views(
 
 
 def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
-    """The camera, or None if it is unknown, and its source; that of a calibration has a size or distortion."""
+    """The camera, or None if it is unknown, and its source; that of a calibration has a size or
+    distortion."""
     given = entry.camera
     if isinstance(given, Camera):
         return given, "file" if given.size or given.distorts else "given"
     if given not in (None, "exif"):
         H, W = photo.image.shape[-2:]
         return Camera(camera_of_view(float(given), (H, W)), focal_deviation=VIEW_DEVIATION), "fov"
-    camera = None if entry.as_stored else photo.camera()  # boxes of datasets come with what is to be known
+    # boxes of datasets come with what is to be known
+    camera = None if entry.as_stored else photo.camera()
     if camera is not None:
         return camera, "exif"
     if given == "exif" or entry.start is not None:

@@ -1,4 +1,5 @@
-"""The conditions of an evaluation: what the method is told about an object, and what of that is drawn at random."""
+"""The conditions of an evaluation: what the method is told about an object, and what of that is
+drawn at random."""
 
 import hashlib
 from collections.abc import Iterable
@@ -18,17 +19,20 @@ class Protocol:
     """The information that the method gets about an object, besides the photograph.
 
     Attributes:
-        cad: "annotated": that CAD. "any": all CADs of the class, the best wins. "other": another CAD of the class,
-            drawn at random.
+        cad: "annotated": that CAD. "any": all CADs of the class, the best wins. "other": another
+            CAD of the class, drawn at random.
         pose: pose prior: "upright" or "any".
-        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the object is detected.
-        hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45 degrees off;
-            "pose:45": the same of the whole rotation; "none".
-        views: photographs of one pose that are registered together, each once as the first; for datasets of cameras.
+        box: 0: as annotated; x > 0 moves each edge at random by up to x of the side; None: the
+            object is detected.
+        hint: "azimuth:45": the azimuth lies within 45 degrees of a value that is itself up to 45
+            degrees off; "pose:45": the same of the whole rotation; "none".
+        views: photographs of one pose that are registered together, each once as the first; for
+            datasets of cameras.
         seed: of the random numbers, which depend on the object's label besides.
 
     Raises:
-        InvalidInputError: an unknown choice, a box outside [0, 0.45], a hint outside (0, 180), or fewer than one view.
+        InvalidInputError: an unknown choice, a box outside [0, 0.45], a hint outside (0, 180), or
+            fewer than one view.
 
     Example:
         >>> protocol = Protocol.parse(["cad=any", "box=0.1"])
@@ -56,11 +60,14 @@ class Protocol:
         if self.seed and str(self) == str(replace(self, seed=0)):
             raise InvalidInputError("protocol: seed: nothing is drawn at random; leave it out")
         if self.views > 1 and self.hint != "none":
-            raise InvalidInputError("protocol: hints are given with one photograph; leave hint or views out")
+            raise InvalidInputError(
+                "protocol: hints are given with one photograph; leave hint or views out"
+            )
 
     @classmethod
     def parse(cls, words: Iterable[str], *, pose: str = "upright") -> "Protocol":
-        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the default of that key."""
+        """Parse words KEY=VALUE; ``box=annotated`` is 0, ``box=none`` is None. ``pose`` is the
+        default of that key."""
         values: dict[str, str | float | int | None] = {"pose": pose}
         named = {"annotated": 0.0, "none": None}
         for word in words:
@@ -81,7 +88,9 @@ class Protocol:
         try:
             degrees = float(text)
         except ValueError as error:
-            raise InvalidInputError(f"hint: expected azimuth:DEGREES or pose:DEGREES, got {self.hint!r}") from error
+            raise InvalidInputError(
+                f"hint: expected azimuth:DEGREES or pose:DEGREES, got {self.hint!r}"
+            ) from error
         check_option(kind, ("azimuth", "pose"), "hint")
         if not 0.0 < degrees < 180.0:
             raise InvalidInputError(f"hint: expected degrees in (0, 180), got {self.hint!r}")
@@ -97,16 +106,22 @@ class Protocol:
 
 
 def perturbed_box(box: Tensor, protocol: Protocol, label: str) -> Tensor:
-    """The box (4,) in px that the method gets for ``label``: edges move by up to ``protocol.box`` of a side."""
+    """The box (4,) in px that the method gets for ``label``: edges move by up to ``protocol.box``
+    of a side."""
     if not protocol.box:
         return box
-    offset = 2.0 * torch.rand(4, generator=random_numbers(protocol, label), dtype=torch.float64) - 1.0
+    offset = (
+        2.0 * torch.rand(4, generator=random_numbers(protocol, label), dtype=torch.float64) - 1.0
+    )
     sides = (box[2:] - box[:2]).repeat(2)
     return (box + protocol.box * offset * sides).to(box.dtype)
 
 
-def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: str) -> PosePrior | None:
-    """The hint about the object ``label``: a range around its true pose moved at random by up to half its width.
+def hint_of_truth(
+    rotation: Tensor, frame: Tensor, protocol: Protocol, label: str
+) -> PosePrior | None:
+    """The hint about the object ``label``: a range around its true pose moved at random by up to
+    half its width.
 
     ``rotation`` (3, 3) is the true one, NaN where it is unknown, ``frame`` that of the mesh, see
     :func:`curvireg_torch.geometry.pose_prior.object_frame`.
@@ -120,7 +135,9 @@ def hint_of_truth(rotation: Tensor, frame: Tensor, protocol: Protocol, label: st
         offset = degrees * (2.0 * torch.rand((), generator=generator, dtype=torch.float64) - 1.0)
         centre = float(viewpoint_from_rotation(R @ frame.mT)[0] + offset)
         return PosePrior(azimuth=((centre - degrees) % 360.0, (centre + degrees) % 360.0))
-    axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+    axis = torch.nn.functional.normalize(
+        torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+    )
     angle = torch.deg2rad(degrees * torch.rand((), generator=generator, dtype=torch.float64))
     return PosePrior(rotation=rotation_from_axis_angle(axis * angle) @ R, within=degrees)
 

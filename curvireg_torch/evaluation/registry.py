@@ -23,8 +23,10 @@ class DatasetSpec:
     example: str  # of ROOT
     pose: str = "any"  # default of the protocol's pose
     category: str = "{category}"  # format of the name of a sample's group
-    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of the class, as add_argument takes them
-    whole: Mapping[str, Any] = field(default_factory=dict)  # options for objects neither occluded nor truncated
+    # of the class, as add_argument takes them
+    options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # options for objects neither occluded nor truncated
+    whole: Mapping[str, Any] = field(default_factory=dict)
 
     def add_arguments(self, parser: Any) -> None:
         """Add ROOT and the options to a parser."""
@@ -37,7 +39,8 @@ class DatasetSpec:
         return {name: getattr(arguments, name) for name in self.options}
 
     def open(self, root: str | PathLike[str], **options: Any) -> Any:
-        """Open the dataset; :class:`CurviregError` if it does not exist, or an option is out of range."""
+        """Open the dataset; :class:`CurviregError` if it does not exist, or an option is out of
+        range."""
         return resolve_name(self.dataset)(root, **options)
 
     @property
@@ -57,8 +60,17 @@ DATASETS: dict[str, DatasetSpec] = {
         options={
             "split": {"default": "val", "help": "name of the image lists (default: val)"},
             "categories": {"nargs": "+", "metavar": "CLASS", "help": "default: all"},
-            "part": {"choices": ("pascal", "imagenet"), "default": "pascal", "help": "default: pascal"},
-            "pixel_origin": {"type": int, "choices": (0, 1), "default": 1, "help": "of the first pixel (default: 1)"},
+            "part": {
+                "choices": ("pascal", "imagenet"),
+                "default": "pascal",
+                "help": "default: pascal",
+            },
+            "pixel_origin": {
+                "type": int,
+                "choices": (0, 1),
+                "default": 1,
+                "help": "of the first pixel (default: 1)",
+            },
         },
         whole={"occluded": False, "truncated": False},
     ),

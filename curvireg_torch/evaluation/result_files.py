@@ -20,7 +20,8 @@ from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .store import to_json
 
-MAX_GLB_FACES = 300_000  # of the largest mesh that is written: viewers are slow with files above 30 MB
+# of the largest mesh that is written: viewers are slow with files above 30 MB
+MAX_GLB_FACES = 300_000
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,21 @@ class View:
 
 
 def write_result(
-    out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, image: Tensor, box: Tensor
+    out: Path,
+    document: dict[str, Any],
+    registrar: Registrar,
+    result: Registration,
+    image: Tensor,
+    box: Tensor,
 ) -> None:
-    """Write the files of a result into the folder ``out``; ``document`` is the content of ``result.json``.
+    """Write the files of a result into the folder ``out``; ``document`` is the content of
+    ``result.json``.
 
-    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`. :class:`OutputError` if a
-    file cannot be written.
+    The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
+    :class:`OutputError` if a file cannot be written.
     """
-    mesh, camera = registrar.of_model(result.model).bank.mesh, document["camera"]
+    mesh = registrar.of_model(result.model).bank.mesh
+    camera = document["camera"]
     distorts = camera is not None and (camera["model"] == "fisheye" or any(camera["distortion"]))
     note = "Distortion of the lens removed." if distorts else ""
     _write(
@@ -56,15 +64,21 @@ def write_result(
 
 
 def write_views(
-    out: Path, document: dict[str, Any], registrar: Registrar, result: Registration, views: Sequence[View]
+    out: Path,
+    document: dict[str, Any],
+    registrar: Registrar,
+    result: Registration,
+    views: Sequence[View],
 ) -> None:
     """Write the files of one pose in several photographs."""
-    faces, arguments = len(registrar.of_model(result.model).bank.mesh.faces), (registrar, result, views)
+    faces = len(registrar.of_model(result.model).bank.mesh.faces)
+    arguments = (registrar, result, views)
     _write(out, document, faces, lambda: views_picture(*arguments), lambda: views_glb(*arguments))
 
 
 def views_picture(registrar: Registrar, result: Registration, views: Sequence[View]) -> bytes:
-    """``overlay.png`` of several photographs: those that could be read, with the contours at the pose."""
+    """``overlay.png`` of several photographs: those that could be read, with the contours at the
+    pose."""
     shown = []
     for view, pose in zip(views, result.views, strict=True):
         if view.image is not None:
@@ -86,11 +100,16 @@ def views_glb(registrar: Registrar, result: Registration, views: Sequence[View])
 
 
 def _write(
-    out: Path, document: dict[str, Any], faces: int, overlay: Callable[[], bytes], scene: Callable[[], bytes]
+    out: Path,
+    document: dict[str, Any],
+    faces: int,
+    overlay: Callable[[], bytes],
+    scene: Callable[[], bytes],
 ) -> None:
     """Write ``result.json``, then the picture and the scene, drawn beside each other."""
     _remove(out)
-    write_file(out / "result.json", to_json(document).encode())  # first: no failure to draw it loses the result
+    # first: no failure to draw it loses the result
+    write_file(out / "result.json", to_json(document).encode())
     files = [("overlay.png", overlay), *([("pose.glb", scene)] if faces <= MAX_GLB_FACES else [])]
 
     def attempt(file: tuple[str, Callable[[], bytes]]) -> Exception | None:
@@ -106,7 +125,8 @@ def _write(
 
 
 def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:
-    """Write the pose as a ``geometry_msgs/PoseStamped`` of ROS in YAML: metres, in the camera's optical frame."""
+    """Write the pose as a ``geometry_msgs/PoseStamped`` of ROS in YAML: metres, in the camera's
+    optical frame."""
     if document["translation"] is None:
         raise InvalidInputError("--format ros: a pose without translation; give a camera")
     w, x, y, z = document["quaternion"]
@@ -125,7 +145,10 @@ pose:
 def write_lost(out: Path, message: str) -> None:
     """Write the ``result.json`` of a refinement that lost the object."""
     _remove(out)
-    write_file(out / "result.json", to_json({"schema": SCHEMA, "status": "lost", "message": message}).encode())
+    write_file(
+        out / "result.json",
+        to_json({"schema": SCHEMA, "status": "lost", "message": message}).encode(),
+    )
 
 
 def _remove(out: Path) -> None:

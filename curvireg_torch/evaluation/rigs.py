@@ -1,4 +1,5 @@
-"""Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and scenes of BOP sets."""
+"""Rigs: photographs of one object from cameras whose poses are known, as CSV, COLMAP models and
+scenes of BOP sets."""
 
 import math
 import os
@@ -25,16 +26,23 @@ from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
 from .photograph import register_views
 from .result_files import View
 
-ROTATION, TRANSLATION, QUATERNION = POSE_COLUMNS[:9], POSE_COLUMNS[9:], ("qw", "qx", "qy", "qz")
-COLUMNS = f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or {' '.join(QUATERNION)}, tx ty tz"
+ROTATION = POSE_COLUMNS[:9]
+TRANSLATION = POSE_COLUMNS[9:]
+QUATERNION = ("qw", "qx", "qy", "qz")
+COLUMNS = (
+    f"photo, {' '.join(BOX)}, {' '.join(CAMERA)} or camera, r11 to r33 or "
+    f"{' '.join(QUATERNION)}, "
+    f"tx ty tz"
+)
 
 
 def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = None) -> list[View]:
-    """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a scene of a BOP set.
+    """Read a rig: a CSV file, a folder of COLMAP with ``images.txt`` and ``cameras.txt``, or a
+    scene of a BOP set.
 
-    docs/results.md describes the columns of the CSV. Of a BOP scene, boxes are those of the object that the name of
-    ``mesh`` numbers, if each photograph shows it once at most. ``find`` finds the photographs and calibrations that the
-    rig names, by default from its own folder on.
+    docs/results.md describes the columns of the CSV. Of a BOP scene, boxes are those of the object
+    that the name of ``mesh`` numbers, if each photograph shows it once at most. ``find`` finds the
+    photographs and calibrations that the rig names, by default from its own folder on.
     """
     folder = path if path.is_dir() else path.parent
     find = find or found_in(folder)
@@ -43,7 +51,9 @@ def read_rig(path: Path, mesh: Path | None = None, *, find: FindFile | None = No
             return _checked(path, _colmap(path, find))
         if (path / "scene_camera.json").is_file():
             return _checked(path, _bop(path, mesh, find))
-        raise InvalidInputError("a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path)
+        raise InvalidInputError(
+            "a folder without images.txt (COLMAP) or scene_camera.json (BOP)", subject=path
+        )
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the rig", subject=path)
     if path.name == "images.txt":
@@ -60,23 +70,35 @@ def _checked(path: Path, rows: Iterator[View]) -> list[View]:
     if not views:
         raise InvalidInputError("no photographs", subject=path)
     if len(views) > MAX_RIG_VIEWS:
-        raise InvalidInputError(f"more than {MAX_RIG_VIEWS:,} photographs; leave some out", subject=path)
+        raise InvalidInputError(
+            f"more than {MAX_RIG_VIEWS:,} photographs; leave some out", subject=path
+        )
     return views
 
 
-def _view(name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any) -> View:
+def _view(
+    name: str, photo: Path, box: Any, camera: Camera | None, rotation: Any, translation: Any
+) -> View:
     """A row; ``rotation`` are 9 numbers, or 4 of a quaternion."""
     try:
         numbers = finite_numbers(rotation, 9) or finite_numbers(rotation, 4)
         t = finite_numbers(translation, 3)
         if numbers is None or t is None:
-            raise InvalidInputError(f"a rotation and a translation are needed; expected columns {COLUMNS}")
+            raise InvalidInputError(
+                f"a rotation and a translation are needed; expected columns {COLUMNS}"
+            )
         if camera is None:
             raise InvalidInputError("expected fx fy cx cy, or camera (a calibration file)")
         R = torch.tensor(numbers, dtype=torch.float64)
         if len(numbers) == 4 and abs(float(R.norm()) - 1.0) > 1e-2:
-            raise InvalidInputError(f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order")
-        R = R.view(3, 3) if len(numbers) == 9 else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
+            raise InvalidInputError(
+                f"expected qw qx qy qz of length 1, got {float(R.norm()):.3g}; check their order"
+            )
+        R = (
+            R.view(3, 3)
+            if len(numbers) == 9
+            else torch.from_numpy(Rotation.from_quat(R.roll(-1).numpy()).as_matrix())
+        )
         T = transform(R, torch.tensor(t, dtype=torch.float64))
         check_pose(T, "the camera's pose")
         return View(name, photo, box, camera, T)
@@ -88,19 +110,25 @@ def _table(cells: Sequence[Sequence[str]], find: FindFile) -> Iterator[View]:
     header, *rows = cells or [[]]
     names = [name.strip().lower() for name in header]
     if twice := sorted({name for name in names if name and names.count(name) > 1}):
-        raise InvalidInputError(f"two columns {', '.join(twice)}; keep one of each", subject="header")
+        raise InvalidInputError(
+            f"two columns {', '.join(twice)}; keep one of each", subject="header"
+        )
     calibrations = Calibrations()
     for number, values in enumerate(rows, start=1):
         row = dict(zip(names, map(str.strip, values), strict=False))
         name = f"row {number}: {row.get('photo', '')}"
         if not row.get("photo"):
-            raise InvalidInputError(f"no photo; expected columns {COLUMNS}", subject=f"row {number}")
+            raise InvalidInputError(
+                f"no photo; expected columns {COLUMNS}", subject=f"row {number}"
+            )
         if beyond := [cell for cell in values[len(names) :] if cell.strip()]:
             raise InvalidInputError(
-                f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas", subject=name
+                f"{beyond[0][:40]!r} is beyond the last column; quote texts with commas",
+                subject=name,
             )
         try:
-            box, camera = numbers_of(row, BOX), camera_of(row, find, calibrations)
+            box = numbers_of(row, BOX)
+            camera = camera_of(row, find, calibrations)
             matrix = numbers_of(row, ROTATION)
             quaternion = numbers_of(row, QUATERNION)
             if matrix and quaternion:
@@ -131,15 +159,17 @@ def _colmap(folder: Path, find: FindFile) -> Iterator[View]:
             raise InvalidInputError(message, subject="images.txt")
         name = words[9].rstrip()
         places = [find(name)]
-        places += [find(str(place / "images" / name)) for place in (folder, *folder.resolve().parents[:3])]
+        places += [
+            find(str(place / "images" / name)) for place in (folder, *folder.resolve().parents[:3])
+        ]
         photo = next(filter(os.path.isfile, places), places[0])
         camera = calibrations.load(f"{folder / 'cameras.txt'}:{words[8]}")
         yield _view(f"image {name}", photo, None, camera, pose[:4], pose[4:])
 
 
 def _without_points(lines: Sequence[str]) -> Iterator[str]:
-    """The lines of ``images.txt`` that name images: COLMAP writes a line of points X Y POINT3D_ID ..., often empty,
-    behind each; other programs leave it out."""
+    """The lines of ``images.txt`` that name images: COLMAP writes a line of points X Y POINT3D_ID
+    ..., often empty, behind each; other programs leave it out."""
     may_be_points = False
     for line in lines:
         if not line.strip() or (may_be_points and _are_points(line)):
@@ -155,13 +185,17 @@ def _are_points(line: str) -> bool:
         numbers = [float(word) for word in words]
     except ValueError:  # a name
         return False
-    return len(numbers) % 3 == 0 and all(number == int(number) for number in numbers[2::3] if math.isfinite(number))
+    return len(numbers) % 3 == 0 and all(
+        number == int(number) for number in numbers[2::3] if math.isfinite(number)
+    )
 
 
 def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
     """Photographs of a scene whose cameras have ``cam_R_w2c`` and ``cam_t_w2c``; lengths in mm."""
     cameras, truths, infos = (
-        read_json(folder / name, dict, "datasets/bop/README.md") if (folder / name).is_file() else {}
+        read_json(folder / name, dict, "datasets/bop/README.md")
+        if (folder / name).is_file()
+        else {}
         for name in ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
     )
     number = re.search(r"obj_(\d+)$", mesh.stem) if mesh is not None else None
@@ -174,11 +208,17 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
         values = camera if isinstance(camera, dict) else {}
         K = finite_numbers(values.get("cam_K"), 9)
         if K is None:
-            raise InvalidInputError("no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}")
+            raise InvalidInputError(
+                "no cam_K of 9 numbers in scene_camera.json", subject=f"image {key}"
+            )
         objects = truths.get(key, [])
         if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
-            raise InvalidInputError("expected a list of objects in scene_gt.json", subject=f"image {key}")
-        mine = [k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])]
+            raise InvalidInputError(
+                "expected a list of objects in scene_gt.json", subject=f"image {key}"
+            )
+        mine = [
+            k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])
+        ]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
         pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
         try:
@@ -200,7 +240,9 @@ def register_rig(
         result, seen = register_views(rig, registrar)
     except CurviregError as error:
         raise InvalidInputError(f"{error}", subject=path) from error
-    document = result_document(result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start})
+    document = result_document(
+        result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
+    )
     document |= {"frame": "world", "inputs": {"rig": str(path), "box": None}}
     for row, view in zip(document["views"], seen, strict=True):
         row |= {"name": view.name, "photo": str(view.photo), "camera": view.camera.describe()}

@@ -12,7 +12,14 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..errors import BankError, CurviregError, InvalidInputError, LostObjectError, MeshError, MissingFileError
+from ..errors import (
+    BankError,
+    CurviregError,
+    InvalidInputError,
+    LostObjectError,
+    MeshError,
+    MissingFileError,
+)
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
 from ..registration.result import SCHEMA, places_document
@@ -23,7 +30,17 @@ from .photograph import Entry, register_entry
 from .store import ResultStore, Row, workers
 
 POSE_SOURCES = (
-    *("data", "filters", "geometry", "matching", "features", "mesh", "registration", "rendering", "terms.py"),
+    *(
+        "data",
+        "filters",
+        "geometry",
+        "matching",
+        "features",
+        "mesh",
+        "registration",
+        "rendering",
+        "terms.py",
+    ),
     *("utils", "errors.py", "pipeline.py"),
 )
 """Parts of the package that results depend on."""
@@ -44,25 +61,31 @@ def run_entries(
     progress: bool = True,
     reports: Sequence[str] = REPORTS,
 ) -> ResultStore | None:
-    """Register the entries, without ``error`` and of different keys, whose results ``out`` does not hold yet.
+    """Register the entries, without ``error`` and of different keys, whose results ``out`` does not
+    hold yet.
 
-    A stored row counts if its digests are the same: that of the photograph's content, and that of the request, which
-    covers ``settings`` (all that every result depends on), the code of this library, the entry's own request and every
-    file of its meshes. Entries of the same meshes follow each other, so that only one bank is in memory, and are
-    registered side by side on torch's threads; each row is on disk as soon as it is known. An input that cannot be used
-    makes a row with ``failed`` as ``status`` and does not stop the others. ``reports``, files that are written from all
-    results, are removed first.
+    A stored row counts if its digests are the same: that of the photograph's content, and that of
+    the request, which covers ``settings`` (all that every result depends on), the code of this
+    library, the entry's own request and every file of its meshes. Entries of the same meshes follow
+    each other, so that only one bank is in memory, and are registered side by side on torch's
+    threads; each row is on disk as soon as it is known. An input that cannot be used makes a row
+    with ``failed`` as ``status`` and does not stop the others. ``reports``, files that are written
+    from all results, are removed first.
 
     Returns:
-        The store, which holds all entries; None in processes that leave the report to the first one.
+        The store, which holds all entries; None in processes that leave the report to the first
+        one.
     """
     common = json.dumps([dict(settings), code_digest(*POSE_SOURCES)], sort_keys=True)
-    photo_digest, digest_of_mesh = cache(file_digest), cache(mesh_digest)
+    photo_digest = cache(file_digest)
+    digest_of_mesh = cache(mesh_digest)
 
     def digests(entry: Entry) -> dict[str, str]:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
         request = text_digest(json.dumps([common, entry.request(), meshes]))
-        photos = [photo_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))]
+        photos = [
+            photo_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))
+        ]
         return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
 
     with workers() as group:
@@ -72,19 +95,31 @@ def run_entries(
                     path.unlink()
         group.wait()
         store = ResultStore(out, group)
-        order = {meshes: place for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))}
+        order = {
+            meshes: place
+            for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))
+        }
         part = group.part(sorted(entries, key=lambda entry: order[entry.meshes]))
-        todo = [(entry, found) for entry in part if not store.is_current(entry.key, found := digests(entry))]
-        with tqdm(desc=label, unit="photo", total=len(part), disable=not (progress and group.rank == 0)) as bar:
+        todo = [
+            (entry, found)
+            for entry in part
+            if not store.is_current(entry.key, found := digests(entry))
+        ]
+        with tqdm(
+            desc=label, unit="photo", total=len(part), disable=not (progress and group.rank == 0)
+        ) as bar:
             bar.update(len(part) - len(todo))
             for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
                 _register_some(list(same), meshes, store, open_registrar, bar)
-                gc.collect(1)  # meshes are in cycles, and too few objects for the collector to look soon
+                # meshes are in cycles, and too few objects for the collector to look soon
+                gc.collect(1)
         group.wait()
         if group.rank:
             return None
         if not store.is_complete({entry.key: digests(entry) for entry in entries}):
-            raise InvalidInputError(f"{out}: a photograph or mesh changed meanwhile; run the same command again")
+            raise InvalidInputError(
+                f"{out}: a photograph or mesh changed meanwhile; run the same command again"
+            )
         store.merge()
         return store
 
@@ -97,7 +132,8 @@ def _register_some(
     bar: "tqdm[Any]",
 ) -> None:
     """Register entries of the same meshes."""
-    lock, start = threading.Lock(), time.perf_counter()
+    lock = threading.Lock()
+    start = time.perf_counter()
     registrar: Registrar | Exception
     try:
         registrar = open_registrar(meshes)
@@ -117,7 +153,9 @@ def _register_some(
     map_on_threads(register_one, range(len(pairs)), device=device)
 
 
-def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_seconds: float) -> Row:
+def _row(
+    entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_seconds: float
+) -> Row:
     """The result of an entry; its thumbnail is on disk before."""
     start = time.perf_counter()
     try:
@@ -132,7 +170,10 @@ def _row(entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_
         seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
         places: Row = {}
         if isinstance(error, LostObjectError) and error.detection is not None:
-            places = {"detection": places_document(error.detection), "inputs": {"picture": photo.facts()}}
+            places = {
+                "detection": places_document(error.detection),
+                "inputs": {"picture": photo.facts()},
+            }
         return failed_row(error, seconds=seconds, **places)
     describer = registrar.of_model(found.model).describer
     write_file(picture, thumbnail(describer, found.projection, found.image, found.box.tolist()))

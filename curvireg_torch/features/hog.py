@@ -11,7 +11,8 @@ from ..filters import operations as ops
 from ..filters.modules import FunctionModule, Positive
 from ..utils.checks import check_fraction, check_integer, check_tensor
 
-MIN_BLOCK_LENGTH = 1e-5  # relative to the longest block of the image; normalisation suppresses shorter ones
+# relative to the longest block of the image; normalisation suppresses shorter ones
+MIN_BLOCK_LENGTH = 1e-5
 
 
 def hog(
@@ -25,22 +26,24 @@ def hog(
 ) -> Tensor:
     """HOG (Dalal and Triggs 2005) of a vector field; one grid of cells covers the whole image.
 
-    Each pixel votes with the length of its vector for the orientation of the vector modulo 180 degrees, distributed
-    linearly over the two nearest bins and the four nearest cells. Blocks of ``block`` x ``block`` cells are normalised
-    by L2-Hys, relative to the strongest block of the image, so the descriptor is invariant to the unit of the field and
-    to contrast.
+    Each pixel votes with the length of its vector for the orientation of the vector modulo 180
+    degrees, distributed linearly over the two nearest bins and the four nearest cells. Blocks of
+    ``block`` x ``block`` cells are normalised by L2-Hys, relative to the strongest block of the
+    image, so the descriptor is invariant to the unit of the field and to contrast.
 
     Args:
-        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have no vote.
+        field: (B, 2, H, W), channel 0 = x, 1 = y, H and W >= grid. Vectors that are not finite have
+            no vote.
         grid: cells along each side.
         bins: orientations over 180 degrees.
         block: cells along the side of a block, <= grid.
         clip: upper limit of L2-Hys in (0, 1]; 1 disables clipping.
-        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable, and checked where it can be read.
+        bin_weights: (bins,) factor >= 0 on every vote for a bin; differentiable, and checked where
+            it can be read.
 
     Returns:
-        (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block column, cell row, cell
-        column, bin; entries in [0, 1]. A field of zeros gives zeros.
+        (B, D), D = (grid - block + 1)^2 block^2 bins = 1764 by default, ordered block row, block
+        column, cell row, cell column, bin; entries in [0, 1]. A field of zeros gives zeros.
 
     Example:
         >>> hog(torch.randn(4, 2, 64, 64)).shape
@@ -50,11 +53,15 @@ def hog(
     clip = _check_options(grid, bins, block, clip)
     H, W = field.shape[-2:]
     if min(H, W) < grid:
-        raise InvalidInputError(f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}")
+        raise InvalidInputError(
+            f"field: expected at least {grid} x {grid} px for grid={grid}, got {H} x {W}"
+        )
     if bin_weights is not None:
         check_tensor(bin_weights, "bin_weights", (bins,))
         if ops.is_host_readable(bin_weights) and not bool((bin_weights >= 0).all()):
-            raise InvalidInputError(f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}")
+            raise InvalidInputError(
+                f"bin_weights: expected factors >= 0, got {bin_weights.tolist()}"
+            )
 
     def layer(field: Tensor) -> ops.Planes:
         votes = _orientation_votes(ops.zero_nonfinite_vectors(field), bins)
@@ -79,9 +86,11 @@ def _check_options(grid: int, bins: int, block: int, clip: float) -> float:
 
 def _orientation_votes(field: Tensor, bins: int) -> Tensor:
     """(B, bins, H, W) vector length of each pixel, distributed over the bins of its orientation."""
-    x, y = field[:, :1], field[:, 1:]
+    x = field[:, :1]
+    y = field[:, 1:]
     length = ops.safe_sqrt(x * x + y * y)
-    # atan2 has no derivative at the origin: use (1, 0) there, by arithmetic, since torch.where takes ten times as long.
+    # atan2 has no derivative at the origin: use (1, 0) there, by arithmetic, since torch.where
+    # takes ten times as long.
     angle = torch.atan2(y, x + (length == 0).to(x.dtype))
     position = torch.remainder(angle * (bins / math.pi), bins)  # bin i covers [i, i + 1)
     index = torch.arange(bins, device=field.device, dtype=field.dtype).view(1, -1, 1, 1)
@@ -94,7 +103,8 @@ def _orientation_votes(field: Tensor, bins: int) -> Tensor:
 
 
 def _cell_weights(length: int, grid: int, like: Tensor) -> Tensor:
-    """(grid, length) weight of each pixel in each cell along one axis, divided by the pixels per cell."""
+    """(grid, length) weight of each pixel in each cell along one axis, divided by the pixels per
+    cell."""
     position = (torch.arange(length, device=like.device, dtype=like.dtype) + 0.5) * (grid / length)
     cell = torch.arange(grid, device=like.device, dtype=like.dtype)[:, None]
     return (1.0 - (position - (cell + 0.5)).abs()).clamp(min=0.0) * (grid / length)
@@ -104,15 +114,20 @@ def _normalised_blocks(cells: Tensor, block: int, clip: float) -> Tensor:
     blocks = cells.unfold(2, block, 1).unfold(3, block, 1)  # (B, bins, n, n, block, block)
     blocks = blocks.permute(0, 2, 3, 4, 5, 1).flatten(3)  # (B, n, n, block * block * bins)
     squared = blocks.square().sum(-1, keepdim=True)
-    blocks = blocks / (squared + (MIN_BLOCK_LENGTH**2 * ops.image_maximum(squared) + ops.safe_eps(squared))).sqrt()
+    blocks = (
+        blocks
+        / (
+            squared + (MIN_BLOCK_LENGTH**2 * ops.image_maximum(squared) + ops.safe_eps(squared))
+        ).sqrt()
+    )
     blocks = blocks.clamp(max=clip)
     blocks = blocks / (blocks.square().sum(-1, keepdim=True) + MIN_BLOCK_LENGTH**2).sqrt()
     return blocks.flatten(1)
 
 
 class HOG(FunctionModule):
-    """Module twin of :func:`hog`: (B, 2, H, W) to (B, D), D = ``length``. ``learnable`` makes ``bin_weights`` (bins,),
-    initially 1, a positive parameter; otherwise it is None.
+    """Module twin of :func:`hog`: (B, 2, H, W) to (B, D), D = ``length``. ``learnable`` makes
+    ``bin_weights`` (bins,), initially 1, a positive parameter; otherwise it is None.
 
     Example:
         >>> layer = HOG(grid=4)
@@ -146,7 +161,8 @@ class HOG(FunctionModule):
         return (self.grid - self.block + 1) ** 2 * self.block**2 * self.bins
 
     def rotated_by_180(self, descriptors: Tensor) -> Tensor:
-        """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations are unchanged."""
+        """Descriptors (B, D) of the fields rotated by 180 degrees: cells are permuted, orientations
+        are unchanged."""
         n = self.grid - self.block + 1
         cells = descriptors.view(-1, n, n, self.block, self.block, self.bins)
         return cells.flip(1, 2, 3, 4).flatten(1)
@@ -156,8 +172,9 @@ class HOG(FunctionModule):
 
 
 def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """Feature points: vectors longer than both neighbours along their direction, rounded to 45 degrees as in Canny,
-    restricted to the longest. Ties at the limit of ``fraction`` are all selected; vectors of length 0 never.
+    """Feature points: vectors longer than both neighbours along their direction, rounded to 45
+    degrees as in Canny, restricted to the longest. Ties at the limit of ``fraction`` are all
+    selected; vectors of length 0 never.
 
     Args:
         field: (B, 2, H, W). Vectors with a NaN or infinite component count as 0.
@@ -168,7 +185,7 @@ def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
 
     Example:
         >>> field = torch.zeros(1, 2, 9, 9)
-        >>> field[0, 0, :, 3:6] = torch.tensor([1.0, 2.0, 1.0])          # a ridge along y, pointing along x
+        >>> field[0, 0, :, 3:6] = torch.tensor([1.0, 2.0, 1.0])  # a ridge along y, pointing along x
         >>> field_points(field, fraction=1.0)[0, 0].sum(dim=0).tolist()
         [0, 0, 0, 0, 9, 0, 0, 0, 0]
     """
@@ -179,13 +196,20 @@ def field_points(field: Tensor, *, fraction: float = 0.04) -> Tensor:
 
 
 def strongest_points(response: Tensor, candidates: Tensor, fraction: float) -> Tensor:
-    """Candidates (B, 1, H, W) with the largest response > 0, up to ``fraction`` of the pixels of each image."""
+    """Candidates (B, 1, H, W) with the largest response > 0, up to ``fraction`` of the pixels of
+    each image."""
     check_fraction(fraction, "fraction")
     B, _, H, W = response.shape
     if B == 0:
         return candidates
-    candidates, count = candidates & (response > 0), max(1, int(fraction * H * W))
+    candidates = candidates & (response > 0)
+    count = max(1, int(fraction * H * W))
     if ops.is_host_readable(response) and not bool((candidates.sum(dim=(1, 2, 3)) > count).any()):
         return candidates  # most views have fewer, and topk is slow
-    limit = torch.where(candidates, response, 0.0).flatten(1).topk(count, dim=1, sorted=False).values.amin(dim=1)
+    limit = (
+        torch.where(candidates, response, 0.0)
+        .flatten(1)
+        .topk(count, dim=1, sorted=False)
+        .values.amin(dim=1)
+    )
     return candidates & (response >= limit.view(B, 1, 1, 1))

@@ -1,4 +1,5 @@
-"""The learned field: a network that predicts the curvilinear saliency of depth from a photograph."""
+"""The learned field: a network that predicts the curvilinear saliency of depth from a
+photograph."""
 
 import hashlib
 from pathlib import Path
@@ -17,14 +18,16 @@ from ..utils.files import write_tensors
 from .backbone import assign_weights
 
 WEIGHTS = Path(__file__).with_name("learned_field.safetensors")
-SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"  # of WEIGHTS; other files are refused
+# of WEIGHTS; other files are refused
+SHA256 = "a32e00a1984fa8f54c49a9c0df33ae24538fac0193c3958a40b88a4eaf837892"
 WORK_SIZE = 128  # px, shorter image side in training and inference
 MAX_ASPECT = 8  # of the longer to the shorter side at which an image is still computed at WORK_SIZE
 
 
 def doubled_angle(field: Tensor) -> Tensor:
-    """Map vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t), (B, 2, H, W), so that v and -v become equal. Opposite
-    vectors then add up instead of cancelling, which averaging and learning need."""
+    """Map vectors m (cos t, sin t) to sqrt(m) (cos 2t, sin 2t), (B, 2, H, W), so that v and -v
+    become equal. Opposite vectors then add up instead of cancelling, which averaging and learning
+    need."""
     x, y = ops.at_least_float32(field).unbind(1)
     length = ops.safe_sqrt(x * x + y * y)
     scale = length.clamp(min=1e-12) ** -1.5
@@ -35,17 +38,20 @@ def halved_angle(doubled: Tensor) -> Tensor:
     """Inverse of :func:`doubled_angle`; each vector is in the half plane x >= 0."""
     c, s = ops.at_least_float32(doubled).unbind(1)
     length = ops.safe_sqrt(c * c + s * s)
-    # With m = length^2 and cos 2t = c / length, compute the larger of m |cos t| and m |sin t| without cancellation and
-    # the other from sin 2t = 2 sin t cos t.
+    # With m = length^2 and cos 2t = c / length, compute the larger of m |cos t| and m |sin t|
+    # without cancellation and the other from sin 2t = 2 sin t cos t.
     larger = ops.safe_sqrt(0.5 * length * (length + c.abs()))
     smaller = 0.5 * length * s.abs() / larger.clamp(min=ops.safe_eps(larger))
-    x, y = torch.where(c >= 0, larger, smaller), torch.where(c >= 0, smaller, larger)
+    x = torch.where(c >= 0, larger, smaller)
+    y = torch.where(c >= 0, smaller, larger)
     return (length[:, None] * torch.stack([x, torch.where(s < 0, -y, y)], dim=1)).to(doubled.dtype)
 
 
 def _conv(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False),
+        nn.BatchNorm2d(outputs),
+        nn.ReLU(inplace=True),
     )
 
 
@@ -67,8 +73,8 @@ class FieldNetwork(nn.Module):
         widths: channels at strides 2, 4, 8 and 16.
 
     Shape:
-        Input (B, 3, H, W) in [0, 1], H and W multiples of 16; output (B, 3, H/2, W/2): channels 0 and 1 are the field
-        by :func:`doubled_angle`, channel 2 the logit of the mask.
+        Input (B, 3, H, W) in [0, 1], H and W multiples of 16; output (B, 3, H/2, W/2): channels 0
+        and 1 are the field by :func:`doubled_angle`, channel 2 the logit of the mask.
 
     Example:
         >>> FieldNetwork((4, 4, 8, 8))(torch.rand(1, 3, 64, 48)).shape
@@ -103,8 +109,8 @@ class FieldNetwork(nn.Module):
 
 
 def _without_batch_norm(network: nn.Module) -> None:
-    """Fold every batch normalisation of a network in evaluation into the convolution before it, which saves a sixth of
-    the network's time."""
+    """Fold every batch normalisation of a network in evaluation into the convolution before it,
+    which saves a sixth of the network's time."""
     for name, child in network.named_children():
         _without_batch_norm(child)
         if isinstance(child, nn.Sequential):
@@ -112,7 +118,9 @@ def _without_batch_norm(network: nn.Module) -> None:
             for layer in child:
                 before = layers[-1] if layers else None
                 if isinstance(layer, nn.BatchNorm2d) and isinstance(before, nn.Conv2d):
-                    layers[-1] = fuse_conv_bn_eval(before, layer).requires_grad_(before.weight.requires_grad)
+                    layers[-1] = fuse_conv_bn_eval(before, layer).requires_grad_(
+                        before.weight.requires_grad
+                    )
                 else:
                     layers.append(layer)
             setattr(network, name, nn.Sequential(*layers))
@@ -121,18 +129,20 @@ def _without_batch_norm(network: nn.Module) -> None:
 class LearnedCurvilinearSaliency(nn.Module):
     """Curvilinear saliency of an object's depth, predicted from its photograph.
 
-    The output of a :class:`FieldNetwork` trained on generated scenes only (see ``docs/learned.md``): contours of the
-    object and its parts without texture and background. It replaces :class:`MultiScaleFocusCurves` for crops around one
-    object; it is not a general edge detector. Its ``network`` has no batch normalisation, which is part of the
-    convolutions: to train on, use a ``FieldNetwork``.
+    The output of a :class:`FieldNetwork` trained on generated scenes only (see
+    ``docs/learned.md``): contours of the object and its parts without texture and background. It
+    replaces :class:`MultiScaleFocusCurves` for crops around one object; it is not a general edge
+    detector. Its ``network`` has no batch normalisation, which is part of the convolutions: to
+    train on, use a ``FieldNetwork``.
 
     Args:
         weights: safetensors file of another training; None is the packaged file.
 
     Shape:
-        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0. Computed at a shorter
-        side of ``WORK_SIZE`` px. Missing pixels (NaN or infinite) give 0. Differentiable. The output has the dtype of
-        the input; the network computes in that of its weights, which ``.half()`` and ``.bfloat16()`` convert.
+        Input (B, 1 or 3, H, W) in [0, 1], RGB if 3; output (B, 2, H, W) without unit, x >= 0.
+        Computed at a shorter side of ``WORK_SIZE`` px. Missing pixels (NaN or infinite) give 0.
+        Differentiable. The output has the dtype of the input; the network computes in that of its
+        weights, which ``.half()`` and ``.bfloat16()`` convert.
 
     Raises:
         InvalidInputError: wrong shape or dtype, or a file whose weights do not fit this network.
@@ -150,12 +160,15 @@ class LearnedCurvilinearSaliency(nn.Module):
         super().__init__()
         self.weights = None if weights is None else str(weights)
         path = Path(weights or WEIGHTS)
-        with torch.device("meta"):  # random initial values would advance the global random generator
+        # random initial values would advance the global random generator
+        with torch.device("meta"):
             self.network = FieldNetwork()
         try:
             assign_weights(self.network, _read_weights(path, packaged=weights is None))
         except RuntimeError as error:  # other names or shapes
-            raise InvalidInputError(f"weights: {path} does not hold the weights of FieldNetwork") from error
+            raise InvalidInputError(
+                f"weights: {path} does not hold the weights of FieldNetwork"
+            ) from error
         _without_batch_norm(self.network)
         self.eval()
 
@@ -163,13 +176,15 @@ class LearnedCurvilinearSaliency(nn.Module):
         return self.field_and_mask(image)[0]
 
     def mask(self, image: Tensor) -> Tensor:
-        """(B, 1, H, W) probability that a pixel belongs to the central object, including its occluded parts."""
+        """(B, 1, H, W) probability that a pixel belongs to the central object, including its
+        occluded parts."""
         return self.field_and_mask(image)[1]
 
     def field_and_mask(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Both, from one pass of the network."""
         output = self._network_output(image)
-        field, mask = halved_angle(output[:, :2]).to(image.dtype), output[:, 2:].sigmoid().to(image.dtype)
+        field = halved_angle(output[:, :2]).to(image.dtype)
+        mask = output[:, 2:].sigmoid().to(image.dtype)
         if ops.may_have_missing(image):
             field = field.masked_fill(ops.missing_mask(image).any(dim=1, keepdim=True), 0.0)
         return field, mask
@@ -193,16 +208,21 @@ class LearnedCurvilinearSaliency(nn.Module):
 
 
 def save_weights(network: FieldNetwork, path: Path) -> None:
-    """Write half-precision safetensors atomically. The network is one that was trained, not that of the layer."""
+    """Write half-precision safetensors atomically. The network is one that was trained, not that of
+    the layer."""
     if not any(isinstance(layer, nn.BatchNorm2d) for layer in network.modules()):
-        raise InvalidInputError("network: its batch normalisation is folded; save the FieldNetwork that was trained")
+        raise InvalidInputError(
+            "network: its batch normalisation is folded; save the FieldNetwork that was trained"
+        )
     state = network.state_dict()
     write_tensors(path, {k: v.half() if v.is_floating_point() else v for k, v in state.items()})
 
 
 def _read_weights(path: Path, *, packaged: bool) -> dict[str, Tensor]:
     if not path.is_file():
-        raise MissingFileError(f"weights: {path} does not exist; train it with scripts/training/train_learned_field.py")
+        raise MissingFileError(
+            f"weights: {path} does not exist; train it with scripts/training/train_learned_field.py"
+        )
     content = path.read_bytes()
     if packaged and hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(f"weights: {path} is damaged; install curvireg_torch again")

@@ -1,11 +1,13 @@
 """Images and depth images (B, 1, H, W) to vector fields (B, 2, H, W).
 
-Channel 0 = x, 1 = y; the length is the measure, the direction points across the edge, its sign is arbitrary. Each
-function has a module twin with the same options. The dtype is kept (half types compute in float32). Wrong shapes,
-dtypes, masks and options raise :class:`~curvireg_torch.errors.InvalidInputError`.
+Channel 0 = x, 1 = y; the length is the measure, the direction points across the edge, its sign is
+arbitrary. Each function has a module twin with the same options. The dtype is kept (half types
+compute in float32). Wrong shapes, dtypes, masks and options raise
+:class:`~curvireg_torch.errors.InvalidInputError`.
 
-Grey levels are kornia's. Gaussians and derivatives are own code, which gives the same results: on one CPU thread,
-forward and backward, kornia's take several times as long (``docs/kornia.md`` has the measurements).
+Grey levels are kornia's. Gaussians and derivatives are own code, which gives the same results: on
+one CPU thread, forward and backward, kornia's take several times as long (``docs/kornia.md`` has
+the measurements).
 """
 
 from .curvilinear import DepthCurvilinearSaliency as DepthCurvilinearSaliency

@@ -15,24 +15,31 @@ from .modules import FunctionModule
 MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0  # px, reported where re-blurring does not lower the saliency
 MIN_BLUR = 0.6  # px, about that of the derivative kernel: MFC does not tell sharper edges apart
-MIN_RELATIVE_SALIENCY = 1e-3  # CS relative to the image's largest below which a pixel is noise: 3 % of the contrast
+# CS relative to the image's largest below which a pixel is noise: 3 % of the contrast
+MIN_RELATIVE_SALIENCY = 1e-3
 
 
 def edge_blur(
-    image: Tensor, *, reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0), mode: str = "reblur-image"
+    image: Tensor,
+    *,
+    reblur_sigmas: Sequence[float] = (1.0, 2.0, 3.0, 4.0),
+    mode: str = "reblur-image",
 ) -> Tensor:
-    r"""Blur (standard deviation in px) of the step edge through each pixel, one estimate per re-blurring.
+    r"""Blur (standard deviation in px) of the step edge through each pixel, one estimate per
+    re-blurring.
 
     With :math:`R_i = CS / CS_i` at the edge, where CS is :math:`|\nabla I|^2`:
 
-    - ``"reblur-image"``: :math:`CS_i = |\nabla(I * g_i)|^2`, :math:`R_i = 1 + \sigma_i^2/\sigma^2`, so
-      :math:`s_i = \sigma_i/\sqrt{R_i-1}`;
+    - ``"reblur-image"``: :math:`CS_i = |\nabla(I * g_i)|^2`, :math:`R_i = 1 + \sigma_i^2/\sigma^2`,
+      so :math:`s_i = \sigma_i/\sqrt{R_i-1}`;
     - ``"reblur-saliency"`` (the paper's ``CSmultiscale`` as printed): :math:`CS_i = CS * g_i`,
-      :math:`R_i = \sqrt{1+2\sigma_i^2/\sigma^2}`, so :math:`s_i = \sqrt 2\,\sigma_i/\sqrt{R_i^2-1}`.
+      :math:`R_i = \sqrt{1+2\sigma_i^2/\sigma^2}`, so
+      :math:`s_i = \sqrt 2\,\sigma_i/\sqrt{R_i^2-1}`.
 
-    (The paper prints :math:`R_i = CS_i/CS`, which is below 1 on an edge.) The blur of the derivative kernel, which
-    depends on the direction of the edge, is subtracted. On the centre line of a step edge of 1 to 4 px in any direction
-    the estimate is accurate to 1.5 %; it grows beside it.
+    (The paper prints :math:`R_i = CS_i/CS`, which is below 1 on an edge.) The blur of the
+    derivative kernel, which depends on the direction of the edge, is subtracted. On the centre line
+    of a step edge of 1 to 4 px in any direction the estimate is accurate to 1.5 %; it grows beside
+    it.
 
     Args:
         image: (B, 1, H, W) grey levels, or (B, 3, H, W) RGB. Missing (NaN) pixels give 1000.
@@ -58,8 +65,11 @@ def edge_blur(
     return ops.apply_to_photograph(layer, image, missing_value=MAX_BLUR)
 
 
-def _edge_blur(x: Tensor, gx: Tensor, gy: Tensor, reblur_sigmas: Sequence[float], mode: str) -> list[Tensor]:
-    """Blur of the edge through each pixel of ``x``, whose gradient is (gx, gy), for each re-blurring."""
+def _edge_blur(
+    x: Tensor, gx: Tensor, gy: Tensor, reblur_sigmas: Sequence[float], mode: str
+) -> list[Tensor]:
+    """Blur of the edge through each pixel of ``x``, whose gradient is (gx, gy), for each
+    re-blurring."""
     saliency = ops.squared_length(gx, gy)
     variance, fourth = _difference_moments(gx, saliency)
     blurs = []
@@ -85,9 +95,9 @@ def _edge_blur(x: Tensor, gx: Tensor, gy: Tensor, reblur_sigmas: Sequence[float]
 def _difference_moments(gx: Tensor, saliency: Tensor) -> tuple[Tensor, Tensor]:
     r"""What central differences add to the squared blur of an edge with the gradient g.
 
-    By the series of erf, an edge of blur s has :math:`CS \propto 1/(s^2 + v + e/s^2)` up to the order of 1/s^6, with
-    the variance :math:`v = \frac13 (g_x^4 + g_y^4)/|g|^4` and :math:`e = v^2 - \frac7{90}(g_x^6 + g_y^6)/|g|^6`.
-    Returns v in px^2 and e in px^4.
+    By the series of erf, an edge of blur s has :math:`CS \propto 1/(s^2 + v + e/s^2)` up to the
+    order of 1/s^6, with the variance :math:`v = \frac13 (g_x^4 + g_y^4)/|g|^4` and
+    :math:`e = v^2 - \frac7{90}(g_x^6 + g_y^6)/|g|^6`. Returns v in px^2 and e in px^4.
     """
     along_x = gx * gx / saliency.clamp(min=ops.safe_eps(saliency))
     product = along_x * (1.0 - along_x)  # g_x^2 g_y^2 / |g|^4
@@ -104,20 +114,23 @@ def multiscale_focus_curves(
     mode: str = "reblur-image",
     saliency_weight: float = 1.0,
 ) -> Tensor:
-    r"""MFC (the paper's section "Multi Focus Curves"): edges in focus, the sharpest with the largest length.
+    r"""MFC (the paper's section "Multi Focus Curves"): edges in focus, the sharpest with the
+    largest length.
 
-    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i` exceeds
-    :math:`e^{-n}` at all n-1 scales and its saliency exceeds 0.1 % of the largest in the image, which rejects noise in
-    flat regions. Its value is :math:`1/\max_i s_i` (the paper's ``ratiogradientMerge``, where arg is a misprint): at
-    most 1/s at step edges of any direction (to 0.5 %), where :math:`s^2` is their squared blur plus ``sigma`` squared,
-    and 1/0.6 per px elsewhere.
+    The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i`
+    exceeds :math:`e^{-n}` at all n-1 scales and its saliency exceeds 0.1 % of the largest in the
+    image, which rejects noise in flat regions. Its value is :math:`1/\max_i s_i` (the paper's
+    ``ratiogradientMerge``, where arg is a misprint): at most 1/s at step edges of any direction (to
+    0.5 %), where :math:`s^2` is their squared blur plus ``sigma`` squared, and 1/0.6 per px
+    elsewhere.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
         scales: n >= 2.
         sigma: smoothing in px before all other steps, >= 0.
         mode: of :func:`edge_blur`.
-        saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 1 ranks the views of real photographs best.
+        saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 1 ranks the views of real
+            photographs best.
 
     Returns:
         (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient.
@@ -138,7 +151,9 @@ def multiscale_focus_curves(
         blurs = _edge_blur(x[..., 1:-1, 1:-1], gx, gy, [float(i) for i in range(1, scales)], mode)
         blur = functools.reduce(torch.maximum, blurs)
         focus = blur.clamp(min=MIN_BLUR).reciprocal()
-        retained = (focus > math.exp(-scales)) & (saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency))
+        retained = (focus > math.exp(-scales)) & (
+            saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency)
+        )
         weight = saliency.clamp(min=ops.safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 

@@ -1,4 +1,5 @@
-"""Perona-Malik diffusion, and multi-scale curvilinear saliency (MCS) of photographs over its scale space."""
+"""Perona-Malik diffusion, and multi-scale curvilinear saliency (MCS) of photographs over its scale
+space."""
 
 import math
 
@@ -15,17 +16,24 @@ DIFFUSION_STEP = 0.2  # of the diffusion under MCS
 
 
 def anisotropic_diffusion(
-    image: Tensor, *, iterations: int, kappa: float | Tensor = 0.03, step: float = 0.2, conductance: str = "rational"
+    image: Tensor,
+    *,
+    iterations: int,
+    kappa: float | Tensor = 0.03,
+    step: float = 0.2,
+    conductance: str = "rational",
 ) -> Tensor:
     r"""Perona-Malik diffusion: explicit steps, four neighbours, no flow through the border.
 
     :math:`I \leftarrow I + \mathrm{step} \sum_{n \in N_4} g(\nabla_n I)\,\nabla_n I` with
-    :math:`g = 1/(1 + (d/\kappa)^2)` (``"rational"``) or :math:`g = \exp(-(d/\kappa)^2)` (``"exponential"``).
+    :math:`g = 1/(1 + (d/\kappa)^2)` (``"rational"``) or :math:`g = \exp(-(d/\kappa)^2)`
+    (``"exponential"``).
 
     Args:
         image: (B, C, H, W); channels diffuse independently. NaN pixels are missing and filled.
         iterations: number of steps, >= 0.
-        kappa: difference in grey levels above which an edge is preserved, > 0; a scalar tensor is differentiable.
+        kappa: difference in grey levels above which an edge is preserved, > 0; a scalar tensor is
+            differentiable.
         step: time step in (0, 0.25]; larger steps are unstable.
         conductance: ``"rational"`` or ``"exponential"``.
 
@@ -39,7 +47,8 @@ def anisotropic_diffusion(
     check_tensor(image, "image", (None, None, None, None))
     check_option(conductance, ("rational", "exponential"), "conductance")
     check_integer(iterations, "iterations", least=0)
-    kappa, step = ops.check_scalar(kappa, "kappa"), check_positive(step, "step")
+    kappa = ops.check_scalar(kappa, "kappa")
+    step = check_positive(step, "step")
     if step > 0.25:
         raise InvalidInputError(f"step: expected 0 < step <= 0.25 (stability), got {step}")
 
@@ -49,7 +58,9 @@ def anisotropic_diffusion(
     return ops.apply_in_blocks(layer, ops.at_least_float32(image)).to(image.dtype)
 
 
-def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str) -> Tensor:
+def diffuse(
+    x: Tensor, iterations: int, kappa: float | Tensor, step: float, conductance: str
+) -> Tensor:
     """:func:`anisotropic_diffusion` of checked arguments."""
     for _ in range(iterations):
         p = ops.replicate_pad(x, 1)  # no difference, hence no flow, across the border
@@ -63,7 +74,9 @@ def diffuse(x: Tensor, iterations: int, kappa: float | Tensor, step: float, cond
 
 def _flow(difference: Tensor, kappa: float | Tensor, conductance: str) -> Tensor:
     # The range of a tensor cannot be checked while tracing.
-    scaled = difference * (1.0 / (kappa.clamp(min=1e-6, max=1e6) if isinstance(kappa, Tensor) else kappa))
+    scaled = difference * (
+        1.0 / (kappa.clamp(min=1e-6, max=1e6) if isinstance(kappa, Tensor) else kappa)
+    )
     if conductance == "rational":
         return difference / torch.addcmul(scaled.new_ones(()), scaled, scaled)
     return difference * torch.exp(-scaled.square())
@@ -76,10 +89,12 @@ def multiscale_curvilinear_saliency(
     sigma: float | Tensor = 1.0,
     kappa: float | Tensor = 0.03,
 ) -> Tensor:
-    r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving smoothing.
+    r"""MCS (the paper's section "Multi-Curvilinear Saliency"): edges that survive edge-preserving
+    smoothing.
 
-    The image curvilinear saliency :math:`|\nabla I|^2` of every level is divided by its maximum over the image. The
-    result is the largest of these where *every* level exceeds :math:`e^{-n}`, and 0 elsewhere.
+    The image curvilinear saliency :math:`|\nabla I|^2` of every level is divided by its maximum
+    over the image. The result is the largest of these where *every* level exceeds :math:`e^{-n}`,
+    and 0 elsewhere.
 
     Args:
         image: (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB. Missing (NaN) pixels give 0.
@@ -88,7 +103,8 @@ def multiscale_curvilinear_saliency(
         kappa: of :func:`anisotropic_diffusion`, which smooths the levels.
 
     Returns:
-        (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest value.
+        (B, 2, H, W): length in [0, 1], direction of the gradient at the level with the largest
+        value.
 
     Example:
         >>> step = (torch.arange(32) >= 16).float().expand(1, 1, 32, 32)
@@ -97,7 +113,8 @@ def multiscale_curvilinear_saliency(
         1.0
     """
     check_integer(scales, "scales")
-    checked_sigma, contrast = ops.check_scalar(sigma, "sigma", zero_ok=True), ops.check_scalar(kappa, "kappa")
+    checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    contrast = ops.check_scalar(kappa, "kappa")
 
     def layer(image: Tensor) -> ops.Planes:
         level = image
@@ -108,7 +125,8 @@ def multiscale_curvilinear_saliency(
             level_field, level_saliency = _normalised_saliency(level, checked_sigma)
             # On a CPU, selection by arithmetic is much faster than argmax and gather.
             field = torch.lerp(field, level_field, (level_saliency > saliency).to(field.dtype))
-            saliency, lowest = torch.maximum(saliency, level_saliency), torch.minimum(lowest, level_saliency)
+            saliency = torch.maximum(saliency, level_saliency)
+            lowest = torch.minimum(lowest, level_saliency)
         return (field * (lowest > math.exp(-scales)),)
 
     return ops.apply_to_photograph(layer, image)

@@ -1,4 +1,5 @@
-"""What the layers share: safe arithmetic, blocks of a batch, missing pixels, derivatives, suppression of non-maxima."""
+"""What the layers share: safe arithmetic, blocks of a batch, missing pixels, derivatives,
+suppression of non-maxima."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,7 +14,8 @@ from ..utils.checks import check_colour_image, check_positive, check_tensor
 
 
 def safe_eps(x: Tensor) -> float:
-    """Smallest positive number of x's dtype whose power -1.5, the derivative of ``rsqrt``, is finite with a margin."""
+    """Smallest positive number of x's dtype whose power -1.5, the derivative of ``rsqrt``, is
+    finite with a margin."""
     return math.pow(torch.finfo(x.dtype).tiny, 0.6)
 
 
@@ -31,7 +33,8 @@ def squared_length(x: Tensor, y: Tensor) -> Tensor:
 def full_precision(x: Tensor) -> AbstractContextManager[object]:
     """Disable autocast: a second derivative has no correct digit left in bfloat16."""
     device = x.device.type
-    if device == "meta" or not torch.is_autocast_enabled(device):  # meta has no autocast, and torch says so by an error
+    # meta has no autocast, and torch says so by an error
+    if device == "meta" or not torch.is_autocast_enabled(device):
         return nullcontext()
     return torch.autocast(device, enabled=False)
 
@@ -47,14 +50,17 @@ def image_maximum(x: Tensor) -> Tensor:
 
 
 def is_host_readable(x: Tensor) -> bool:
-    """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a ``torch.func`` call."""
+    """Whether Python can read the values of x at no cost: a CPU tensor, not compiled, not in a
+    ``torch.func`` call."""
     if torch.compiler.is_compiling() or x.device.type != "cpu":
         return False
-    return not torch._C._functorch.is_functorch_wrapped_tensor(x)  # torch has no public test for this
+    # torch has no public test for this
+    return not torch._C._functorch.is_functorch_wrapped_tensor(x)
 
 
 def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> float | Tensor:
-    """Return a positive option, a number or a scalar tensor, whose value is checked where it is readable."""
+    """Return a positive option, a number or a scalar tensor, whose value is checked where it is
+    readable."""
     if not isinstance(value, Tensor):
         return check_positive(value, name, zero_ok=zero_ok)
     check_tensor(value, name, ())
@@ -66,16 +72,20 @@ def check_scalar(value: float | Tensor, name: str, *, zero_ok: bool = False) -> 
 def check_sigmas(sigmas: Sequence[float], name: str) -> list[float]:
     """Return at least one standard deviation, each > 0."""
     if not hasattr(sigmas, "__len__") or len(sigmas) == 0:
-        raise InvalidInputError(f"{name}: expected a sequence of at least one sigma, got {sigmas!r:.40}")
+        raise InvalidInputError(
+            f"{name}: expected a sequence of at least one sigma, got {sigmas!r:.40}"
+        )
     return [check_positive(sigma, name) for sigma in sigmas]
 
 
-Planes = tuple[Tensor, ...]  # channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all
+# channels of a result: several tensors (B, 1, H, W), or one tensor that holds them all
+Planes = tuple[Tensor, ...]
 BLOCK_PIXELS = 2**18  # that a layer gets at once, so that intermediate results stay in the cache
 
 
 def apply_in_blocks(layer: Callable[..., Planes], *tensors: Tensor | None) -> Tensor:
-    """``stack_channels(*layer(*tensors))`` of a layer that treats images independently, in blocks on a CPU."""
+    """``stack_channels(*layer(*tensors))`` of a layer that treats images independently, in blocks
+    on a CPU."""
     x = tensors[0]
     assert x is not None
     if torch.compiler.is_compiling() or x.device.type != "cpu" or x.numel() <= BLOCK_PIXELS:
@@ -93,24 +103,31 @@ def stack_channels(*planes: Tensor) -> Tensor:
     return torch.stack([plane.squeeze(1) for plane in planes], dim=1)
 
 
-MAX_HOLE_LEVELS = 5  # holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean
+# holes of up to 2^5 px are filled from their surroundings, the middle of larger ones with the mean
+MAX_HOLE_LEVELS = 5
 
 
-def apply_to_photograph(layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0) -> Tensor:
-    """Apply ``layer`` to grey levels; missing pixels are filled from their surroundings and give ``missing_value``."""
+def apply_to_photograph(
+    layer: Callable[[Tensor], Planes], image: Tensor, *, missing_value: float = 0.0
+) -> Tensor:
+    """Apply ``layer`` to grey levels; missing pixels are filled from their surroundings and give
+    ``missing_value``."""
     check_colour_image(image)
 
     def on_filled(x: Tensor) -> Planes:
         if not may_have_missing(x):
             return layer(x)
         mask = missing_mask(x)
-        return tuple(torch.where(mask, missing_value, plane) for plane in layer(fill_missing(x, mask)))
+        return tuple(
+            torch.where(mask, missing_value, plane) for plane in layer(fill_missing(x, mask))
+        )
 
     return apply_in_blocks(on_filled, to_grey(at_least_float32(image))).to(image.dtype)
 
 
 def to_grey(image: Tensor) -> Tensor:
-    """(B, 1, H, W) grey levels of (B, 3, H, W) RGB, 0.299 R + 0.587 G + 0.114 B; a grey image is returned unchanged."""
+    """(B, 1, H, W) grey levels of (B, 3, H, W) RGB, 0.299 R + 0.587 G + 0.114 B; a grey image is
+    returned unchanged."""
     if image.shape[1] == 1:
         return image
     from kornia.color import rgb_to_grayscale  # here, because its import takes 0.3 s
@@ -120,7 +137,8 @@ def to_grey(image: Tensor) -> Tensor:
 
 
 def may_have_missing(x: Tensor) -> bool:
-    """False if all of x is known to be finite, at the cost of one sum; always True while tracing."""
+    """False if all of x is known to be finite, at the cost of one sum; always True while
+    tracing."""
     return not is_host_readable(x) or not math.isfinite(float(x.detach().sum()))
 
 
@@ -130,18 +148,21 @@ def missing_mask(x: Tensor) -> Tensor:
 
 
 def fill_missing(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Fill missing pixels of (B, C, H, W), by default those not finite, with the mean of the smallest pyramid cell that
-    has a valid pixel; an image without any becomes 0."""
+    """Fill missing pixels of (B, C, H, W), by default those not finite, with the mean of the
+    smallest pyramid cell that has a valid pixel; an image without any becomes 0."""
     if mask is None:
         if not may_have_missing(x):
             return x
         mask = missing_mask(x)
-    sums, weights = [torch.where(mask, 0.0, x)], [(~mask).to(x.dtype)]
+    sums = [torch.where(mask, 0.0, x)]
+    weights = [(~mask).to(x.dtype)]
     for _ in range(MAX_HOLE_LEVELS):
         sums.append(F.avg_pool2d(sums[-1], 2, ceil_mode=True))
         weights.append(F.avg_pool2d(weights[-1], 2, ceil_mode=True))
     tiny = torch.finfo(x.dtype).tiny
-    fill = sums[-1].sum(dim=(2, 3), keepdim=True) / weights[-1].sum(dim=(2, 3), keepdim=True).clamp(min=tiny)
+    fill = sums[-1].sum(dim=(2, 3), keepdim=True) / weights[-1].sum(dim=(2, 3), keepdim=True).clamp(
+        min=tiny
+    )
     for total, weight in zip(sums[:0:-1], weights[:0:-1], strict=True):
         coarser = fill[..., : weight.shape[-2], : weight.shape[-1]]
         fill = torch.where(weight > 0, total / weight.clamp(min=tiny), coarser)
@@ -157,34 +178,44 @@ def zero_nonfinite_vectors(field: Tensor) -> Tensor:
 
 
 MAX_TENSOR_RADIUS = 16  # px, of the kernel of a sigma that is a tensor: a traced graph reserves it
-MIN_TENSOR_SIGMA = 1e-3  # px, below which a kernel is a single 1 in every dtype and has derivative 0
+# px, below which a kernel is a single 1 in every dtype and has derivative 0
+MIN_TENSOR_SIGMA = 1e-3
 
 
 def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
     """Separable Gaussian smoothing of (B, C, H, W) with replicated borders; NaN spreads.
 
     Args:
-        sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable. The kernel is cut at
-            ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are clamped to 0.001 px, not checked.
+        sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable.
+            The kernel is cut at ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are
+            clamped to 0.001 px, not checked.
     """
-    return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(x.dtype)
+    return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(
+        x.dtype
+    )
 
 
 def smooth(x: Tensor, sigma: float | Tensor, *, margin: int = 1, linear: bool = False) -> Tensor:
-    """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite differences need it:
-    ``linear`` by the slope at the borders, else by replicating them."""
+    """:func:`gaussian_smooth` of an image enlarged by ``margin`` px on each side, as finite
+    differences need it: ``linear`` by the slope at the borders, else by replicating them."""
     weights = _gaussian_kernel(sigma, x)
     radius = len(weights) // 2
     x = (extrapolate_pad if linear else replicate_pad)(x, radius + margin)
     if radius == 0:
         return x
-    # Sums of shifted images: much faster than a convolution on few images, and one loop when compiled.
+    # Sums of shifted images: much faster than a convolution on few images, and one loop when
+    # compiled.
     for dim in (-1, -2):
-        padded, length = x, x.shape[dim] - 2 * radius
+        padded = x
+        length = x.shape[dim] - 2 * radius
         x = padded.narrow(dim, 0, length) * weights[0]
         for i in range(1, 2 * radius + 1):
             part = padded.narrow(dim, i, length)
-            x = x.addcmul_(part, weights[i]) if isinstance(weights, Tensor) else x.add_(part, alpha=weights[i])
+            x = (
+                x.addcmul_(part, weights[i])
+                if isinstance(weights, Tensor)
+                else x.add_(part, alpha=weights[i])
+            )
     return x
 
 
@@ -192,7 +223,9 @@ def _gaussian_kernel(sigma: float | Tensor, like: Tensor) -> Sequence[float] | T
     """Weights of a kernel of odd length: floats for a float, a tensor for a tensor."""
     if not isinstance(sigma, Tensor):
         radius = math.ceil(4.0 * sigma)
-        kernel = [math.exp(-0.5 * (i / sigma) ** 2) if i else 1.0 for i in range(-radius, radius + 1)]
+        kernel = [
+            math.exp(-0.5 * (i / sigma) ** 2) if i else 1.0 for i in range(-radius, radius + 1)
+        ]
         total = sum(kernel)
         return [weight / total for weight in kernel]
     radius = MAX_TENSOR_RADIUS
@@ -210,25 +243,32 @@ def replicate_pad(x: Tensor, radius: int) -> Tensor:
 
 
 def extrapolate_pad(x: Tensor, radius: int) -> Tensor:
-    """Pad (B, C, H, W) by ``radius`` px on all sides with the slope at the border, so that planes stay planes."""
+    """Pad (B, C, H, W) by ``radius`` px on all sides with the slope at the border, so that planes
+    stay planes."""
     steps = torch.arange(1, radius + 1, device=x.device, dtype=x.dtype)
     for dim in (-1, -2):
-        n, k = x.shape[dim], steps if dim == -1 else steps[:, None]
-        first, last = x.narrow(dim, 0, 1), x.narrow(dim, n - 1, 1)
+        n = x.shape[dim]
+        k = steps if dim == -1 else steps[:, None]
+        first = x.narrow(dim, 0, 1)
+        last = x.narrow(dim, n - 1, 1)
         # The indices are clamped because an image one pixel wide has no slope.
-        fall, rise = first - x.narrow(dim, min(1, n - 1), 1), last - x.narrow(dim, max(n - 2, 0), 1)
+        fall = first - x.narrow(dim, min(1, n - 1), 1)
+        rise = last - x.narrow(dim, max(n - 2, 0), 1)
         x = torch.cat([first + fall * k.flip(0), x, last + rise * k], dim=dim)
     return x
 
 
 def central_gradient(p: Tensor) -> tuple[Tensor, Tensor]:
     """(p_x, p_y) per px by central differences; the result is 1 px smaller than p on each side."""
-    return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(p[..., 2:, 1:-1], p[..., :-2, 1:-1])
+    return _half_difference(p[..., 1:-1, 2:], p[..., 1:-1, :-2]), _half_difference(
+        p[..., 2:, 1:-1], p[..., :-2, 1:-1]
+    )
 
 
 def central_derivatives(p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """(p_x, p_y, p_xx, p_yy, p_xy) per px and px^2; each is 1 px smaller than p on each side."""
-    x, slope = p[..., 1:-1, 1:-1], _half_difference(p[..., 2:], p[..., :-2])
+    x = p[..., 1:-1, 1:-1]
+    slope = _half_difference(p[..., 2:], p[..., :-2])
     xx = (p[..., 1:-1, 2:] + p[..., 1:-1, :-2]).sub_(x, alpha=2)
     yy = (p[..., 2:, 1:-1] + p[..., :-2, 1:-1]).sub_(x, alpha=2)
     xy = _half_difference(slope[..., 2:, :], slope[..., :-2, :])
@@ -240,7 +280,8 @@ def _half_difference(after: Tensor, before: Tensor) -> Tensor:
 
 
 def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B, 1, H, W)."""
+    """True where ``length`` is a maximum along (x, y), rounded to 45 degrees as in Canny; all (B,
+    1, H, W)."""
     H, W = length.shape[-2:]
     p = F.pad(length, (1, 1, 1, 1))
 
@@ -248,11 +289,17 @@ def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
         return p[..., 1 + dy : 1 + dy + H, 1 + dx : 1 + dx + W]
 
     tan = 0.41421356  # tan 22.5 degrees
-    horizontal, vertical = y.abs() <= tan * x.abs(), x.abs() <= tan * y.abs()
+    horizontal = y.abs() <= tan * x.abs()
+    vertical = x.abs() <= tan * y.abs()
     diagonal = ~(horizontal | vertical)
     falling = diagonal & (x * y > 0)  # y points down: equal signs run from top left to bottom right
     result = torch.zeros_like(horizontal)
-    for selected, dx, dy in ((horizontal, 1, 0), (vertical, 0, 1), (falling, 1, 1), (diagonal & ~falling, 1, -1)):
+    for selected, dx, dy in (
+        (horizontal, 1, 0),
+        (vertical, 0, 1),
+        (falling, 1, 1),
+        (diagonal & ~falling, 1, -1),
+    ):
         # Strict on one side only, so that a plateau two pixels wide yields exactly one point.
         result = result | (selected & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
     return result

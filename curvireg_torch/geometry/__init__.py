@@ -3,10 +3,13 @@
 Conventions of the whole library (pinned by ``tests/geometry``):
 
 - OpenCV camera: x right, y down, z forward; ``T_cam_from_model`` maps model points into the camera.
-- Pixel (0, 0) is the centre of the top-left pixel; the image covers [-0.5, W - 0.5] x [-0.5, H - 0.5].
-- Boxes are ``x0, y0, x1, y1`` in pixels; depth is z along the optical axis in model units, background 0.
+- Pixel (0, 0) is the centre of the top-left pixel; the image covers [-0.5, W - 0.5] x [-0.5, H -
+  0.5].
+- Boxes are ``x0, y0, x1, y1`` in pixels; depth is z along the optical axis in model units,
+  background 0.
 - Angles are degrees at the API, radians inside. Images are RGB, floating, in [0, 1].
-- Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and rotates nothing.
+- Poses refer to the frame and unit of the mesh file; ``up`` names the axis that points up and
+  rotates nothing.
 """
 
 from .calibration import Camera as Camera

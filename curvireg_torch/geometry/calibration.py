@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import as_numbers, check_camera_matrix, check_integer, check_option, check_photograph, check_tensor
+from ..utils.checks import (
+    as_numbers,
+    check_camera_matrix,
+    check_integer,
+    check_option,
+    check_photograph,
+    check_tensor,
+)
 from ..utils.files import finite_numbers
 from .cameras import boxes_around
 from .crops import check_boxes
@@ -33,20 +40,23 @@ class Camera:
 
     Attributes:
         matrix: (3, 3) in px, as float64.
-        distortion: coefficients in OpenCV's order. "radial-tangential": none, or 4, 5, 8, 12 or 14 (k1, k2, p1, p2, k3,
-            k4, k5, k6, s1, s2, s3, s4, tx, ty); "fisheye" (equidistant): the 4 of ``cv2.fisheye``.
+        distortion: coefficients in OpenCV's order. "radial-tangential": none, or 4, 5, 8, 12 or 14
+            (k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty); "fisheye" (equidistant): the 4
+            of ``cv2.fisheye``.
         model: "radial-tangential" or "fisheye".
         size: (H, W) of the photographs that it was calibrated with; None: that of any photograph.
-        focal_deviation: standard deviation of the focal length, as a fraction of it; 0 of a known one.
-        source: one of :data:`SOURCES`: "given"; "exif", by the metadata of the photograph's file; "estimated" in the
-            photograph itself.
+        focal_deviation: standard deviation of the focal length, as a fraction of it; 0 of a known
+            one.
+        source: one of :data:`SOURCES`: "given"; "exif", by the metadata of the photograph's file;
+            "estimated" in the photograph itself.
 
     Raises:
-        InvalidInputError: an unusable matrix, a wrong number of coefficients, or a deviation that is not finite and
-            >= 0.
+        InvalidInputError: an unusable matrix, a wrong number of coefficients, or a deviation that
+            is not finite and >= 0.
 
     Example:
-        >>> camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], (-0.3, 0.1, 0, 0), size=(480, 640))
+        >>> camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], (-0.3, 0.1, 0, 0),
+        ...     size=(480, 640))
         >>> camera.at((240, 320)).matrix.tolist()
         [[250.0, 0.0, 159.5], [0.0, 250.0, 119.5], [0.0, 0.0, 1.0]]
     """
@@ -59,17 +69,25 @@ class Camera:
     source: str = "given"
 
     def __post_init__(self) -> None:
-        matrix = as_numbers(self.matrix, "camera matrix", dtype=torch.float64).detach().cpu().double()
+        matrix = (
+            as_numbers(self.matrix, "camera matrix", dtype=torch.float64).detach().cpu().double()
+        )
         check_tensor(matrix, "camera matrix", (3, 3))
         check_camera_matrix(matrix)
         check_option(self.model, MODELS, "distortion model")
         check_option(self.source, SOURCES, "source")
         if not 0.0 <= self.focal_deviation < float("inf"):
-            raise InvalidInputError(f"focal_deviation: expected a fraction >= 0, got {self.focal_deviation}")
+            raise InvalidInputError(
+                f"focal_deviation: expected a fraction >= 0, got {self.focal_deviation}"
+            )
         given = list(self.distortion)
         numbers = finite_numbers(given, len(given))
         if numbers is None or len(numbers) not in MODELS[self.model]:
-            expected = f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the model {self.model!r}"
+            expected = (
+                f"{' or '.join(map(str, MODELS[self.model]))} finite coefficients of the "
+                f"model "
+                f"{self.model!r}"
+            )
             raise InvalidInputError(f"distortion: expected {expected}, got {given!r:.80}")
         for side in self.size or ():
             check_integer(side, "size of the image")
@@ -82,17 +100,27 @@ class Camera:
         return self.model == "fisheye" or any(self.distortion)
 
     def at(self, size: tuple[int, int]) -> "Camera":
-        """Return the camera of the same photographs, resized to (H, W); another aspect ratio is refused."""
+        """Return the camera of the same photographs, resized to (H, W); another aspect ratio is
+        refused."""
         (h, w), (H, W) = self.size or size, size
-        if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:  # sides of resized pictures are rounded
+        # sides of resized pictures are rounded
+        if abs(w * H / h - W) > 1 and abs(h * W / w - H) > 1:
             turned = abs(h * H / w - W) <= 1
-            advice = "turn the photograph by 90 degrees" if turned else "give one of uncropped photographs of this size"
+            advice = (
+                "turn the photograph by 90 degrees"
+                if turned
+                else "give one of uncropped photographs of this size"
+            )
             raise InvalidInputError(
-                f"camera: calibrated for {w} x {h} px, but the photograph has {W} x {H} px, another aspect ratio; "
+                f"camera: calibrated for {w} x {h} px, but the photograph has {W} x {H} px, "
+                f"another aspect ratio; "
                 f"{advice}"
             )
-        x, y = W / w, H / h
-        scale = torch.tensor([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+        x = W / w
+        y = H / h
+        scale = torch.tensor(
+            [[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]], dtype=torch.float64
+        )
         return replace(self, matrix=scale @ self.matrix, size=size)
 
     def describe(self) -> dict[str, Any]:
@@ -108,9 +136,10 @@ class Camera:
 
 
 class Undistorted(NamedTuple):
-    """What a camera with the same matrix, but without distortion, shows: ``image`` (C, H, W); ``box`` (4,) around the
-    outline of the given one; ``mask`` (H, W) float32; and ``missing`` (H, W) bool, pixels that were not recorded, or
-    whose distortion is unknown: they repeat the border of what is known."""
+    """What a camera with the same matrix, but without distortion, shows: ``image`` (C, H, W);
+    ``box`` (4,) around the outline of the given one; ``mask`` (H, W) float32; and ``missing`` (H,
+    W) bool, pixels that were not recorded, or whose distortion is unknown: they repeat the border
+    of what is known."""
 
     image: Tensor
     box: Tensor | None
@@ -118,17 +147,22 @@ class Undistorted(NamedTuple):
     missing: Tensor
 
 
-def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: Tensor | None = None) -> Undistorted:
-    """Remove the distortion of a photograph; box and mask move, the camera matrix remains. A polynomial describes
-    a lens up to the radius at which it stops growing; what lies beyond is missing.
+def undistorted(
+    image: Tensor, camera: Camera, box: Tensor | None = None, mask: Tensor | None = None
+) -> Undistorted:
+    """Remove the distortion of a photograph; box and mask move, the camera matrix remains. A
+    polynomial describes a lens up to the radius at which it stops growing; what lies beyond is
+    missing.
 
     Args:
-        image: (1 or 3, H, W), floating or uint8, of the size of the camera or of another, see :meth:`Camera.at`.
+        image: (1 or 3, H, W), floating or uint8, of the size of the camera or of another, see
+            :meth:`Camera.at`.
         box: (4,) x0, y0, x1, y1 in px of the photograph.
         mask: (H, W) floating.
 
     Raises:
-        InvalidInputError: a photograph of another aspect ratio, or a box outside what the undistorted one shows.
+        InvalidInputError: a photograph of another aspect ratio, or a box outside what the
+            undistorted one shows.
 
     Example:
         >>> camera = Camera([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]], (-0.3, 0.1, 0, 0))
@@ -142,18 +176,26 @@ def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: 
     if not camera.distorts:
         return Undistorted(image, box, mask, torch.zeros(size, dtype=torch.bool))
     if max(size) > MAX_REMAPPED_SIDE:
-        raise InvalidInputError(f"photograph: expected sides of at most {MAX_REMAPPED_SIDE} px, got {W} x {H}")
+        raise InvalidInputError(
+            f"photograph: expected sides of at most {MAX_REMAPPED_SIDE} px, got {W} x {H}"
+        )
     box = None if box is None else _undistorted_box(camera, box, size)
-    maps, missing = _maps(tuple(camera.matrix.flatten().tolist()), tuple(camera.distortion), camera.model, size)
+    maps, missing = _maps(
+        tuple(camera.matrix.flatten().tolist()), tuple(camera.distortion), camera.model, size
+    )
 
     def remapped(x: Tensor, border: int) -> Tensor:
         planes = x.detach().cpu()
         planes = planes if planes.dtype in (torch.uint8, torch.float64) else planes.float()
-        moved = [cv2.remap(plane.numpy(), *maps, cv2.INTER_LINEAR, borderMode=border) for plane in planes]
+        moved = [
+            cv2.remap(plane.numpy(), *maps, cv2.INTER_LINEAR, borderMode=border) for plane in planes
+        ]
         return torch.from_numpy(np.stack(moved)).to(x)
 
     if mask is not None:
-        mask = remapped(mask[None], cv2.BORDER_CONSTANT)[0].masked_fill(missing.to(mask.device), 0.0)
+        mask = remapped(mask[None], cv2.BORDER_CONSTANT)[0].masked_fill(
+            missing.to(mask.device), 0.0
+        )
     return Undistorted(remapped(image, cv2.BORDER_REPLICATE), box, mask, missing)
 
 
@@ -161,11 +203,13 @@ def undistorted(image: Tensor, camera: Camera, box: Tensor | None = None, mask: 
 def _maps(
     matrix: tuple[float, ...], distortion: tuple[float, ...], model: str, size: tuple[int, int]
 ) -> tuple[tuple[Any, Any], Tensor]:
-    """Maps of ``cv2.remap`` from a photograph of (H, W) to one without distortion, and (H, W) bool: what is missing."""
+    """Maps of ``cv2.remap`` from a photograph of (H, W) to one without distortion, and (H, W) bool:
+    what is missing."""
     (H, W), K, D = size, np.array(matrix).reshape(3, 3), np.array(distortion)
     library = cv2.fisheye if model == "fisheye" else cv2
     x, y = library.initUndistortRectifyMap(K, D, np.eye(3), K, (W, H), cv2.CV_32FC1)
-    u, v = (np.arange(W) - K[0, 2]) / K[0, 0], (np.arange(H) - K[1, 2]) / K[1, 1]
+    u = (np.arange(W) - K[0, 2]) / K[0, 0]
+    v = (np.arange(H) - K[1, 2]) / K[1, 1]
     limit = _growing_radii(distortion, model)[2]
     beyond = u**2 + v[:, None] ** 2 > limit**2
     if beyond.any():
@@ -185,7 +229,8 @@ def _distorted(rays: Array, K: Array, D: Array, model: str) -> Array:
 
 
 def _growing_radii(distortion: Sequence[float], model: str) -> tuple[Array, Array, float]:
-    """Radii of rays (x, y, 1), their radially distorted radii, as far as these grow, and where they stop, or inf."""
+    """Radii of rays (x, y, 1), their radially distorted radii, as far as these grow, and where they
+    stop, or inf."""
     angle = np.linspace(0.0, MAX_ANGLE, 5000)
     radius = np.tan(angle)
     k = np.zeros(8)
@@ -202,30 +247,40 @@ def _growing_radii(distortion: Sequence[float], model: str) -> tuple[Array, Arra
 
 
 def _with_radii(points: Array, old: Array, new: Array) -> Array:
-    """(N, 2) points, moved along their directions from ``old`` radii to ``new`` ones; the last are the largest."""
+    """(N, 2) points, moved along their directions from ``old`` radii to ``new`` ones; the last are
+    the largest."""
     distance = np.linalg.norm(points, axis=-1, keepdims=True)
     return np.asarray(points * np.interp(distance, old, new) / np.maximum(distance, 1e-12))
 
 
 def _undistorted_box(camera: Camera, box: Tensor, size: tuple[int, int]) -> Tensor:
-    """(4,) around the undistorted outline of a box; what extends beyond the photograph moves with its border."""
+    """(4,) around the undistorted outline of a box; what extends beyond the photograph moves with
+    its border."""
     (H, W), K, D = size, camera.matrix.numpy(), np.array(camera.distortion)
     check_boxes(box[None].detach().float(), [size])
     x0, y0, x1, y1 = box.detach().cpu().double().tolist()
-    around, corners = np.linspace(0.0, 4.0, 201), ([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0])
+    around = np.linspace(0.0, 4.0, 201)
+    corners = ([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0])
     outline = np.stack([np.interp(around, range(5), values) for values in corners], axis=1)
     inside = outline.clip([-0.5, -0.5], [W - 0.5, H - 0.5])
     radius, distorted, _ = _growing_radii(camera.distortion, camera.model)
-    centre, focal = K[:2, 2], np.diag(K)[:2]
+    centre = K[:2, 2]
+    focal = np.diag(K)[:2]
     target = (inside - centre) / focal
     rays = _with_radii(target, distorted, radius)
-    for _ in range(20):  # the rest of the distortion, which is small, is that of the ray found before
-        rest = (_distorted(rays, K, D, camera.model) - centre) / focal - _with_radii(rays, radius, distorted)
+    # the rest of the distortion, which is small, is that of the ray found before
+    for _ in range(20):
+        rest = (_distorted(rays, K, D, camera.model) - centre) / focal - _with_radii(
+            rays, radius, distorted
+        )
         rays = _with_radii(target - rest, distorted, radius)
     moved = boxes_around(torch.from_numpy(rays * focal + centre + outline - inside)).to(box)
-    if not bool((moved[:2] < torch.tensor([W, H]).to(box) - 0.5).all() and (moved[2:] > -0.5).all()):
+    if not bool(
+        (moved[:2] < torch.tensor([W, H]).to(box) - 0.5).all() and (moved[2:] > -0.5).all()
+    ):
         raise InvalidInputError(
-            f"box ({x0:g}, {y0:g}, {x1:g}, {y1:g}): outside what the photograph shows once its distortion is removed, "
+            f"box ({x0:g}, {y0:g}, {x1:g}, {y1:g}): outside what the photograph shows once its "
+            f"distortion is removed, "
             "too far from the optical axis; turn the camera to the object"
         )
     return moved

@@ -7,25 +7,37 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_camera_matrix, check_finite, check_number, check_pose, check_rotation
+from ..utils.checks import (
+    check_camera_matrix,
+    check_finite,
+    check_number,
+    check_pose,
+    check_rotation,
+)
 
 MAX_BOX_ITERATIONS = 20
 MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the position
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float64) -> Tensor:
+def camera_matrix(
+    fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float64
+) -> Tensor:
     """Return the (3, 3) OpenCV camera matrix; all arguments in px."""
-    fx, fy, cx, cy = (check_number(v, name) for v, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy")))
+    fx, fy, cx, cy = (
+        check_number(v, name) for v, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy"))
+    )
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
     check_camera_matrix(K)
     return K
 
 
 def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
-    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an (H, W) in px, with
-    square pixels and the principal point in the centre."""
+    """(3, 3) float64 camera matrix of a horizontal field of view, 0 < ``fov`` < 180 degrees, and an
+    (H, W) in px, with square pixels and the principal point in the centre."""
     if not (isinstance(fov, int | float) and 0.0 < fov < 180.0):
-        raise InvalidInputError(f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}")
+        raise InvalidInputError(
+            f"fov: expected 0 < degrees < 180 across the image's width, got {fov!r}"
+        )
     H, W = size
     focal = W / 2 / math.tan(math.radians(fov) / 2)
     return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
@@ -34,12 +46,17 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
 def transform(R: Tensor, t: Tensor) -> Tensor:
     """(..., 4, 4) rigid transform from (..., 3, 3) and (..., 3)."""
     top = torch.cat([R, t[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(*top.shape[:-2], 1, 4)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(
+        *top.shape[:-2], 1, 4
+    )
     return torch.cat([top, bottom], dim=-2)
 
 
-def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """(..., P, 2) pixel coordinates of model points, as ``cv2.projectPoints`` gives without distortion.
+def project_points(
+    points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
+) -> Tensor:
+    """(..., P, 2) pixel coordinates of model points, as ``cv2.projectPoints`` gives without
+    distortion.
 
     Args:
         points: (P, 3) or (N, P, 3) in model units.
@@ -58,15 +75,21 @@ def project_points(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, ortho
     return projected(points, T_cam_from_model, K, orthographic=orthographic)
 
 
-def projected(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """:func:`project_points` without its checks, for loops over poses that the library has computed."""
+def projected(
+    points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
+) -> Tensor:
+    """:func:`project_points` without its checks, for loops over poses that the library has
+    computed."""
     cam = points @ T_cam_from_model[..., :3, :3].mT + T_cam_from_model[..., None, :3, 3]
     xy = cam[..., :2] if orthographic else cam[..., :2] / cam[..., 2:]
     return xy @ K[..., :2, :2].mT + K[..., None, :2, 2]
 
 
-def projected_boxes(points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False) -> Tensor:
-    """(..., 4) boxes x0, y0, x1, y1 around projected model points, which must be in front of a perspective camera."""
+def projected_boxes(
+    points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
+) -> Tensor:
+    """(..., 4) boxes x0, y0, x1, y1 around projected model points, which must be in front of a
+    perspective camera."""
     return boxes_around(project_points(points, T_cam_from_model, K, orthographic=orthographic))
 
 
@@ -76,8 +99,8 @@ def boxes_around(pixels: Tensor) -> Tensor:
 
 
 def rotation_towards(rays: Tensor) -> Tensor:
-    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z > 0: they turn
-    allocentric rotations into poses."""
+    """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z >
+    0: they turn allocentric rotations into poses."""
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)
@@ -85,22 +108,28 @@ def rotation_towards(rays: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def pose_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
-    """Estimate the pose with which the projected points fill a box, with the object in front of the camera: the fixed
-    point of two closed-form steps. The sizes of the projected and the given box determine the distance (least squares
-    over width and height), their centres the offset, towards which the rotation turns.
+def pose_from_box(
+    points: Tensor, rotation: Tensor, box: Tensor, K: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Estimate the pose with which the projected points fill a box, with the object in front of the
+    camera: the fixed point of two closed-form steps. The sizes of the projected and the given box
+    determine the distance (least squares over width and height), their centres the offset, towards
+    which the rotation turns.
 
     Args:
         points: (P, 3) of the model, for instance the vertices of its convex hull.
-        rotation: (..., 3, 3) model -> camera, as seen by a camera that looks straight at the object's centre.
+        rotation: (..., 3, 3) model -> camera, as seen by a camera that looks straight at the
+            object's centre.
         box: (..., 4) x0, y0, x1, y1 in px.
         K: (..., 3, 3).
 
     Returns:
-        rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64, in model units.
+        rotation (..., 3, 3) and translation (..., 3) in the photograph's camera, float64, in model
+        units.
 
     Raises:
-        InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is unusable.
+        InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is
+            unusable.
     """
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")
@@ -110,17 +139,23 @@ def pose_from_box(points: Tensor, rotation: Tensor, box: Tensor, K: Tensor) -> t
     points, view, box, K = (v.detach().cpu().double() for v in (points, rotation, box, K))
     centre = 0.5 * (points.amin(dim=0) + points.amax(dim=0))
     extent = torch.linalg.vector_norm(points - centre, dim=1).max()
-    size, middle = box[..., 2:] - box[..., :2], 0.5 * (box[..., :2] + box[..., 2:])
+    size = box[..., 2:] - box[..., :2]
+    middle = 0.5 * (box[..., :2] + box[..., 2:])
     inverse = torch.linalg.inv(K)
     # Start far enough away for every point to be in front of the camera.
     z = torch.maximum(2.0 * extent * K[..., 0, 0] / size.amax(dim=-1), 2.0 * extent)
     position = (inverse @ F.pad(middle, (0, 1), value=1.0)[..., None])[..., 0] * z[..., None]
-    R, moving = view, torch.ones_like(z, dtype=torch.bool)
+    R = view
+    moving = torch.ones_like(z, dtype=torch.bool)
     for _ in range(MAX_BOX_ITERATIONS):
         # Each pose stops on its own: it does not depend on the others.
         R = torch.where(moving[..., None, None], rotation_towards(position) @ view, R)
-        low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(2, dim=-1)
-        zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(dim=-1, keepdim=True)
+        low, high = boxes_around(projected(points - centre, transform(R, position), K)).split(
+            2, dim=-1
+        )
+        zoom = ((high - low) * size).sum(dim=-1, keepdim=True) / (size * size).sum(
+            dim=-1, keepdim=True
+        )
         offset = F.pad(middle - 0.5 * (low + high), (0, 1))
         # Move sideways at the object's depth, then along its ray; never closer than its own extent.
         moved = position + (inverse @ offset[..., None])[..., 0] * position[..., 2:]

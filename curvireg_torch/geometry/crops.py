@@ -20,7 +20,8 @@ def whole_image_box(image: Tensor) -> Tensor:
 
 
 def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
-    """Refuse (B, 4) boxes that are empty, not finite or entirely outside their image, of the (H, W) in ``sizes``."""
+    """Refuse (B, 4) boxes that are empty, not finite or entirely outside their image, of the (H, W)
+    in ``sizes``."""
     check_tensor(boxes, "boxes", (len(sizes), 4))
     for i, (box, (H, W)) in enumerate(zip(boxes.tolist(), sizes, strict=True)):
         x0, y0, x1, y1 = box
@@ -30,19 +31,26 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
             raise InvalidInputError(f"{name}: expected finite coordinates in px")
         if max(map(abs, box)) > MAX_BOX_COORDINATE:
             raise InvalidInputError(
-                f"{name}: coordinates beyond {MAX_BOX_COORDINATE:g} px; give pixel coordinates of the {W} x {H} image"
+                f"{name}: coordinates beyond {MAX_BOX_COORDINATE:g} px; give pixel coordinates of "
+                f"the {W} x {H} image"
             )
         if x1 <= x0 or y1 <= y0:
             raise InvalidInputError(
-                f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height, or --box-format xywh"
+                f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height, or "
+                f"--box-format xywh"
             )
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
-            raise InvalidInputError(f"{name}: entirely outside the {W} x {H} image; give its pixel coordinates")
+            raise InvalidInputError(
+                f"{name}: entirely outside the {W} x {H} image; give its pixel coordinates"
+            )
 
 
 def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
-    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union is empty."""
-    common = torch.minimum(boxes[:, None, 2:], others[:, 2:]) - torch.maximum(boxes[:, None, :2], others[:, :2])
+    """(N, M) intersection over union of (N, 4) and (M, 4) boxes x0, y0, x1, y1; 0 where the union
+    is empty."""
+    common = torch.minimum(boxes[:, None, 2:], others[:, 2:]) - torch.maximum(
+        boxes[:, None, :2], others[:, :2]
+    )
     overlap = common.clamp(min=0).prod(dim=-1)
     first, second = ((box[:, 2:] - box[:, :2]).clamp(min=0).prod(dim=-1) for box in (boxes, others))
     union = first[:, None] + second - overlap
@@ -50,7 +58,8 @@ def box_iou(boxes: Tensor, others: Tensor) -> Tensor:
 
 
 def non_maximum_suppression(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
-    """Indices of (N, 4) boxes by falling score (N,), without those that overlap a better one by more than an IoU."""
+    """Indices of (N, 4) boxes by falling score (N,), without those that overlap a better one by
+    more than an IoU."""
     from kornia.geometry.bbox import nms  # here, because its import takes 0.3 s
 
     kept: Tensor = nms(boxes, scores, threshold)
@@ -66,19 +75,22 @@ def square_boxes(boxes: Tensor, margin: float) -> Tensor:
 
 
 def crop_transforms(squares: Tensor, size: int) -> Tensor:
-    """(..., 3, 3) maps from image to crop pixels, borders onto borders; ``A @ K`` is the crop's camera matrix."""
+    """(..., 3, 3) maps from image to crop pixels, borders onto borders; ``A @ K`` is the crop's
+    camera matrix."""
     scale = size / (squares[..., 2] - squares[..., 0])
     return _scale_and_shift(scale, -squares[..., 0] * scale - 0.5, -squares[..., 1] * scale - 0.5)
 
 
 def image_transforms(squares: Tensor, size: int) -> Tensor:
-    """The inverse of :func:`crop_transforms`, with exact zeros and ones, which LAPACK does not guarantee."""
+    """The inverse of :func:`crop_transforms`, with exact zeros and ones, which LAPACK does not
+    guarantee."""
     scale = (squares[..., 2] - squares[..., 0]) / size
     return _scale_and_shift(scale, squares[..., 0] + 0.5 * scale, squares[..., 1] + 0.5 * scale)
 
 
 def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
+    zero = torch.zeros_like(scale)
+    one = torch.ones_like(scale)
     rows = [torch.stack(row, -1) for row in ([scale, zero, x], [zero, scale, y], [zero, zero, one])]
     return torch.stack(rows, -2)
 
@@ -86,17 +98,22 @@ def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
 def crop_images(
     images: Tensor | Sequence[Tensor], boxes: Any, *, size: int = 256, margin: float = 0.1
 ) -> tuple[Tensor, Tensor]:
-    """Square crops around boxes, resampled bilinearly, with a wider triangle filter (no aliasing) when shrinking.
+    """Square crops around boxes, resampled bilinearly, with a wider triangle filter (no aliasing)
+    when shrinking.
 
-    Crops are NaN where they depend on a pixel that is not finite. Half types are resampled in float32.
+    Crops are NaN where they depend on a pixel that is not finite. Half types are resampled in
+    float32.
 
     Args:
-        images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image repeat its border.
-        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may extend beyond the image.
+        images: (B, C, H, W), or a list of (C, H, W) of different sizes. Pixels outside an image
+            repeat its border.
+        boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists; may extend beyond the
+            image.
         margin: added on each side of the box, as a fraction of its longer side.
 
     Returns:
-        crops (B, C, size, size) in the dtype of the images, and (B, 3, 3) :func:`crop_transforms`, at least float32.
+        crops (B, C, size, size) in the dtype of the images, and (B, 3, 3) :func:`crop_transforms`,
+        at least float32.
 
     Raises:
         InvalidInputError: wrong shapes, or a box is empty or entirely outside its image.
@@ -115,7 +132,10 @@ def crop_images(
     check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
     squares = square_boxes(boxes, margin)
     A = crop_transforms(squares, size)
-    crops = [crop_squares(image, square[None], size) for image, square in zip(images, squares, strict=True)]
+    crops = [
+        crop_squares(image, square[None], size)
+        for image, square in zip(images, squares, strict=True)
+    ]
     if crops:
         return torch.cat(crops).to(images[0].dtype), A
     if isinstance(images, Tensor):
@@ -124,28 +144,37 @@ def crop_images(
 
 
 def crop_squares(image: Tensor, squares: Tensor, size: int) -> Tensor:
-    """(K, C, size, size) crops of K squares (K, 4) in px of one image (C, H, W), floating or uint8; at least float32.
-    Resampled as in :func:`crop_images`; of a large image only the pixels that the crops depend on are read."""
+    """(K, C, size, size) crops of K squares (K, 4) in px of one image (C, H, W), floating or uint8;
+    at least float32. Resampled as in :func:`crop_images`; of a large image only the pixels that the
+    crops depend on are read."""
     # Half types cannot represent pixel coordinates: bfloat16 has eight bits.
     dtype = torch.promote_types(image.dtype, torch.float32)
     borders = squares.to("cpu", dtype)  # many small steps
-    rows, columns = (_Resampling(borders[:, i], borders[:, i + 2], size, image.shape[-1 - i]) for i in (1, 0))
+    rows, columns = (
+        _Resampling(borders[:, i], borders[:, i + 2], size, image.shape[-1 - i]) for i in (1, 0)
+    )
     x = image[:, rows.first : rows.end, columns.first : columns.end]
 
     def resampled(x: Tensor) -> Tensor:
-        return torch.stack([columns(strip.mT, k).mT for k, strip in enumerate(rows(x).split(size, dim=1))])
+        return torch.stack(
+            [columns(strip.mT, k).mT for k, strip in enumerate(rows(x).split(size, dim=1))]
+        )
 
     crops = resampled(x)
-    if not bool(crops.isfinite().all()):  # 0 times NaN is NaN: one missing pixel would spread along its row and column
+    # 0 times NaN is NaN: one missing pixel would spread along its row and column
+    if not bool(crops.isfinite().all()):
         missing = ~x.isfinite()
-        crops = torch.where(resampled(missing.to(dtype)) > 0, torch.nan, resampled(torch.where(missing, 0.0, x)))
+        crops = torch.where(
+            resampled(missing.to(dtype)) > 0, torch.nan, resampled(torch.where(missing, 0.0, x))
+        )
     return crops
 
 
 class _Resampling:
-    """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K pairs of borders (K,),
-    from the input from ``first`` to ``end``. Neighbouring samples, of whichever crop, are computed together, by the
-    product of a narrow matrix with the few inputs that they depend on."""
+    """Triangle filters, at least one pixel wide, that resample an axis of ``length`` between K
+    pairs of borders (K,), from the input from ``first`` to ``end``. Neighbouring samples, of
+    whichever crop, are computed together, by the product of a narrow matrix with the few inputs
+    that they depend on."""
 
     def __init__(self, low: Tensor, high: Tensor, size: int, length: int) -> None:
         scale = ((high - low) / size)[:, None]
@@ -156,18 +185,23 @@ class _Resampling:
         self.end = min(length, int((self._centres + self._widths).amax()) + 1)
 
     def __call__(self, x: Tensor, crop: int | None = None) -> Tensor:
-        """(C, samples, W) of one crop, or of all in sequence, from the (C, end - first, W) input, converted where it is
-        used."""
+        """(C, samples, W) of one crop, or of all in sequence, from the (C, end - first, W) input,
+        converted where it is used."""
         which = slice(None) if crop is None else slice(crop, crop + 1)
         centres, order = self._centres[which].flatten().sort(stable=True)
         widths = self._widths[which].flatten()[order]
         parts = []
-        for centre, width in zip(centres.split(SAMPLES_AT_A_TIME), widths.split(SAMPLES_AT_A_TIME), strict=True):
+        for centre, width in zip(
+            centres.split(SAMPLES_AT_A_TIME), widths.split(SAMPLES_AT_A_TIME), strict=True
+        ):
             low = max(0, int((centre - width).amin()) - self.first)
             high = int((centre + width).amax()) + 1 - self.first
             part = x[:, low:high].to(centres.dtype)
             part = part.div_(255.0) if x.dtype == torch.uint8 else part
-            samples = torch.arange(low, low + part.shape[1], device=centre.device, dtype=centre.dtype) + self.first
+            samples = (
+                torch.arange(low, low + part.shape[1], device=centre.device, dtype=centre.dtype)
+                + self.first
+            )
             weights = (1.0 - (samples - centre[:, None]).abs() / width[:, None]).clamp(min=0.0)
             parts.append((weights / weights.sum(dim=1, keepdim=True)).to(part) @ part)
         return torch.cat(parts, dim=1)[:, order.argsort()]

@@ -1,7 +1,9 @@
-"""PASCAL3D+ viewpoint angles, their rotations, the angle between two rotations, and samplings of viewpoints.
+"""PASCAL3D+ viewpoint angles, their rotations, the angle between two rotations, and samplings of
+viewpoints.
 
-The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin, with the model's +z
-up in the image, rotated by ``theta`` about the optical axis. With the image's y flipped to OpenCV's that is
+The PASCAL3D+ camera looks from ``C = d (cos e sin a, -cos e cos a, sin e)`` at the model's origin,
+with the model's +z up in the image, rotated by ``theta`` about the optical axis. With the image's y
+flipped to OpenCV's that is
 
     R = diag(1, -1, -1) Rz(theta) Rx(e - 90 deg) Rz(-a),    x_cam = R x_model + t,    t = (0, 0, d).
 
@@ -17,12 +19,21 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..utils.checks import check_integer, check_numbers, check_option, check_positive, check_rotation
+from ..utils.checks import (
+    check_integer,
+    check_numbers,
+    check_option,
+    check_positive,
+    check_rotation,
+)
 from ..utils.choices import UP_AXES
 
 
-def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0) -> Tensor:
-    """(..., 3, 3) rotations model -> OpenCV camera of PASCAL3D+ viewpoints; the module states the equation.
+def rotation_from_viewpoint(
+    azimuth: Tensor | float, elevation: Tensor | float, theta: Tensor | float = 0.0
+) -> Tensor:
+    """(..., 3, 3) rotations model -> OpenCV camera of PASCAL3D+ viewpoints; the module states the
+    equation.
 
     Args:
         azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
@@ -33,12 +44,20 @@ def rotation_from_viewpoint(azimuth: Tensor | float, elevation: Tensor | float, 
         [0, -1, 0]
     """
     angles = azimuth, elevation, theta
-    device = next((v.device for v in angles if isinstance(v, Tensor)), None)  # of the tensors, for plain numbers
-    tensors = [v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in angles]
+    # of the tensors, for plain numbers
+    device = next((v.device for v in angles if isinstance(v, Tensor)), None)
+    tensors = [
+        v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in angles
+    ]
     tensors = [v if v.is_floating_point() else v.to(torch.get_default_dtype()) for v in tensors]
     dtype = reduce(torch.promote_types, (v.dtype for v in tensors))
     a, e, t = (torch.deg2rad(v) for v in torch.broadcast_tensors(*(v.to(dtype) for v in tensors)))
-    ca, sa, ce, se, ct, st = a.cos(), a.sin(), e.cos(), e.sin(), t.cos(), t.sin()
+    ca = a.cos()
+    sa = a.sin()
+    ce = e.cos()
+    se = e.sin()
+    ct = t.cos()
+    st = t.sin()
     # Rows of Rz(theta) Rx(e - 90) Rz(-a), rows two and three negated.
     rows = [
         [ct * ca - st * se * -sa, ct * sa - st * se * ca, -st * ce],
@@ -52,9 +71,10 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Inverse of :func:`rotation_from_viewpoint` for (..., 3, 3) rotations.
 
     Returns:
-        azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape (...). At the poles
-        (elevation +-90) theta is 0; close to one, rounding decides the azimuth, and theta matches it.
-        :func:`rotation_from_viewpoint` gives R back everywhere, within 5e-5 rad in float32.
+        azimuth in [0, 360), elevation in [-90, 90], theta in [-180, 180), degrees, each of shape
+        (...). At the poles (elevation +-90) theta is 0; close to one, rounding decides the azimuth,
+        and theta matches it. :func:`rotation_from_viewpoint` gives R back everywhere, within 5e-5
+        rad in float32.
 
     Example:
         >>> a, e, t = viewpoint_from_rotation(rotation_from_viewpoint(30.0, 20.0, -10.0))
@@ -63,36 +83,49 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     check_rotation(R, "R")
     # The direction to the camera's centre is -R[2].
-    cx, cy, cz = -R[..., 2, 0], -R[..., 2, 1], -R[..., 2, 2]
+    cx = -R[..., 2, 0]
+    cy = -R[..., 2, 1]
+    cz = -R[..., 2, 2]
     planar = torch.hypot(cx, cy)
     elevation = torch.atan2(cz, planar)
     pole = planar < 4 * torch.finfo(R.dtype).eps
     # At the pole R[0] = (cos(a -+ theta), sin(a -+ theta), 0).
     a = torch.atan2(torch.where(pole, R[..., 0, 1], cx), torch.where(pole, R[..., 0, 0], -cy))
-    # The first column of R Rz(a), (cos theta, -sin theta, 0), gives the theta that belongs to this azimuth.
-    ca, sa = a.cos(), a.sin()
-    theta = torch.atan2(-(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa)
+    # The first column of R Rz(a), (cos theta, -sin theta, 0), gives the theta that belongs to this
+    # azimuth.
+    ca = a.cos()
+    sa = a.sin()
+    theta = torch.atan2(
+        -(R[..., 1, 0] * ca + R[..., 1, 1] * sa), R[..., 0, 0] * ca + R[..., 0, 1] * sa
+    )
     theta = torch.where(pole, torch.zeros_like(theta), theta)
     azimuth = torch.rad2deg(a) % 360.0
     theta = (torch.rad2deg(theta) + 180.0) % 360.0 - 180.0
     # x % 360 may round up to 360 itself for a tiny negative x.
-    return torch.where(azimuth >= 360.0, torch.zeros_like(azimuth), azimuth), torch.rad2deg(elevation), theta
+    return (
+        torch.where(azimuth >= 360.0, torch.zeros_like(azimuth), azimuth),
+        torch.rad2deg(elevation),
+        theta,
+    )
 
 
 def up_rotation(up: str) -> Tensor:
-    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z axis does. glTF's
-    front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
+    """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z
+    axis does. glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
 
 
 def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
-    """(...) geodesic distances of rotations (..., 3, 3), ``acos((tr(R1^T R2) - 1) / 2)`` in degrees in [0, 180].
+    """(...) geodesic distances of rotations (..., 3, 3), ``acos((tr(R1^T R2) - 1) / 2)`` in degrees
+    in [0, 180].
 
-    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0; NaN for a missing estimate (NaN).
+    Computed as ``2 asin(|R1 - R2|_F / (2 sqrt 2))``, which is accurate near 0; NaN for a missing
+    estimate (NaN).
 
     Example:
-        >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0), rotation_from_viewpoint(30.0, 0.0))), 3)
+        >>> round(float(rotation_error(rotation_from_viewpoint(0.0, 0.0),
+        ...     rotation_from_viewpoint(30.0, 0.0))), 3)
         30.0
     """
     check_rotation(R1, "R1")
@@ -101,7 +134,8 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))
 
 
-DEFAULT_DISTANCE = 5.0  # of a view in units of the object's radius: docs/experiments.md compares others
+# of a view in units of the object's radius: docs/experiments.md compares others
+DEFAULT_DISTANCE = 5.0
 
 
 @dataclass(frozen=True)
@@ -110,7 +144,8 @@ class ViewSphere:
 
     Attributes:
         azimuth, elevation, theta: (N,) degrees.
-        distance: (N,) camera to object centre, in units of the object's radius (half the diagonal of its box).
+        distance: (N,) camera to object centre, in units of the object's radius (half the diagonal
+            of its box).
     """
 
     azimuth: Tensor
@@ -121,15 +156,21 @@ class ViewSphere:
     def __post_init__(self) -> None:
         shapes = {tuple(v.shape) for v in (self.azimuth, self.elevation, self.theta, self.distance)}
         if len(shapes) != 1 or self.azimuth.ndim != 1:
-            raise InvalidInputError(f"ViewSphere: expected four tensors of one shape (N,), got shapes {sorted(shapes)}")
+            raise InvalidInputError(
+                f"ViewSphere: expected four tensors of one shape (N,), got shapes {sorted(shapes)}"
+            )
         if not bool((self.distance > 1).all()):
-            raise InvalidInputError("ViewSphere: expected distances > 1 object radius (the camera outside the object)")
+            raise InvalidInputError(
+                "ViewSphere: expected distances > 1 object radius (the camera outside the object)"
+            )
 
     def __len__(self) -> int:
         return self.azimuth.numel()
 
     def __getitem__(self, index: Tensor | slice) -> "ViewSphere":
-        return ViewSphere(self.azimuth[index], self.elevation[index], self.theta[index], self.distance[index])
+        return ViewSphere(
+            self.azimuth[index], self.elevation[index], self.theta[index], self.distance[index]
+        )
 
     @property
     def rotations(self) -> Tensor:
@@ -137,14 +178,23 @@ class ViewSphere:
         return rotation_from_viewpoint(self.azimuth, self.elevation, self.theta)
 
     def for_up(self, up: str) -> "ViewSphere":
-        """Return the same views of an object whose axis ``up`` (:func:`up_rotation`) points up, in its own frame."""
+        """Return the same views of an object whose axis ``up`` (:func:`up_rotation`) points up, in
+        its own frame."""
         return self if up == "z" else self.in_frame(up_rotation(up))
 
     def in_frame(self, rotation: Tensor) -> "ViewSphere":
-        """Return the same views in the frame that ``rotation`` (3, 3) turns into the frame of these."""
-        exact = rotation_from_viewpoint(self.azimuth.double(), self.elevation.double(), self.theta.double())
+        """Return the same views in the frame that ``rotation`` (3, 3) turns into the frame of
+        these."""
+        exact = rotation_from_viewpoint(
+            self.azimuth.double(), self.elevation.double(), self.theta.double()
+        )
         azimuth, elevation, theta = viewpoint_from_rotation(exact @ rotation.to(exact))
-        return ViewSphere(azimuth.to(self.azimuth), elevation.to(self.azimuth), theta.to(self.azimuth), self.distance)
+        return ViewSphere(
+            azimuth.to(self.azimuth),
+            elevation.to(self.azimuth),
+            theta.to(self.azimuth),
+            self.distance,
+        )
 
 
 def sample_views(
@@ -162,7 +212,8 @@ def sample_views(
         distances: in units of the object's radius, > 1.
 
     Returns:
-        All combinations, distance fastest, then theta, azimuth, elevation. Duplicates at the poles stay.
+        All combinations, distance fastest, then theta, azimuth, elevation. Duplicates at the poles
+        stay.
 
     Example:
         >>> len(sample_views(azimuth_step=20, elevations=[0, 50], thetas=[-10, 0, 10]))
@@ -171,23 +222,34 @@ def sample_views(
     count = max(1, round(360.0 / check_positive(azimuth_step, "azimuth_step")))
     heights = check_numbers(elevations, "elevations")
     if float(heights.abs().max()) > 90.0:
-        raise InvalidInputError(f"elevations: expected degrees in [-90, 90], got {heights.tolist()}")
+        raise InvalidInputError(
+            f"elevations: expected degrees in [-90, 90], got {heights.tolist()}"
+        )
     azimuths = torch.arange(count, dtype=torch.float64) * 360.0 / count
-    axes = [heights, azimuths, check_numbers(thetas, "thetas"), check_numbers(distances, "distances")]
-    elevation, azimuth, theta, distance = (v.flatten().float() for v in torch.meshgrid(*axes, indexing="ij"))
+    axes = [
+        heights,
+        azimuths,
+        check_numbers(thetas, "thetas"),
+        check_numbers(distances, "distances"),
+    ]
+    elevation, azimuth, theta, distance = (
+        v.flatten().float() for v in torch.meshgrid(*axes, indexing="ij")
+    )
     return ViewSphere(azimuth, elevation, theta, distance)
 
 
-PAPER_RADIUS = 0.2  # m, of the object: the paper's distances are metric, its objects are not described
+# m, of the object: the paper's distances are metric, its objects are not described
+PAPER_RADIUS = 0.2
 
 
 def paper_views() -> ViewSphere:
-    """The paper's grid: azimuth in steps of 20 degrees, elevation of 50 degrees, distance of 0.3 m up to 2 m, for an
-    object with a radius of 0.2 m.
+    """The paper's grid: azimuth in steps of 20 degrees, elevation of 50 degrees, distance of 0.3 m
+    up to 2 m, for an object with a radius of 0.2 m.
 
-    The paper says "around 700" views. Its steps give that number where elevation runs on over the poles, around the
-    whole circle (0, 50, ..., 300 degrees): 18 x 7 x 6 = 756. Past a pole the camera is upside down. An orthographic
-    camera, as the paper's, does not see the distance: there, 126 of these views differ.
+    The paper says "around 700" views. Its steps give that number where elevation runs on over the
+    poles, around the whole circle (0, 50, ..., 300 degrees): 18 x 7 x 6 = 756. Past a pole the
+    camera is upside down. An orthographic camera, as the paper's, does not see the distance: there,
+    126 of these views differ.
 
     Example:
         >>> len(paper_views())
@@ -207,18 +269,25 @@ def paper_views() -> ViewSphere:
 
 
 def uniform_views(
-    count: int, *, thetas: Sequence[float] = (0.0,), distances: Sequence[float] = (DEFAULT_DISTANCE,)
+    count: int,
+    *,
+    thetas: Sequence[float] = (0.0,),
+    distances: Sequence[float] = (DEFAULT_DISTANCE,),
 ) -> ViewSphere:
-    """``count`` near-uniform view directions on the sphere, by the Fibonacci spiral, each with every theta and distance
-    as in :func:`sample_views`. No direction is farther than ``157 / sqrt(count)`` degrees from the nearest view
-    (measured for 2 to 3000 directions).
+    """``count`` near-uniform view directions on the sphere, by the Fibonacci spiral, each with
+    every theta and distance as in :func:`sample_views`. No direction is farther than
+    ``157 / sqrt(count)`` degrees from the nearest view (measured for 2 to 3000 directions).
 
     Example:
         >>> len(uniform_views(100, thetas=[0, 90, 180, 270]))
         400
     """
     check_integer(count, "count")
-    axes = torch.arange(count).double(), check_numbers(thetas, "thetas"), check_numbers(distances, "distances")
+    axes = (
+        torch.arange(count).double(),
+        check_numbers(thetas, "thetas"),
+        check_numbers(distances, "distances"),
+    )
     i, theta, distance = (v.flatten() for v in torch.meshgrid(*axes, indexing="ij"))
     elevation = torch.rad2deg(torch.asin(-1.0 + 2.0 * (i + 0.5) / count))
     azimuth = (i * 180.0 * (3.0 - math.sqrt(5.0))) % 360.0

@@ -1,4 +1,5 @@
-"""What is to be expected of a mesh before a photograph is taken: its state, views that look alike, and a trial."""
+"""What is to be expected of a mesh before a photograph is taken: its state, views that look alike,
+and a trial."""
 
 from .report import Inspection as Inspection
 from .report import inspect as inspect

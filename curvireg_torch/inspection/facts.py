@@ -1,4 +1,5 @@
-"""The state of a mesh: size, faces, parts, colours and symmetries, and what is wrong with it, in words."""
+"""The state of a mesh: size, faces, parts, colours and symmetries, and what is wrong with it, in
+words."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,15 +15,19 @@ from ..matching.describe import VIEW_FACES
 from ..mesh import has_colours, mesh_symmetries, mesh_unit, mesh_warnings
 from ..mesh.mesh import extreme_points, mesh_radius
 
-MANY_FACES = 200_000  # From which simplification is advised: reading and the first bank take longer than a photograph
+# From which simplification is advised: reading and the first bank take longer than a photograph
+MANY_FACES = 200_000
 MANY_PARTS = 50
 THIN = 0.02  # Shortest side of the box, as a fraction of the longest, of a thin mesh
-# Area of the surface as a fraction of that of its convex hull, below which a mesh is a wire: a chair of tubes has 0.1
+# Area of the surface as a fraction of that of its convex hull, below which a mesh is a wire: a
+# chair of tubes has 0.1
 WIRE_AREA = 0.02
-# Standard deviation of the distances from the middle, relative to their mean, below which a mesh is a sphere
+# Standard deviation of the distances from the middle, relative to their mean, below which a mesh is
+# a sphere
 SPHERE_SPREAD = 0.03
 # Metres across between which a mesh is an object that someone photographs
-SMALLEST, LARGEST = 0.005, 20.0
+SMALLEST = 0.005
+LARGEST = 20.0
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048}
 SYMMETRY_POINTS = 2_000
 CONTINUOUS_TURN = 15.0  # Degrees below which a symmetry is one of a body of revolution
@@ -35,7 +40,8 @@ class Symmetry:
     Attributes:
         transform: (4, 4) float64 of the model frame.
         angle: degrees.
-        deviation_percent: mean distance of the rotated surface from the surface, in percent of the diameter.
+        deviation_percent: mean distance of the rotated surface from the surface, in percent of the
+            diameter.
     """
 
     transform: Tensor
@@ -61,7 +67,8 @@ class MeshFacts:
         faces, parts: numbers of faces, and of connected parts.
         is_watertight: whether every edge has two faces.
         doubled_faces: number of faces that exist twice.
-        area_of_hull: area of the surface as a fraction of that of the convex hull; a closed convex body has 1.
+        area_of_hull: area of the surface as a fraction of that of the convex hull; a closed convex
+            body has 1.
         is_coloured: whether colours vary over the surface.
         symmetries: rotations but the identity that leave the shape as it is.
         warnings: what is wrong, in words.
@@ -112,24 +119,36 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     welded.merge_vertices()  # files such as STL repeat the corners of each face
     rows = np.sort(welded.faces, axis=1)
     doubled_faces = len(rows) - len(trimesh.grouping.unique_rows(rows)[0])
-    corners = trimesh.graph.connected_component_labels(welded.edges_unique, node_count=len(welded.vertices))
+    corners = trimesh.graph.connected_component_labels(
+        welded.edges_unique, node_count=len(welded.vertices)
+    )
     parts = len(np.unique(corners[welded.faces]))
     symmetries = measured_symmetries(mesh)
     is_coloured = has_colours(mesh)
     warnings = [warning.text for warning in mesh_warnings(mesh)]
     warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
     if len(mesh.faces) > MANY_FACES:
-        warnings.append(f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}; simplify it, and it loads faster")
+        warnings.append(
+            f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}; simplify it, and it loads "
+            f"faster"
+        )
     if doubled_faces:
-        warnings.append(f"{doubled_faces:,} faces exist twice: harmless here, but other programs draw them flickering")
+        warnings.append(
+            f"{doubled_faces:,} faces exist twice: harmless here, but other programs draw them "
+            f"flickering"
+        )
     if parts > MANY_PARTS:
-        warnings.append(f"{parts:,} loose parts: leave out what no photograph shows, such as screws inside")
+        warnings.append(
+            f"{parts:,} loose parts: leave out what no photograph shows, such as screws inside"
+        )
     if extents.min() < THIN * extents.max():
         warnings.append("thin: its pose is uncertain where it is seen from the edge")
     is_sphere = _is_sphere(mesh)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
-        warnings.append("a sphere: it looks the same from everywhere, so its rotation cannot be seen")
+        warnings.append(
+            "a sphere: it looks the same from everywhere, so its rotation cannot be seen"
+        )
     elif symmetries and not is_coloured:
         warnings.append(_symmetry_warning(symmetries))
     if is_wire:
@@ -159,7 +178,8 @@ def measured_symmetries(mesh: trimesh.Trimesh) -> tuple[Symmetry, ...]:
     tree = cKDTree(points)
     diameter = 2.0 * mesh_radius(mesh)
     sample = points[::20]
-    spacing = float(tree.query(sample, k=2)[0][:, 1].mean())  # of points on one and the same surface
+    # of points on one and the same surface
+    spacing = float(tree.query(sample, k=2)[0][:, 1].mean())
     angles = rotation_error(transforms[:, :3, :3], torch.eye(3, dtype=torch.float64)).tolist()
     symmetries = []
     for transform, angle in zip(transforms[1:], angles[1:], strict=True):
@@ -190,7 +210,15 @@ def _is_sphere(mesh: trimesh.Trimesh) -> bool:
 
 def _symmetry_warning(symmetries: tuple[Symmetry, ...]) -> str:
     if any(symmetry.angle < CONTINUOUS_TURN for symmetry in symmetries):
-        return "a body of revolution without colours: its turn about the axis cannot be seen, and is not counted"
+        return (
+            "a body of revolution without colours: its turn about the axis cannot be seen, "
+            "and is "
+            "not counted"
+        )
     worst = max(symmetry.deviation_percent for symmetry in symmetries)
     count = len(symmetries) + 1
-    return f"it looks the same in {count} orientations (up to {worst:.2g} % of its diameter): a pose is one of as many"
+    return (
+        f"it looks the same in {count} orientations (up to {worst:.2g} % of its diameter): a "
+        f"pose "
+        f"is one of as many"
+    )

@@ -13,11 +13,15 @@ from ..matching import ViewBank, ViewDescriber
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
 RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
-CANDIDATES = 3  # Views of the bank that are tried for each direction, beside its half turns about the mesh's axes
+# Views of the bank that are tried for each direction, beside its half turns about the mesh's axes
+CANDIDATES = 3
 TURNED = 2  # Candidates that are turned to come nearer
-# Degrees that a photograph resolves: poses look alike that differ by no more than a pose from itself, turned so far
+# Degrees that a photograph resolves: poses look alike that differ by no more than a pose from
+# itself, turned so far
 RESOLUTION = 3.0
-HALF_TURNS = torch.stack([2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()])
+HALF_TURNS = torch.stack(
+    [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
+)
 STEPS = (6.0, 2.0)  # Degrees by which a candidate is turned to come nearer
 
 
@@ -46,20 +50,31 @@ class LookAlike:
     def to_dict(self) -> dict[str, Any]:
         views = {}
         for name, rotation in (("view", self.rotation), ("rival", self.rival)):
-            azimuth, elevation, theta = (float(angle) for angle in viewpoint_from_rotation(rotation))
+            azimuth, elevation, theta = (
+                float(angle) for angle in viewpoint_from_rotation(rotation)
+            )
             views[name] = {"azimuth": azimuth, "elevation": elevation, "theta": theta}
-        numbers = {"angle_deg": self.angle, "similarity": self.similarity, "resolved": self.resolved}
+        numbers = {
+            "angle_deg": self.angle,
+            "similarity": self.similarity,
+            "resolved": self.resolved,
+        }
         return {**views, **numbers, "alike": self.is_alike}
 
 
 @torch.no_grad()
 def look_alikes(
-    bank: ViewBank, describer: ViewDescriber, symmetries: Tensor | None, *, elevations: tuple[float, float] = (-90, 90)
+    bank: ViewBank,
+    describer: ViewDescriber,
+    symmetries: Tensor | None,
+    *,
+    elevations: tuple[float, float] = (-90, 90),
 ) -> tuple[LookAlike, ...]:
-    """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the sphere.
+    """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the
+    sphere.
 
-    Candidates are views of the bank, and half turns about the axes of the mesh; the best are turned until they are
-    most similar. Descriptors are those by which poses
+    Candidates are views of the bank, and half turns about the axes of the mesh; the best are turned
+    until they are most similar. Descriptors are those by which poses
     are compared with photographs.
 
     Args:
@@ -74,7 +89,11 @@ def look_alikes(
     distance = bank.distances.median().double().cpu()
     descriptors = _described(describer, directions, distance)
     resolved = _resolved(describer, directions, distance, descriptors)
-    group = torch.eye(3, dtype=torch.float64)[None] if symmetries is None else symmetries[:, :3, :3].double()
+    group = (
+        torch.eye(3, dtype=torch.float64)[None]
+        if symmetries is None
+        else symmetries[:, :3, :3].double()
+    )
     views = bank.rotations.double().cpu()
     coarse = F.normalize(bank.descriptors, dim=1)
     matched = _matched(bank, describer, directions, distance)
@@ -90,7 +109,11 @@ def look_alikes(
         if not len(candidates):
             continue
         rival, score = _nearest(describer, candidates, distance, descriptors[row])
-        pairs.append(LookAlike(direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]))
+        pairs.append(
+            LookAlike(
+                direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]
+            )
+        )
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
 
 
@@ -104,9 +127,13 @@ def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) ->
     return F.normalize(describer.descriptors(rotations, distance.expand(len(rotations))), dim=1)
 
 
-def _matched(bank: ViewBank, describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:
+def _matched(
+    bank: ViewBank, describer: ViewDescriber, rotations: Tensor, distance: Tensor
+) -> Tensor:
     """(N, D) descriptors as the bank has them."""
-    return describer.with_settings(bank.settings).descriptors(rotations, distance.expand(len(rotations)))
+    return describer.with_settings(bank.settings).descriptors(
+        rotations, distance.expand(len(rotations))
+    )
 
 
 def _turns(degrees: float) -> Tensor:
@@ -116,8 +143,11 @@ def _turns(degrees: float) -> Tensor:
     return torch.stack([rotation_from_axis_angle(vector) for vector in vectors])
 
 
-def _resolved(describer: ViewDescriber, rotations: Tensor, distance: Tensor, descriptors: Tensor) -> list[float]:
-    """Of each rotation the mean similarity with itself, turned about the axes by what a photograph resolves."""
+def _resolved(
+    describer: ViewDescriber, rotations: Tensor, distance: Tensor, descriptors: Tensor
+) -> list[float]:
+    """Of each rotation the mean similarity with itself, turned about the axes by what a photograph
+    resolves."""
     turned = _turns(RESOLUTION) @ rotations[:, None]
     similar = _described(describer, turned.flatten(0, 1), distance).view(len(rotations), 6, -1)
     values: list[float] = (similar * descriptors[:, None]).sum(dim=2).mean(dim=1).tolist()
@@ -127,14 +157,17 @@ def _resolved(describer: ViewDescriber, rotations: Tensor, distance: Tensor, des
 def _nearest(
     describer: ViewDescriber, candidates: Tensor, distance: Tensor, descriptor: Tensor
 ) -> tuple[Tensor, float]:
-    """The candidate (3, 3) of (K, 3, 3) that comes nearest to a descriptor (D,) when turned, and its similarity."""
+    """The candidate (3, 3) of (K, 3, 3) that comes nearest to a descriptor (D,) when turned, and
+    its similarity."""
     unturned = _described(describer, candidates, distance) @ descriptor
     candidates = candidates[unturned.topk(min(TURNED, len(candidates))).indices.cpu()]
     still = torch.eye(3, dtype=torch.float64)[None]
     for degrees in STEPS:
         turns = torch.cat([still, _turns(degrees)])
         around = turns @ candidates[:, None]
-        similarity = (_described(describer, around.flatten(0, 1), distance) @ descriptor).view(len(candidates), -1)
+        similarity = (_described(describer, around.flatten(0, 1), distance) @ descriptor).view(
+            len(candidates), -1
+        )
         best = similarity.argmax(dim=1).cpu()
         candidates = around[torch.arange(len(candidates)), best]
         highest = similarity.amax(dim=1)

@@ -31,7 +31,7 @@ img {{ height: 14rem; background: #eee }} .warning {{ border-left: 4px solid #d9
 </style></head><body><h1>{title}</h1>
 {body}
 </body></html>
-"""
+"""  # noqa: E501
 
 
 def report_lines(report: Inspection) -> list[str]:
@@ -43,7 +43,9 @@ def report_lines(report: Inspection) -> list[str]:
     if report.trial is not None:
         lines.append(f"expected: {_in_words(report.trial.expected)}")
         for name, (before, after) in report.trial.compared.items():
-            change = f"right {before.right:.2f} -> {after.right:.2f}, reliable {before.reliable:.2f} -> "
+            change = (
+                f"right {before.right:.2f} -> {after.right:.2f}, reliable {before.reliable:.2f} -> "
+            )
             lines.append(f"  {name}: {change}{after.reliable:.2f} ({before.n} photographs)")
     lines += [f"warning: {text}" for text in report.warnings]
     return lines
@@ -63,13 +65,18 @@ def report_page(report: Inspection, registrar: Registrar | None, *, title: str) 
     if report.pairs:
         parts += ["<h2>Views that look alike</h2>", _pairs(report, registrar)]
     if report.trial is not None:
-        parts += ["<h2>What to expect</h2>", _expectation(report), _confusions(report.trial.outcomes, registrar)]
+        parts += [
+            "<h2>What to expect</h2>",
+            _expectation(report),
+            _confusions(report.trial.outcomes, registrar),
+        ]
     return _PAGE.format(title=html.escape(title), body="\n".join(parts))
 
 
 def _in_words(expected: Expected) -> str:
     shares = (
-        f"right in {expected.right:.2f}, reliable in {expected.reliable:.2f}, median {expected.median_deg:.1f} degrees"
+        f"right in {expected.right:.2f}, reliable in {expected.reliable:.2f}, median "
+        f"{expected.median_deg:.1f} degrees"
     )
     return f"{shares} (of {expected.n} generated photographs)"
 
@@ -78,12 +85,21 @@ def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
     unit = facts.unit or "units"
     sides = " x ".join(f"{side:.4g}" for side in facts.extents)
     closed = "closed" if facts.is_watertight else "open: edges without a second face"
-    colours = "vary: its print is used" if facts.is_coloured else "none, or one plain colour: only its shape is used"
+    colours = (
+        "vary: its print is used"
+        if facts.is_coloured
+        else "none, or one plain colour: only its shape is used"
+    )
     return [
         ("size", f"{sides} {unit}"),
         ("faces", f"{facts.faces:,} in {facts.parts:,} parts, {closed}"),
         ("colours", colours),
-        ("symmetries", f"{len(facts.symmetries) + 1} orientations look the same" if facts.symmetries else "none"),
+        (
+            "symmetries",
+            f"{len(facts.symmetries) + 1} orientations look the same"
+            if facts.symmetries
+            else "none",
+        ),
     ]
 
 
@@ -105,9 +121,13 @@ def _symmetry_table(facts: MeshFacts) -> str:
 
 def _pairs(report: Inspection, registrar: Registrar | None) -> str:
     count = (
-        f"From {len(report.alike)} of {len(report.pairs)} directions another side looks alike: their edges differ by"
+        f"From {len(report.alike)} of {len(report.pairs)} directions another side looks "
+        f"alike: "
+        f"their edges differ by"
     )
-    lines = [f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees.</p>"]
+    lines = [
+        f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees.</p>"
+    ]
     if registrar is None:
         return lines[0]
     for pair in report.pairs[:MOST_PAIRS]:
@@ -121,7 +141,10 @@ def _pair_figure(describer: ViewDescriber, registrar: Registrar, pair: LookAlike
     pictures = describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
     images = "".join(_image(_picture(picture)) for picture in pictures)
     verdict = "alike" if pair.is_alike else "different"
-    caption = f"{pair.angle:.0f}° apart: {verdict} (similarity {pair.similarity:.2f}, resolved {pair.resolved:.2f})"
+    caption = (
+        f"{pair.angle:.0f}° apart: {verdict} (similarity {pair.similarity:.2f}, resolved "
+        f"{pair.resolved:.2f})"
+    )
     return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
 
 
@@ -141,16 +164,28 @@ def _expectation(report: Inspection) -> str:
     header = ("photographs", "N", "right", "within 5°", "reliable", "reliable, wrong", "median")
     rows = [header, _row(f"all, camera {camera}", report.trial.expected)]
     for key, name in (("by_elevation_deg", "elevation {}°"), ("by_pixels_across", "{} px across")):
-        rows += [_row(name.format(interval), Expected(**values)) for interval, values in document[key].items()]
+        rows += [
+            _row(name.format(interval), Expected(**values))
+            for interval, values in document[key].items()
+        ]
     for name, (before, after) in report.trial.compared.items():
         rows += [_row("the first of them", before), _row(name, after)]
-    note = "Right: within 30 degrees. Generated photographs are simpler than real ones: no clutter, nothing in front."
+    note = (
+        "Right: within 30 degrees. Generated photographs are simpler than real ones: no "
+        "clutter, "
+        "nothing in front."
+    )
     return f"{_table(rows)}<p>{note}</p>"
 
 
 def _row(name: str, expected: Expected) -> tuple[str, ...]:
     shares = (expected.right, expected.within_5_deg, expected.reliable, expected.reliable_and_wrong)
-    return name, str(expected.n), *(f"{share:.2f}" for share in shares), f"{expected.median_deg:.1f}°"
+    return (
+        name,
+        str(expected.n),
+        *(f"{share:.2f}" for share in shares),
+        f"{expected.median_deg:.1f}°",
+    )
 
 
 def _confusions(outcomes: Sequence[Outcome], registrar: Registrar | None) -> str:
@@ -169,4 +204,7 @@ def _confusion_figure(outcome: Outcome, registrar: Registrar) -> str:
     drawn = draw_window(registrar.describer, outcome.result.projection, image, window, scale)
     confidence = outcome.result.confidence
     said = "" if confidence is None else f", confidence {int(100 * confidence) / 100:.2f}"
-    return f"<figure>{_image(jpeg(drawn, 85))}<figcaption>{outcome.error_deg:.0f}° off{said}</figcaption></figure>"
+    return (
+        f"<figure>{_image(jpeg(drawn, 85))}<figcaption>{outcome.error_deg:.0f}° "
+        f"off{said}</figcaption></figure>"
+    )

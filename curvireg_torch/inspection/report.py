@@ -34,8 +34,10 @@ class Inspection:
 
     Attributes:
         facts: the state of the mesh.
-        pairs: of each direction from which the mesh was looked at, the most similar other view, most similar first.
-        trial: generated photographs, registered; None for a mesh without hope, or where none were asked for.
+        pairs: of each direction from which the mesh was looked at, the most similar other view,
+            most similar first.
+        trial: generated photographs, registered; None for a mesh without hope, or where none were
+            asked for.
         seed: of the photographs.
         with_camera: whether the camera was known.
     """
@@ -57,11 +59,20 @@ class Inspection:
         warnings = list(self.facts.warnings)
         share = len(self.alike) / max(len(self.pairs), 1)
         if share >= MANY_ALIKE:
-            remedy = "give a hint (--azimuth, --side)" if self.facts.is_coloured else "give a texture or a hint"
-            warnings.append(f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}")
+            remedy = (
+                "give a hint (--azimuth, --side)"
+                if self.facts.is_coloured
+                else "give a texture or a hint"
+            )
+            warnings.append(
+                f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}"
+            )
         if self.trial is not None and self.trial.expected.right < MIN_RIGHT:
             right = 100 * self.trial.expected.right
-            warnings.append(f"only {right:.0f} % of generated photographs were registered right: expect wrong answers")
+            warnings.append(
+                f"only {right:.0f} % of generated photographs were registered right: expect wrong "
+                f"answers"
+            )
         return tuple(warnings)
 
     @property
@@ -122,7 +133,8 @@ def inspect(
         seed: of the photographs.
         with_camera: whether the camera is known.
         compare: also register a quarter of the photographs under other conditions.
-        pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in their file.
+        pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in
+            their file.
         backgrounds: (3, H, W) pictures or paths, instead of generated ones.
         progress: called with ("bank" or "photographs", done, total); to cancel, it may raise.
 
@@ -154,9 +166,13 @@ def inspect(
         if n == 0:
             return Inspection(facts, pairs, None, seed, with_camera)
         pictures = [_background(picture) for picture in backgrounds]
-        photographs = generate_photographs(clean, n, seed=seed, upright=upright, backgrounds=pictures)
+        photographs = generate_photographs(
+            clean, n, seed=seed, upright=upright, backgrounds=pictures
+        )
         report = None if progress is None else partial(progress, "photographs")
-        trial = run_trial(registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report)
+        trial = run_trial(
+            registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report
+        )
     return Inspection(facts, pairs, trial, seed, with_camera)
 
 

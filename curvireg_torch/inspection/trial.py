@@ -1,4 +1,5 @@
-"""Generated photographs of a mesh, registered with the defaults: how often the answer will be right."""
+"""Generated photographs of a mesh, registered with the defaults: how often the answer will be
+right."""
 
 import itertools
 import math
@@ -50,7 +51,8 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The answer for a generated photograph: rotation error up to symmetries, and what the registration says."""
+    """The answer for a generated photograph: rotation error up to symmetries, and what the
+    registration says."""
 
     photograph: Photograph
     result: Registration | None
@@ -97,7 +99,8 @@ class Expected:
 
 @dataclass(frozen=True)
 class Trial:
-    """Outcomes with the conditions that were asked for, and of a part of the photographs with others."""
+    """Outcomes with the conditions that were asked for, and of a part of the photographs with
+    others."""
 
     outcomes: tuple[Outcome, ...]
     compared: dict[str, tuple[Expected, Expected]]
@@ -108,7 +111,8 @@ class Trial:
         return Expected.of(self.outcomes)
 
     def by(self, key: Callable[[Outcome], float], borders: Sequence[float]) -> dict[str, Expected]:
-        """What is expected in each of the ranges between ``borders``; ranges without outcomes are left out."""
+        """What is expected in each of the ranges between ``borders``; ranges without outcomes are
+        left out."""
         ranges = {}
         for low, high in itertools.pairwise(borders):
             inside = [outcome for outcome in self.outcomes if low <= key(outcome) < high]
@@ -118,10 +122,16 @@ class Trial:
 
 
 def generate_photographs(
-    mesh: trimesh.Trimesh, count: int, *, seed: int, upright: bool, backgrounds: Sequence[Tensor] = ()
+    mesh: trimesh.Trimesh,
+    count: int,
+    *,
+    seed: int,
+    upright: bool,
+    backgrounds: Sequence[Tensor] = (),
 ) -> list[Photograph]:
-    """Photographs of a mesh at random poses, sizes and places, in random light, out of focus by up to 1.2 px, with
-    noise, in front of random or given ``backgrounds`` (3, H, W); boxes are wrong by about 5 % of their sides.
+    """Photographs of a mesh at random poses, sizes and places, in random light, out of focus by up
+    to 1.2 px, with noise, in front of random or given ``backgrounds`` (3, H, W); boxes are wrong by
+    about 5 % of their sides.
 
     Photograph k depends only on the seed and k.
     """
@@ -155,8 +165,8 @@ def run_trial(
     compare: bool = True,
     report_progress: Callable[[int, int], object] | None = None,
 ) -> Trial:
-    """Register photographs of the registrar's mesh, and a quarter of them without a camera, with a hint, and without
-    the mesh's colours, where these are other conditions."""
+    """Register photographs of the registrar's mesh, and a quarter of them without a camera, with a
+    hint, and without the mesh's colours, where these are other conditions."""
     symmetries = _symmetries(registrar)
     K = trial_camera() if with_camera else None
     conditions = _conditions(registrar, with_camera=with_camera) if compare else {}
@@ -169,7 +179,9 @@ def run_trial(
             report_progress(next(done), total)
         return outcome
 
-    outcomes = [reported(_register(registrar, photograph, K, symmetries)) for photograph in photographs]
+    outcomes = [
+        reported(_register(registrar, photograph, K, symmetries)) for photograph in photographs
+    ]
     before = Expected.of(outcomes[: len(part)])
     compared = {}
     for name, register in conditions.items():
@@ -178,7 +190,9 @@ def run_trial(
     return Trial(tuple(outcomes), compared)
 
 
-def _conditions(registrar: Registrar, *, with_camera: bool) -> dict[str, Callable[[Photograph, Tensor], Outcome]]:
+def _conditions(
+    registrar: Registrar, *, with_camera: bool
+) -> dict[str, Callable[[Photograph, Tensor], Outcome]]:
     """Other conditions by name, and how a photograph is registered under them."""
     K = trial_camera()
     given = K if with_camera else None
@@ -189,14 +203,18 @@ def _conditions(registrar: Registrar, *, with_camera: bool) -> dict[str, Callabl
         generator = torch.Generator().manual_seed(int(1000 * photograph.box.sum().abs()))
         error = HINT_DEGREES * (2.0 * float(torch.rand((), generator=generator)) - 1.0)
         middle = _azimuth(registrar.bank.mesh, photograph.truth) + error
-        prior = PosePrior(azimuth=((middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0))
+        prior = PosePrior(
+            azimuth=((middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0)
+        )
         return _register(registrar, photograph, given, symmetries, prior=prior)
 
     def with_two(photograph: Photograph, symmetries: Tensor) -> Outcome:
         return _register_pair(registrar, photograph, symmetries)
 
     conditions: dict[str, Callable[[Photograph, Tensor], Outcome]] = {
-        camera_name: lambda photograph, symmetries: _register(registrar, photograph, other, symmetries),
+        camera_name: lambda photograph, symmetries: _register(
+            registrar, photograph, other, symmetries
+        ),
         f"with a hint: azimuth within {HINT_DEGREES:g} degrees": with_hint,
         "with a second photograph from another side": with_two,
     }
@@ -220,7 +238,9 @@ def _register(
     prior: PosePrior | None = None,
 ) -> Outcome:
     result = registrar([photograph.image], photograph.box[None], K, prior=prior)[0]
-    return _outcome(registrar, photograph, result if isinstance(result, Registration) else None, symmetries)
+    return _outcome(
+        registrar, photograph, result if isinstance(result, Registration) else None, symmetries
+    )
 
 
 def _register_pair(registrar: Registrar, photograph: Photograph, symmetries: Tensor) -> Outcome:
@@ -228,23 +248,32 @@ def _register_pair(registrar: Registrar, photograph: Photograph, symmetries: Ten
     K = trial_camera()
     mesh = registrar.bank.mesh
     generator = torch.Generator().manual_seed(int(photograph.box.sum().abs() * 1000))
-    turn = rotation_from_axis_angle(torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64))
-    centre = photograph.truth[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0)) + photograph.truth[:3, 3]
+    turn = rotation_from_axis_angle(
+        torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
+    )
+    centre = (
+        photograph.truth[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
+        + photograph.truth[:3, 3]
+    )
     move = torch.eye(4, dtype=torch.float64)
     move[:3, :3] = turn
     move[:3, 3] = centre - turn @ centre
     image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
     cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
     try:
-        result = registrar.register_views([photograph.image, image], torch.stack([photograph.box, box]), K, cameras)
+        result = registrar.register_views(
+            [photograph.image, image], torch.stack([photograph.box, box]), K, cameras
+        )
     except CurviregError:
         return _outcome(registrar, photograph, None, symmetries)
     return _outcome(registrar, photograph, result, symmetries)
 
 
-def _outcome(registrar: Registrar, photograph: Photograph, result: Registration | None, symmetries: Tensor) -> Outcome:
-    """The outcome of a registration; without a camera, rotations are compared as a camera that looks at the object
-    sees them."""
+def _outcome(
+    registrar: Registrar, photograph: Photograph, result: Registration | None, symmetries: Tensor
+) -> Outcome:
+    """The outcome of a registration; without a camera, rotations are compared as a camera that
+    looks at the object sees them."""
     truth = photograph.truth[:3, :3]
     elevation = float(viewpoint_from_rotation(truth)[1])
     if result is None:
@@ -266,7 +295,9 @@ def _symmetries(registrar: Registrar) -> Tensor:
     return transforms[:, :3, :3].double()
 
 
-def _random_truth(mesh: trimesh.Trimesh, K: Tensor, generator: torch.Generator, *, upright: bool) -> Tensor:
+def _random_truth(
+    mesh: trimesh.Trimesh, K: Tensor, generator: torch.Generator, *, upright: bool
+) -> Tensor:
     """A (4, 4) pose that shows the mesh; seen from everywhere and rolled, unless it is upright."""
     elevations = (-10.0, 60.0) if upright else (-90.0, 90.0)
     T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)

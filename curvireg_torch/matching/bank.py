@@ -1,4 +1,5 @@
-"""A bank of rendered views of a mesh, described once, stored as safetensors, and matched many times."""
+"""A bank of rendered views of a mesh, described once, stored as safetensors, and matched many
+times."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -19,7 +20,15 @@ from ..errors import BankError, CurviregError, InvalidInputError, MissingFileErr
 from ..geometry.viewpoint import ViewSphere, up_rotation
 from ..mesh import MeshWarning, has_colours, mesh_symmetries, mesh_warnings
 from ..mesh.colours import SurfaceColours, surface_colours
-from ..mesh.mesh import as_mesh, checked_triangles, extreme_points, mesh_radius, mesh_unit, mesh_up, principal_rotation
+from ..mesh.mesh import (
+    as_mesh,
+    checked_triangles,
+    extreme_points,
+    mesh_radius,
+    mesh_unit,
+    mesh_up,
+    principal_rotation,
+)
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Precision, Whitening, ledoit_wolf
@@ -29,7 +38,8 @@ from ..utils.files import tensor_digest, write_tensors
 from ..utils.threads import single_threaded_pool
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
-FORMAT, FORMAT_VERSION = "curvireg_torch.ViewBank", 8
+FORMAT = "curvireg_torch.ViewBank"
+FORMAT_VERSION = 8
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
 REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
@@ -43,28 +53,40 @@ class ViewBank:
         views: the N viewpoints.
         pipeline: the pipeline that the bank was built for.
         descriptors: (N, D) float32.
-        boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the object on the axis.
-        appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank. Meshes with colours
-            have grey features followed by coloured ones.
-        described_views_file: where those of a large bank are kept, as views are described; None keeps them in memory.
+        boxes: (N, 4) float64 boxes of the object in normalised image coordinates, centre of the
+            object on the axis.
+        appearance: (N, D) float16 features for the :class:`Appearance` term; None in a large bank.
+            Meshes with colours have grey features followed by coloured ones.
+        described_views_file: where those of a large bank are kept, as views are described; None
+            keeps them in memory.
     """
 
     described_views_file: Path | None = None
 
     def __init__(
-        self, mesh: trimesh.Trimesh, views: ViewSphere, pipeline: Pipeline, tensors: Mapping[str, Tensor]
+        self,
+        mesh: trimesh.Trimesh,
+        views: ViewSphere,
+        pipeline: Pipeline,
+        tensors: Mapping[str, Tensor],
     ) -> None:
-        self.mesh, self.views, self.pipeline = mesh, views, pipeline
+        self.mesh = mesh
+        self.views = views
+        self.pipeline = pipeline
         self.descriptors = tensors["descriptors"].float()
         self.boxes = tensors["boxes"]
-        self._points, self._silhouettes = tensors["points"], tensors["silhouettes"]
+        self._points = tensors["points"]
+        self._silhouettes = tensors["silhouettes"]
         self.appearance = tensors.get("appearance")
 
     def __len__(self) -> int:
         return len(self.views)
 
     def __repr__(self) -> str:
-        return f"ViewBank({len(self)} views of a mesh of {len(self.mesh.faces)} faces, {self.settings})"
+        return (
+            f"ViewBank({len(self)} views of a mesh of {len(self.mesh.faces)} faces, "
+            f"{self.settings})"
+        )
 
     @property
     def settings(self) -> BankSettings:
@@ -87,12 +109,14 @@ class ViewBank:
 
     @cached_property
     def whitening(self) -> Whitening:
-        """By mean and shrunk covariance of the views' descriptors, for ``Correlation(whitening="bank")``."""
+        """By mean and shrunk covariance of the views' descriptors, for
+        ``Correlation(whitening="bank")``."""
         return Whitening(*ledoit_wolf(self.descriptors))
 
     @cached_property
     def precision(self) -> Precision:
-        """Inverse of the shrunk covariance of the views' descriptors, for ``Correlation(whitening="paper")``."""
+        """Inverse of the shrunk covariance of the views' descriptors, for
+        ``Correlation(whitening="paper")``."""
         return Precision(self.descriptors)
 
     def points_at(self, index: Tensor | slice) -> Tensor:
@@ -104,16 +128,20 @@ class ViewBank:
         return _unpack(self._silhouettes[index], self.settings.image_size)
 
     def check_compatible(self, pipeline: Pipeline) -> None:
-        """Raise :class:`BankError` unless settings and view policy are those of ``pipeline``; views that were passed by
-        the caller (``pose="given"``) fit every policy."""
-        mine, theirs = asdict(self.settings), asdict(pipeline.bank)
+        """Raise :class:`BankError` unless settings and view policy are those of ``pipeline``; views
+        that were passed by the caller (``pose="given"``) fit every policy."""
+        mine = asdict(self.settings)
+        theirs = asdict(pipeline.bank)
         if self.pipeline.views.pose != "given":
             mine |= self.pipeline.views.key_fields()
             theirs |= pipeline.views.key_fields()
         if mine != theirs:
             names = [n for n in mine if n in theirs and mine[n] != theirs[n]]
             differences = ", ".join(f"{n} {mine[n]}, expected {theirs[n]}" for n in names)
-            raise BankError(f"bank: built with other settings ({differences}); build it again, or use bank.pipeline")
+            raise BankError(
+                f"bank: built with other settings ({differences}); build it again, or use "
+                f"bank.pipeline"
+            )
 
     @classmethod
     def build(
@@ -136,19 +164,25 @@ class ViewBank:
             image_size, camera: instead of the pipeline's.
             renderer: "auto", "embree", "pyrender" or a :class:`DepthRenderer` of this mesh.
             pipeline: default ``Pipeline()``.
-            progress: show a bar; or a callback (stage "bank", views done, views in all) that may raise to cancel.
+            progress: show a bar; or a callback (stage "bank", views done, views in all) that may
+                raise to cancel.
             device: where views are filtered and described, and where the bank is stored.
 
         Example:
             >>> from curvireg_torch.geometry import sample_views
-            >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90, elevations=[20]),
+            >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90,
+            ...     elevations=[20]),
             ...                       image_size=64, progress=False)
             >>> len(bank), bank.descriptors.shape
             (4, torch.Size([4, 1764]))
         """
-        mesh, pipeline = as_mesh(mesh), pipeline or Pipeline()
+        mesh = as_mesh(mesh)
+        pipeline = pipeline or Pipeline()
         options: dict[str, Any] = {"image_size": image_size, "camera": camera}
-        pipeline = replace(pipeline, bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}))
+        pipeline = replace(
+            pipeline,
+            bank=replace(pipeline.bank, **{k: v for k, v in options.items() if v is not None}),
+        )
         if views is None:
             views = views_of(mesh, pipeline.views)
         elif len(views) == 0:
@@ -156,12 +190,16 @@ class ViewBank:
         else:
             pipeline = pipeline.with_pose_prior("given")
         describe = ViewDescriber(mesh, pipeline.bank, renderer=renderer, device=device)
-        rotations, distances = views.rotations, views.distance * mesh_radius(mesh)
+        rotations = views.rotations
+        distances = views.distance * mesh_radius(mesh)
         term = pipeline.stored_appearance(len(views))
         appearance = None if term is None else term.build().to(device)
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
-            chunk = rotations[start : start + VIEWS_AT_A_TIME], distances[start : start + VIEWS_AT_A_TIME]
+            chunk = (
+                rotations[start : start + VIEWS_AT_A_TIME],
+                distances[start : start + VIEWS_AT_A_TIME],
+            )
             tensors = packed(describe(*chunk))
             if appearance is not None:
                 tensors["appearance"] = appearance.describe(describe.shaded(*chunk)).half()
@@ -182,8 +220,11 @@ class ViewBank:
 
     def to(self, device: torch.device | str) -> "ViewBank":
         """The same bank on another device."""
-        bank = ViewBank(self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()})
-        on_cpu = bank.device.type == "cpu"  # another device rounds differently: a file has the features of a CPU
+        bank = ViewBank(
+            self.mesh, self.views, self.pipeline, {k: v.to(device) for k, v in self.tensors.items()}
+        )
+        # another device rounds differently: a file has the features of a CPU
+        on_cpu = bank.device.type == "cpu"
         bank.described_views_file = self.described_views_file if on_cpu else None
         return bank
 
@@ -199,7 +240,8 @@ class ViewBank:
         }
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write a safetensors file atomically. Descriptors in float16 change cosines by less than 1e-4."""
+        """Write a safetensors file atomically. Descriptors in float16 change cosines by less than
+        1e-4."""
         contents = {**self.tensors, "descriptors": self.descriptors.half()}
         contents |= {f"views.{f.name}": getattr(self.views, f.name) for f in fields(ViewSphere)}
         arrays = {f"mesh.{name}": x for name, x in colour_arrays(self.mesh).items()}
@@ -235,29 +277,42 @@ class ViewBank:
         """
         path = Path(path)
         if not path.is_file():
-            raise MissingFileError(f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path)
+            raise MissingFileError(
+                f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path
+            )
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
                 if metadata.get("format") != FORMAT:
-                    raise BankError("not a view bank; build one with 'curvireg bank MESH --out FILE'", subject=path)
+                    raise BankError(
+                        "not a view bank; build one with 'curvireg bank MESH --out FILE'",
+                        subject=path,
+                    )
                 if (version := metadata.get("version")) != str(FORMAT_VERSION):
-                    message = f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
+                    message = (
+                        f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
+                    )
                     raise BankError(message, subject=path)
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
             if metadata["checksum"] != tensor_digest(tensors, size=16):
-                raise BankError(f"changed since it was written (its checksum differs); {REBUILD}", subject=path)
+                raise BankError(
+                    f"changed since it was written (its checksum differs); {REBUILD}", subject=path
+                )
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
             tensors["descriptors"] = tensors["descriptors"].float()
             mesh = _mesh(tensors, metadata["unit"], metadata["up"])
             noticed = json.loads(metadata.get("warnings", "[]"))
-            mesh.metadata["warnings"] = tuple(MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed)
+            mesh.metadata["warnings"] = tuple(
+                MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed
+            )
             _check_contents(views, pipeline.bank, tensors)
         except BankError:
             raise
         except (SafetensorError, OSError) as error:
-            raise BankError(f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path) from error
+            raise BankError(
+                f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path
+            ) from error
         except Exception as error:  # a file may hold anything
             reason = str(error) if isinstance(error, CurviregError) else repr(error)
             reason = reason.partition("\n")[0][:200]
@@ -266,7 +321,8 @@ class ViewBank:
 
 
 def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:
-    """(3, 3) float64 rotation from the mesh's frame to the one in which the policy's azimuth and elevation are."""
+    """(3, 3) float64 rotation from the mesh's frame to the one in which the policy's azimuth and
+    elevation are."""
     return principal_rotation(mesh) if policy.frame == "principal" else up_rotation(mesh_up(mesh))
 
 
@@ -278,15 +334,23 @@ def views_of(mesh: trimesh.Trimesh, policy: ViewPolicy) -> ViewSphere:
 
 
 def packed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What :class:`ViewDescriber` says of N views, with its masks (N, S, S) bool as (N, ceil(S * S / 8)) uint8."""
+    """What :class:`ViewDescriber` says of N views, with its masks (N, S, S) bool as (N, ceil(S * S
+    / 8)) uint8."""
     masks = {name: tensors[name] for name in ("points", "silhouettes")}
-    small = {name: np.packbits(mask.flatten(1).cpu().numpy(), axis=1) for name, mask in masks.items()}
-    return {**tensors, **{name: torch.from_numpy(bits).to(masks[name].device) for name, bits in small.items()}}
+    small = {
+        name: np.packbits(mask.flatten(1).cpu().numpy(), axis=1) for name, mask in masks.items()
+    }
+    return {
+        **tensors,
+        **{name: torch.from_numpy(bits).to(masks[name].device) for name, bits in small.items()},
+    }
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     mesh = _triangles(tensors, "mesh")
-    mesh._cache.update({n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors})
+    mesh._cache.update(
+        {n: tensors[n] for n in ("extreme_points", "mesh_symmetries") if n in tensors}
+    )
     if len(mesh.faces) > VIEW_FACES:
         mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
     _check_extreme_points(mesh)
@@ -296,9 +360,15 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
         mesh.units = unit
     mesh.metadata["up"] = up
     if "mesh.colours.uv" in tensors:
-        colours = {n.removeprefix("mesh.colours."): x.numpy() for n, x in tensors.items() if "mesh.colours." in n}
+        colours = {
+            n.removeprefix("mesh.colours."): x.numpy()
+            for n, x in tensors.items()
+            if "mesh.colours." in n
+        }
         textures = tuple(colours[f"picture{k}"] for k in range(len(colours) - 3))
-        surface = SurfaceColours(colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures)
+        surface = SurfaceColours(
+            colours["corners"], colours["uv"].astype(np.float32), colours["texture"], textures
+        )
         surface.check(len(mesh.faces))
         mesh.metadata["colours"] = surface
     if not has_colours(mesh):
@@ -324,7 +394,11 @@ def _check_extreme_points(mesh: trimesh.Trimesh) -> None:
     if points.dtype != torch.float64:
         raise ValueError("extreme_points: expected float64")
     check_finite(points, "extreme_points")
-    bounds = torch.stack([points.amin(dim=0), points.amax(dim=0)]) if len(points) else torch.full((2, 3), torch.nan)
+    bounds = (
+        torch.stack([points.amin(dim=0), points.amax(dim=0)])
+        if len(points)
+        else torch.full((2, 3), torch.nan)
+    )
     gap = (bounds - torch.from_numpy(np.array(mesh.bounds))).abs().max()
     if not float(gap) <= EXTREME_TOLERANCE * mesh_radius(mesh):
         raise ValueError("extreme_points: those of another mesh")
@@ -335,27 +409,45 @@ def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:
     colours = surface_colours(mesh)
     if colours is None:
         return {}
-    arrays: dict[str, np.ndarray] = {"corners": colours.corners, "uv": colours.uv, "texture": colours.texture}
+    arrays: dict[str, np.ndarray] = {
+        "corners": colours.corners,
+        "uv": colours.uv,
+        "texture": colours.texture,
+    }
     arrays |= {f"picture{k}": texture for k, texture in enumerate(colours.textures)}
     return {f"colours.{name}": x for name, x in arrays.items()}
 
 
-def _check_contents(views: ViewSphere, settings: BankSettings, tensors: Mapping[str, Tensor]) -> None:
-    """Raise ValueError for contents that no bank has: a checksum only shows that the file was not changed."""
-    N, masks = len(views), -(-(settings.image_size**2) // 8)
-    widths = {"descriptors": hog_layer(settings).length, "boxes": 4, "points": masks, "silhouettes": masks}
+def _check_contents(
+    views: ViewSphere, settings: BankSettings, tensors: Mapping[str, Tensor]
+) -> None:
+    """Raise ValueError for contents that no bank has: a checksum only shows that the file was not
+    changed."""
+    N = len(views)
+    masks = -(-(settings.image_size**2) // 8)
+    widths = {
+        "descriptors": hog_layer(settings).length,
+        "boxes": 4,
+        "points": masks,
+        "silhouettes": masks,
+    }
     if "appearance" in tensors:
         widths["appearance"] = tensors["appearance"].shape[-1]
     for name, width in widths.items():
         x = tensors[name]
         # A sum in float32 is finite if all half-precision values are, and fast.
-        if x.shape != (N, width) or (x.is_floating_point() and not bool(x.sum(dtype=torch.float32).isfinite())):
+        if x.shape != (N, width) or (
+            x.is_floating_point() and not bool(x.sum(dtype=torch.float32).isfinite())
+        ):
             raise ValueError(f"{name}: not of the shape that the settings say, or not finite")
     if any(tensors[name].dtype != torch.uint8 for name in ("points", "silhouettes")):
         raise ValueError("points, silhouettes: expected uint8")
     if not all(bool(getattr(views, f.name).isfinite().all()) for f in fields(ViewSphere)):
         raise ValueError("viewpoints that are not finite")
-    if not tensors["descriptors"].any() or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all():
+    if (
+        not tensors["descriptors"].any()
+        or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all()
+    ):
         raise ValueError("descriptors that are all zero, or empty boxes")
 
 

@@ -24,15 +24,27 @@ from ..rendering import DepthRenderer
 from ..utils.files import code_digest, tensor_digest, text_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
-#: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT overrides it.
+#: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT
+#: overrides it.
 CACHE_LIMIT = 2_000_000_000
-ABANDONED_SECONDS = 3600.0  # Age from which an incomplete file counts as the remains of a killed process
+# Age from which an incomplete file counts as the remains of a killed process
+ABANDONED_SECONDS = 3600.0
 # Code that turns a mesh into described views: a bank that another version of it built is not found
-_SOURCES = ("features", "filters", "geometry", "mesh", "rendering", "terms.py", "pipeline.py", "matching/describe.py")
+_SOURCES = (
+    "features",
+    "filters",
+    "geometry",
+    "mesh",
+    "rendering",
+    "terms.py",
+    "pipeline.py",
+    "matching/describe.py",
+)
 
 
 class CachedBank(NamedTuple):
-    """A file of the cache: ``path``, ``size`` in bytes, and ``used``, the time of its last use in seconds."""
+    """A file of the cache: ``path``, ``size`` in bytes, and ``used``, the time of its last use in
+    seconds."""
 
     path: Path
     size: int
@@ -40,9 +52,10 @@ class CachedBank(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else ``~/.cache/curvireg_torch``. Only files named
-    ``bank-<32 digits>.safetensors`` or ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder
-    ``banks`` are ever listed, overwritten or removed."""
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else
+    ``~/.cache/curvireg_torch``. Only files named ``bank-<32 digits>.safetensors`` or
+    ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder ``banks`` are ever
+    listed, overwritten or removed."""
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):
@@ -54,14 +67,29 @@ def cache_folder() -> Path:
 
 
 def bank_key(
-    mesh: trimesh.Trimesh, views: ViewSphere, *, pipeline: Pipeline | None = None, renderer: str = "auto"
+    mesh: trimesh.Trimesh,
+    views: ViewSphere,
+    *,
+    pipeline: Pipeline | None = None,
+    renderer: str = "auto",
 ) -> str:
-    """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings, renderer and code."""
+    """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings,
+    renderer and code."""
     pipeline = pipeline or Pipeline()
-    settings = {**asdict(pipeline.bank), "appearance": pipeline.stored_appearance(len(views)) is not None}
-    arrays = {"vertices": np.array(mesh.vertices, np.float64), "faces": np.array(mesh.faces, np.int64)}
-    tensors = {name: torch.from_numpy(np.array(x)) for name, x in {**arrays, **colour_arrays(mesh)}.items()}
-    tensors |= {f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)}
+    settings = {
+        **asdict(pipeline.bank),
+        "appearance": pipeline.stored_appearance(len(views)) is not None,
+    }
+    arrays = {
+        "vertices": np.array(mesh.vertices, np.float64),
+        "faces": np.array(mesh.faces, np.int64),
+    }
+    tensors = {
+        name: torch.from_numpy(np.array(x)) for name, x in {**arrays, **colour_arrays(mesh)}.items()
+    }
+    tensors |= {
+        f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
+    }
     facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer]
     digests = [code_digest(*_SOURCES), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
@@ -77,29 +105,36 @@ def cached_bank(
     device: torch.device | str = "cpu",
     progress: bool | Callable[[str, int, int], object] = True,
 ) -> ViewBank:
-    """The bank from the cache, or a new one that is stored there, whereupon the cache is trimmed to its limit.
-    Concurrent processes are safe. A damaged file is built again. A folder that cannot be written causes a warning.
+    """The bank from the cache, or a new one that is stored there, whereupon the cache is trimmed to
+    its limit. Concurrent processes are safe. A damaged file is built again. A folder that cannot be
+    written causes a warning.
 
     Args:
         mesh, views, pipeline, device, progress: see :meth:`ViewBank.build`.
-        renderer: for a new bank; its name is part of the key. With a custom renderer the cache is not used.
+        renderer: for a new bank; its name is part of the key. With a custom renderer the cache is
+            not used.
         folder: default :func:`cache_folder`.
 
     Example:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
-        >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2], folder=folder, progress=False)
+        >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2],
+        ...     folder=folder, progress=False)
         >>> len(list_cache(folder)), clear_cache(folder)
         (1, 1)
     """
-    mesh, folder, pipeline = as_mesh(mesh), folder or cache_folder(), pipeline or Pipeline()
+    mesh = as_mesh(mesh)
+    folder = folder or cache_folder()
+    pipeline = pipeline or Pipeline()
     if views is None:
         views = views_of(mesh, pipeline.views)
     else:
         pipeline = pipeline.with_pose_prior("given")
 
     def build() -> ViewBank:
-        return ViewBank.build(mesh, views, pipeline=pipeline, renderer=renderer, device=device, progress=progress)
+        return ViewBank.build(
+            mesh, views, pipeline=pipeline, renderer=renderer, device=device, progress=progress
+        )
 
     if not isinstance(renderer, str):
         return build()
@@ -111,20 +146,27 @@ def cached_bank(
             with suppress(OSError):  # a read-only cache
                 os.utime(path)
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
-            bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
+            bank.described_views_file = (
+                _described_views_file(path) if bank.device.type == "cpu" else None
+            )
             return bank
     bank = build()
     bank.pipeline = pipeline
-    bank.descriptors = bank.descriptors.half().float()  # as the file stores them, so that both rank alike
+    # as the file stores them, so that both rank alike
+    bank.descriptors = bank.descriptors.half().float()
     bank.described_views_file = _described_views_file(path) if bank.device.type == "cpu" else None
     try:
         bank.save(path)
         _trim(folder, keep=path)
     except OutputError as error:
-        warning = f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
+        warning = (
+            f"the bank is not cached, so it will be built again: {error}, by CURVIREG_CACHE=FOLDER"
+        )
         warnings.warn(warning, stacklevel=2)
     except OSError as error:  # files may be added to the folder, but not removed
-        warning = f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
+        warning = (
+            f"the cache exceeds its limit: {error.filename} cannot be removed ({error.strerror})"
+        )
         warnings.warn(warning, stacklevel=2)
     return bank
 
@@ -135,8 +177,8 @@ def list_cache(folder: Path | None = None) -> list[CachedBank]:
 
 
 def clear_cache(folder: Path | None = None) -> int:
-    """Remove every bank of the cache, the features of its views, and incomplete files of killed processes; returns the
-    number of banks."""
+    """Remove every bank of the cache, the features of its views, and incomplete files of killed
+    processes; returns the number of banks."""
     files = _files(folder or cache_folder())
     for file in files:
         file.path.unlink(missing_ok=True)
@@ -153,13 +195,19 @@ def _is_bank(file: CachedBank) -> bool:
 
 
 def _trim(folder: Path, *, keep: Path) -> None:
-    """Remove the least recently used banks, but not ``keep``, until the limit is met, and abandoned files."""
+    """Remove the least recently used banks, but not ``keep``, until the limit is met, and abandoned
+    files."""
     given = os.environ.get("CURVIREG_CACHE_LIMIT", "")
-    limit, total = int(given) if given.isdecimal() else CACHE_LIMIT, 0
+    limit = int(given) if given.isdecimal() else CACHE_LIMIT
+    total = 0
     for file in _files(folder):
         total += file.size
         incomplete = file.path.suffix == ".tmp"
-        if (time.time() - file.used > ABANDONED_SECONDS) if incomplete else (total > limit and file.path != keep):
+        if (
+            (time.time() - file.used > ABANDONED_SECONDS)
+            if incomplete
+            else (total > limit and file.path != keep)
+        ):
             file.path.unlink(missing_ok=True)
             total -= file.size
 
@@ -169,7 +217,9 @@ def _files(folder: Path) -> list[CachedBank]:
     found = []
     with suppress(OSError):  # the folder does not exist yet, or cannot be read
         for path in (folder / "banks").iterdir():
-            if re.fullmatch(r"(bank|views)-[0-9a-f]{32}\.safetensors(\.[0-9a-f]{8}\.tmp)?", path.name):
+            if re.fullmatch(
+                r"(bank|views)-[0-9a-f]{32}\.safetensors(\.[0-9a-f]{8}\.tmp)?", path.name
+            ):
                 with suppress(FileNotFoundError):  # removed by another process
                     found.append(CachedBank(path, path.stat().st_size, path.stat().st_mtime))
     return sorted(found, key=lambda file: file.used, reverse=True)

@@ -1,4 +1,5 @@
-"""A coarse packing of a bank's views, and the appearance of its views, described once and stored beside the bank."""
+"""A coarse packing of a bank's views, and the appearance of its views, described once and stored
+beside the bank."""
 
 import weakref
 from collections.abc import Callable, Sequence
@@ -13,13 +14,16 @@ from ..errors import OutputError
 from ..utils.files import tensor_digest, write_tensors
 
 MAX_STORED_VIEWS = 2048
-"""Views whose appearance is kept, 35 kB each at 128 px. A packing of the 7200 default views at 20 degrees has 942."""
+"""Views whose appearance is kept, 35 kB each at 128 px. A packing of the 7200 default views at 20
+degrees has 942."""
 
 
 def cells_of_views(rotations: Tensor, representatives: Tensor) -> Tensor:
-    """(N,) index of the representative (C,) whose rotation is nearest to that of each view (N, 3, 3)."""
+    """(N,) index of the representative (C,) whose rotation is nearest to that of each view (N, 3,
+    3)."""
     flat = rotations.flatten(1)
-    traces = flat @ flat[representatives].T  # the trace of a relative rotation grows as its angle falls
+    # the trace of a relative rotation grows as its angle falls
+    traces = flat @ flat[representatives].T
     return traces.argmax(dim=1)
 
 
@@ -37,10 +41,11 @@ def best_cells(log_scores: Tensor, cells: Tensor, *, count: int) -> Tensor:
 
 
 class DescribedViews:
-    """Appearance features of views, by the index of the view: kept in memory, and in a file if there is one.
+    """Appearance features of views, by the index of the view: kept in memory, and in a file if
+    there is one.
 
-    The file is read when features are needed first, and written when these are released or the process ends; several
-    processes may share it, and a damaged file counts as none.
+    The file is read when features are needed first, and written when these are released or the
+    process ends; several processes may share it, and a damaged file counts as none.
 
     Args:
         path: the file; None keeps features in memory alone.
@@ -55,10 +60,12 @@ class DescribedViews:
             weakref.finalize(self, _store, path, self._features, self._stored)
 
     def features(self, views: Sequence[int], describe: Callable[[list[int]], Tensor]) -> Tensor:
-        """(U, D) features of views; those that are not known are described by ``describe``, which returns the float16
-        features of a list of views."""
+        """(U, D) features of views; those that are not known are described by ``describe``, which
+        returns the float16 features of a list of views."""
         self._read()
-        known = {view: feature for view in views if (feature := self._features.get(view)) is not None}
+        known = {
+            view: feature for view in views if (feature := self._features.get(view)) is not None
+        }
         missing = [view for view in views if view not in known]
         if missing:
             described = dict(zip(missing, describe(missing), strict=True))
@@ -98,6 +105,9 @@ def _store(path: Path, features: dict[int, Tensor], stored: set[int]) -> None:
     if len(together) > MAX_STORED_VIEWS:
         together = features
     views = sorted(together)
-    tensors = {"views": torch.tensor(views), "features": torch.stack([together[view] for view in views])}
+    tensors = {
+        "views": torch.tensor(views),
+        "features": torch.stack([together[view] for view in views]),
+    }
     with suppress(OutputError):  # a read-only or full cache: they are described again
         write_tensors(path, tensors, {"checksum": tensor_digest(tensors, size=16)})

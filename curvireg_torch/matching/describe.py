@@ -19,17 +19,25 @@ from ..rendering import DepthRenderer, make_renderer, render_colour, shade
 from ..rendering.contours import LEVELS, MeshContours
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
-VIEW_FACES = LEVELS[-1][1]  # to which larger meshes are simplified for views: their contours are those of full size
-EQUAL_VIEWS = 1e-6  # Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
+# to which larger meshes are simplified for views: their contours are those of full size
+VIEW_FACES = LEVELS[-1][1]
+# Tolerance of equal rotations (entries) and distances (relative): 1e-4 px in a view
+EQUAL_VIEWS = 1e-6
 # Depth fields of the surface that a perspective camera sees: without the camera they are nearly HFN
 OF_SURFACE = {"ASG": average_shading_gradient, "AR": apparent_ridges}
-# Distances to step back so that a perspective view approximates parallel projection to a few per mille
+# Distances to step back so that a perspective view approximates parallel projection to a few per
+# mille
 PARALLEL_DISTANCE = 20.0
 
 
 def depth_filter(settings: BankSettings) -> nn.Module:
-    """The filter that turns rendered depth into vector fields; see :meth:`ViewDescriber.field` for perspective ones."""
-    options = {"sigma": settings.sigma, "formula": settings.formula} if settings.depth_field == "CS" else {}
+    """The filter that turns rendered depth into vector fields; see :meth:`ViewDescriber.field` for
+    perspective ones."""
+    options = (
+        {"sigma": settings.sigma, "formula": settings.formula}
+        if settings.depth_field == "CS"
+        else {}
+    )
     layer: nn.Module = DEPTH_FIELDS[settings.depth_field](**options)
     return layer
 
@@ -41,15 +49,17 @@ def hog_layer(settings: BankSettings) -> HOG:
 
 @cached_in_mesh
 def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more than these."""
+    """What framed views of a mesh of more than ``VIEW_FACES`` faces are rendered from, with no more
+    than these."""
     centre = mesh_centre(mesh).numpy()
     vertices, faces = simplified(mesh, centre, VIEW_FACES)
     return trimesh.Trimesh(vertices + centre, faces, process=False)
 
 
 class ViewDescriber:
-    """Renders, filters and describes arbitrary views of one clean mesh, see :meth:`curvireg_torch.ViewBank.build`.
-    Framed views are rendered from a mesh of at most ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
+    """Renders, filters and describes arbitrary views of one clean mesh, see
+    :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of at most
+    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
 
     def __init__(
         self,
@@ -62,7 +72,9 @@ class ViewDescriber:
         self._mesh = self._simple = mesh
         self._coloured = has_colours(mesh)
         self.renderer = self.view_renderer = make_renderer(mesh, renderer, many_views=True)
-        self.centre, self.radius, self.hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
+        self.centre = mesh_centre(mesh)
+        self.radius = mesh_radius(mesh)
+        self.hull = extreme_points(mesh)
         self._device = device
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self._simple = view_mesh(mesh)
@@ -70,8 +82,10 @@ class ViewDescriber:
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
-        self.settings, self._orthographic = settings, settings.camera == "orthographic"
-        self._filter, self.descriptor = depth_filter(settings), hog_layer(settings)
+        self.settings = settings
+        self._orthographic = settings.camera == "orthographic"
+        self._filter = depth_filter(settings)
+        self.descriptor = hog_layer(settings)
 
     @cached_property
     def contours(self) -> MeshContours:
@@ -79,31 +93,41 @@ class ViewDescriber:
         return MeshContours(self._simple)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
-        """The same mesh and renderer with other settings; convex hulls of large meshes take seconds."""
+        """The same mesh and renderer with other settings; convex hulls of large meshes take
+        seconds."""
         other = copy(self)
         other._set(settings)
         return other
 
     def cameras(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cameras that look at the object's centre, cropped to its box as a photograph is: T (N, 4, 4), K (N, 3, 3) of
-        the crops, and boxes (N, 4), all float64. As in all methods, ``rotations`` (N, 3, 3) are model -> camera,
-        ``distances`` (N,) those of the object's centre in model units."""
+        """Cameras that look at the object's centre, cropped to its box as a photograph is: T (N, 4,
+        4), K (N, 3, 3) of the crops, and boxes (N, 4), all float64. As in all methods,
+        ``rotations`` (N, 3, 3) are model -> camera, ``distances`` (N,) those of the object's centre
+        in model units."""
         R = rotations.double().cpu()
         t = -(R @ self.centre)
         t[:, 2] += distances.double().cpu()
         T = transform(R, t)
         K = torch.eye(3, dtype=torch.float64)
         boxes = boxes_around(projected(self.hull, T, K, orthographic=self._orthographic))
-        return T, crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size), boxes
+        return (
+            T,
+            crop_transforms(square_boxes(boxes, self.settings.margin), self.settings.image_size),
+            boxes,
+        )
 
-    def cameras_of_boxes(self, rotations: Tensor, distances: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """Perspective cameras that look straight at the object and project it into the photographs' (N, 4) boxes. They
-        replace unknown cameras of photographs. For orthographic views the camera is far away. Returns T_cam_from_model
-        (N, 4, 4) and camera matrices (N, 3, 3) in px of the photographs, float64."""
+    def cameras_of_boxes(
+        self, rotations: Tensor, distances: Tensor, boxes: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Perspective cameras that look straight at the object and project it into the photographs'
+        (N, 4) boxes. They replace unknown cameras of photographs. For orthographic views the camera
+        is far away. Returns T_cam_from_model (N, 4, 4) and camera matrices (N, 3, 3) in px of the
+        photographs, float64."""
         T, K, _ = self.cameras(rotations, distances)
         if self._orthographic:
             z = distances.double().cpu()
-            T, K = T.clone(), K.clone()
+            T = T.clone()
+            K = K.clone()
             T[:, 2, 3] += PARALLEL_DISTANCE * z
             K[:, :2, :2] *= (1.0 + PARALLEL_DISTANCE) * z[:, None, None]
         squares = square_boxes(boxes.double().cpu(), self.settings.margin)
@@ -117,7 +141,9 @@ class ViewDescriber:
     def _seen(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Depth (N, 1, S, S), camera matrices (N, 3, 3) and boxes (N, 4) of the framed views."""
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self.view_renderer.render(T, K, (self.settings.image_size,) * 2, orthographic=self._orthographic)
+        depth = self.view_renderer.render(
+            T, K, (self.settings.image_size,) * 2, orthographic=self._orthographic
+        )
         return depth.to(self._device), K.to(self._device), boxes.to(self._device)
 
     def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
@@ -126,15 +152,19 @@ class ViewDescriber:
         return self.field(depth, K)
 
     def field(self, depth: Tensor, K: Tensor) -> Tensor:
-        """(N, 2, S, S) field of depth (N, 1, S, S) that was seen by cameras (N, 3, 3) of the settings' kind."""
+        """(N, 2, S, S) field of depth (N, 1, S, S) that was seen by cameras (N, 3, 3) of the
+        settings' kind."""
         of_surface = None if self._orthographic else OF_SURFACE.get(self.settings.depth_field)
-        field: Tensor = self._filter(depth) if of_surface is None else of_surface(depth, camera_matrix=K)
+        field: Tensor = (
+            self._filter(depth) if of_surface is None else of_surface(depth, camera_matrix=K)
+        )
         return field
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
-        """(N, 1, S, S) grey pictures of the framed views, see :func:`curvireg_torch.rendering.shade`. With the mesh's
-        colours (N, 4, S, S): grey, then RGB of :func:`curvireg_torch.rendering.render_colour`."""
+        """(N, 1, S, S) grey pictures of the framed views, see
+        :func:`curvireg_torch.rendering.shade`. With the mesh's colours (N, 4, S, S): grey, then RGB
+        of :func:`curvireg_torch.rendering.render_colour`."""
         return self._shaded(*self._framed(rotations, distances))
 
     @torch.no_grad()
@@ -150,7 +180,8 @@ class ViewDescriber:
         return self.view_renderer.render(T, K, size, orthographic=self._orthographic), T, K
 
     def _shaded(self, depth: Tensor, T: Tensor, K: Tensor) -> Tensor:
-        S, projection = self.settings.image_size, {"orthographic": self._orthographic}
+        S = self.settings.image_size
+        projection = {"orthographic": self._orthographic}
         grey = shade(depth, K, **projection).to(self._device)
         if not self._coloured:
             return grey
@@ -169,40 +200,55 @@ class ViewDescriber:
     @torch.no_grad()
     def descriptors(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, D) descriptors of the framed views."""
-        chunks = zip(rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True)
+        chunks = zip(
+            rotations.split(VIEWS_AT_A_TIME), distances.split(VIEWS_AT_A_TIME), strict=True
+        )
         return torch.cat([self.descriptor(self.fields(R, z)) for R, z in chunks])
 
     @torch.no_grad()
     def __call__(self, rotations: Tensor, distances: Tensor) -> dict[str, Tensor]:
-        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are rendered once.
-        ``descriptors`` (N, D) float32; ``points`` and ``silhouettes`` (N, S, S) bool; ``boxes`` (N, 4) float64 of the
-        object in normalised image coordinates (focal length 1), its centre on the axis; orthographic in model units."""
+        """Describe views; those that differ by a multiple of 90 degrees about the optical axis are
+        rendered once. ``descriptors`` (N, D) float32; ``points`` and ``silhouettes`` (N, S, S)
+        bool; ``boxes`` (N, 4) float64 of the object in normalised image coordinates (focal length
+        1), its centre on the axis; orthographic in model units."""
         # An orthographic camera does not see the distance.
         seen = torch.ones_like(distances) if self._orthographic else distances
         source, quarters = quarter_turns(rotations, seen)
         rendered = source == torch.arange(len(source))
         depth, K, boxes = self._seen(rotations[rendered], distances[rendered])
         field = self.field(depth, K)
-        points, silhouettes = field_points(field, fraction=self.settings.point_fraction)[:, 0], depth[:, 0] > 0
+        points = field_points(field, fraction=self.settings.point_fraction)[:, 0]
+        silhouettes = depth[:, 0] > 0
         descriptors = self.descriptor(field)
         if not bool(rendered.all()):
             selected = quarters.to(self._device), (rendered.cumsum(0) - 1)[source].to(self._device)
-            sideways = self.descriptor(torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3)))
+            sideways = self.descriptor(
+                torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3))
+            )
             halves = (self.descriptor.rotated_by_180(x) for x in (descriptors, sideways))
             descriptors = torch.stack([descriptors, sideways, *halves])[selected]
             masks = torch.stack([points, silhouettes])
-            points, silhouettes = torch.stack([masks.rot90(-k, (2, 3)) for k in range(4)], dim=1)[:, *selected]
+            points, silhouettes = torch.stack([masks.rot90(-k, (2, 3)) for k in range(4)], dim=1)[
+                :, *selected
+            ]
             x0, y0, x1, y1 = boxes.T
             clockwise = [x0, y0, x1, y1, -y1, x0, -y0, x1, -x1, -y1, -x0, -y0, y0, -x1, y1, -x0]
             boxes = torch.stack(clockwise, dim=1).view(-1, 4, 4).transpose(0, 1)[selected]
-        return {"descriptors": descriptors, "points": points, "silhouettes": silhouettes, "boxes": boxes}
+        return {
+            "descriptors": descriptors,
+            "points": points,
+            "silhouettes": silhouettes,
+            "boxes": boxes,
+        }
 
 
 def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
-    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees. Returns, on the CPU, the
-    index (N,) of the first view of each view's group, and the number (N,) of clockwise 90 degree rotations, 0 to 3,
-    from that view to this one."""
-    x, y, z = rotations[:, 0].double().cpu(), rotations[:, 1].double().cpu(), distances.double().cpu()
+    """Group views that are the same picture rotated in the plane by a multiple of 90 degrees.
+    Returns, on the CPU, the index (N,) of the first view of each view's group, and the number (N,)
+    of clockwise 90 degree rotations, 0 to 3, from that view to this one."""
+    x = rotations[:, 0].double().cpu()
+    y = rotations[:, 1].double().cpu()
+    z = distances.double().cpu()
     frames = [torch.cat(pair, dim=1) for pair in ((x, y), (-y, x), (-x, -y), (y, -x))]
     apart = torch.cdist(torch.stack(frames), frames[0], compute_mode="donot_use_mm_for_euclid_dist")
     close = (apart < EQUAL_VIEWS) & ((z[:, None] - z).abs() <= EQUAL_VIEWS * z)

@@ -1,4 +1,5 @@
-"""All views of a bank ranked for every photograph of a batch, and the selection of distinct views."""
+"""All views of a bank ranked for every photograph of a batch, and the selection of distinct
+views."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -34,9 +35,11 @@ from .bank import VIEWS_AT_A_TIME, ViewBank, packed
 from .cells import DescribedViews, best_cells, cells_of_views
 from .describe import ViewDescriber, hog_layer
 
-_PREPARED = ("_terms", "_described_views", "_packing", "describer")  # attributes that follow from bank and pipeline
+# attributes that follow from bank and pipeline
+_PREPARED = ("_terms", "_described_views", "_packing", "describer")
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
-NEAR_TRACE = 1.0 + 3.0**0.5  # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
+# Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
+NEAR_TRACE = 1.0 + 3.0**0.5
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
 
 
@@ -47,11 +50,12 @@ class Ranking:
     Attributes:
         scores: (B, N) in [0, 1], the product of the terms' scores, each to the power of its weight.
         order: (B, N) view indices, best first; ties in the order of the bank.
-        terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors, in [0, 1], or in
-            [-1, 1] if they are whitened, or the paper's product; "repeatability": fraction of the photograph's points
-            found in the view; "box": similarity of the boxes' aspect ratios in [0, 1], best view 1.
-        allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,) the best of the others
-            more than 30 degrees from the best view, or -1.
+        terms: name -> (B, N) raw scores of each term: "hog": normalised correlation of descriptors,
+            in [0, 1], or in [-1, 1] if they are whitened, or the paper's product; "repeatability":
+            fraction of the photograph's points found in the view; "box": similarity of the boxes'
+            aspect ratios in [0, 1], best view 1.
+        allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,)
+            the best of the others more than 30 degrees from the best view, or -1.
     """
 
     scores: Tensor
@@ -82,15 +86,21 @@ class Ranking:
 
 
 def distinct_views(
-    order: Tensor, rotations: Tensor, *, count: int, angle: float = 30.0, symmetries: Tensor | None = None
+    order: Tensor,
+    rotations: Tensor,
+    *,
+    count: int,
+    angle: float = 30.0,
+    symmetries: Tensor | None = None,
 ) -> Tensor:
     """Best views that are more than ``angle`` degrees from every better selected one.
 
     Args:
         order: (N,) view indices, best first.
         rotations: (N, 3, 3) of the views.
-        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from :func:`curvireg_torch.geometry.symmetry_transforms`: views
-            that differ by one of them count as the same.
+        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from
+            :func:`curvireg_torch.geometry.symmetry_transforms`: views that differ by one of them
+            count as the same.
 
     Returns:
         (K,) view indices, best first, K <= count.
@@ -100,7 +110,8 @@ def distinct_views(
     R, S = (
         x.detach().cpu().float().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations))
     )  # many small steps
-    flat, least = R.reshape(-1, 9).T, 1.0 + 2.0 * math.cos(math.radians(min(angle, 180.0))) - ROUNDING_OF_TRACE
+    flat = R.reshape(-1, 9).T
+    least = 1.0 + 2.0 * math.cos(math.radians(min(angle, 180.0))) - ROUNDING_OF_TRACE
     selected: list[int] = []
     available = np.ones(len(R), bool)
     for view in order.tolist():
@@ -115,29 +126,33 @@ def distinct_views(
 class ViewMatcher(nn.Module):
     r"""Ranks all views of a bank for every photograph.
 
-    The box of each photograph is cropped as the views are, filtered and described; each ranking term compares it with
-    all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms take the best over a few jittered crops.
-    The composition of a batch and the number of torch's threads change scores by rounding, relatively by about 1e-5;
-    :class:`curvireg_torch.Registrar` prevents that.
+    The box of each photograph is cropped as the views are, filtered and described; each ranking
+    term compares it with all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms
+    take the best over a few jittered crops. The composition of a batch and the number of torch's
+    threads change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar`
+    prevents that.
 
-    It computes in float32, also under autocast: ``.half()`` and other dtypes are refused. ``.to(device)`` moves bank,
-    terms and field. A copy, also by pickle, has a bank of its own.
+    It computes in float32, also under autocast: ``.half()`` and other dtypes are refused.
+    ``.to(device)`` moves bank, terms and field. A copy, also by pickle, has a bank of its own.
 
     Args:
         bank: the views of a mesh.
         pipeline: field, terms and box jitter; default the bank's.
-        field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute ``colour = True`` it gets colour
-            photographs as (B, 3, S, S).
+        field: custom photograph filter (B, 1, S, S) -> (B, 2, S, S). With an attribute
+            ``colour = True`` it gets colour photographs as (B, 3, S, S).
         renderer: for views that :class:`Appearance` needs.
 
     Raises:
-        BankError: the bank was built with other settings than the pipeline's, or for another view policy.
+        BankError: the bank was built with other settings than the pipeline's, or for another view
+            policy.
 
     Example:
         >>> import trimesh
         >>> from curvireg_torch.geometry import sample_views
-        >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90), image_size=64, progress=False)
-        >>> ranking = ViewMatcher(bank)(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30], [10, 5, 60, 47]]))
+        >>> bank = ViewBank.build(trimesh.creation.box(), sample_views(azimuth_step=90),
+        ...     image_size=64, progress=False)
+        >>> ranking = ViewMatcher(bank)(torch.rand(2, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30],
+        ...     [10, 5, 60, 47]]))
         >>> ranking.scores.shape, ranking.top(3).shape
         (torch.Size([2, 32]), torch.Size([2, 3]))
     """
@@ -153,12 +168,17 @@ class ViewMatcher(nn.Module):
         super().__init__()
         pipeline = bank.pipeline if pipeline is None else pipeline
         bank.check_compatible(pipeline)
-        pipeline = replace(pipeline, views=bank.pipeline.views)  # "given" if the caller passed the views
-        self.bank, self._renderer = bank, renderer
+        # "given" if the caller passed the views
+        pipeline = replace(pipeline, views=bank.pipeline.views)
+        self.bank = bank
+        self._renderer = renderer
         self.pipeline = pipeline if field is None else pipeline.with_field(field)
         self.field = (pipeline.photograph_field() if field is None else field).to(bank.device)
         self.descriptor = hog_layer(bank.settings)
-        appearance = next((term for term in pipeline.terms if isinstance(term, Appearance) and term.weight > 0), None)
+        appearance = next(
+            (term for term in pipeline.terms if isinstance(term, Appearance) and term.weight > 0),
+            None,
+        )
         self._appearance = None if appearance is None else appearance.build().to(bank.device)
         self._prepare()
 
@@ -168,14 +188,23 @@ class ViewMatcher(nn.Module):
         for name in _PREPARED:
             self.__dict__.pop(name, None)
         self._described_views = DescribedViews(self.bank.described_views_file)
-        terms = [term for term in self.pipeline.terms if term.weight > 0 and not isinstance(term, Appearance)]
-        self._terms: list[tuple[Term, Comparison]] = [(term, term.build(self.bank)) for term in terms]
+        terms = [
+            term
+            for term in self.pipeline.terms
+            if term.weight > 0 and not isinstance(term, Appearance)
+        ]
+        self._terms: list[tuple[Term, Comparison]] = [
+            (term, term.build(self.bank)) for term in terms
+        ]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Move to another device. Modules convert their tensors by a function: what it does to one of float32 tells."""
+        """Move to another device. Modules convert their tensors by a function: what it does to one
+        of float32 tells."""
         moved = fn(torch.zeros(0, device=self.bank.device))
         if moved.dtype != torch.float32:
-            raise InvalidInputError(f"ViewMatcher: computes in float32, got {moved.dtype}; convert its field only")
+            raise InvalidInputError(
+                f"ViewMatcher: computes in float32, got {moved.dtype}; convert its field only"
+            )
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         if moved.device != self.bank.device:
             self.bank = self.bank.to(moved.device)
@@ -191,30 +220,36 @@ class ViewMatcher(nn.Module):
         self._prepare_on_one_thread()
 
     def _prepare_on_one_thread(self) -> None:
-        """Whatever number of threads torch has, rounding is that of a matcher which the registrar built."""
+        """Whatever number of threads torch has, rounding is that of a matcher which the registrar
+        built."""
         map_on_threads(lambda _: self._prepare(), [0])
 
     def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
         """Rank all views.
 
         Args:
-            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8, on any device.
+            images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, floating in [0, 1] or uint8, on
+                any device.
             boxes: (B, 4) x0, y0, x1, y1 in px, a tensor, an array or lists.
 
         Raises:
-            InvalidInputError: wrong shape or dtype, another number of boxes than of images, or an unusable box.
+            InvalidInputError: wrong shape or dtype, another number of boxes than of images, or an
+                unusable box.
             ImageError: pixels of the crop of a box are missing (NaN or infinite) or outside [0, 1].
         """
         return self.rank(self.query(images, boxes))
 
     @in_full_precision
     def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
-        """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing pixels."""
+        """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
+        pixels."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
         jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
-        return self.describe(regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images]))
+        return self.describe(
+            regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images])
+        )
 
     def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
@@ -237,14 +272,16 @@ class ViewMatcher(nn.Module):
 
     @in_full_precision
     def rank(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
-        """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed`` (B, N) bool leaves
-        views out, whose score is 0."""
+        """Compare B described photographs with all views; errors as :meth:`forward`. ``allowed``
+        (B, N) bool leaves views out, whose score is 0."""
         terms, first = self._first_terms(query)
         log, compared = self._with_appearance(query, first)
         if allowed is not None:
-            allowed, without_limits = allowed.to(log.device), log
+            allowed = allowed.to(log.device)
+            without_limits = log
             log, compared = self._with_appearance(query, first.masked_fill(~allowed, -torch.inf))
-        order, outside = log.argsort(dim=1, descending=True, stable=True), None
+        order = log.argsort(dim=1, descending=True, stable=True)
+        outside = None
         if allowed is not None:
             R = self.bank.rotations
             near = R[order[:, 0]].flatten(1) @ R.flatten(1).T >= NEAR_TRACE - ROUNDING_OF_TRACE
@@ -254,8 +291,8 @@ class ViewMatcher(nn.Module):
 
     @in_full_precision
     def similarity(self, query: QueryFeatures, allowed: Tensor | None = None) -> Tensor:
-        """(B,) normalised correlation of the view that is best without the appearance term, at a fraction of the cost
-        of :meth:`rank`."""
+        """(B,) normalised correlation of the view that is best without the appearance term, at a
+        fraction of the cost of :meth:`rank`."""
         terms, log = self._first_terms(query)
         if allowed is not None:
             log = log.masked_fill(~allowed.to(log.device), -torch.inf)
@@ -265,17 +302,22 @@ class ViewMatcher(nn.Module):
         """Scores of all terms but appearance, and their product's logarithm (B, N)."""
         check_pixels(query.crops, "of the box")
         terms = {term.name: compare(query) for term, compare in self._terms}
-        return terms, torch.stack([term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]).sum(
-            dim=0
-        )
+        return terms, torch.stack(
+            [term.weight * term.log_score(terms[term.name]) for term, _ in self._terms]
+        ).sum(dim=0)
 
     @torch.no_grad()
     @in_full_precision
     def compare_views(self, query: QueryFeatures, views: ViewSphere) -> Tensor:
-        """(N,) log scores of further views of the mesh for one described photograph, 0 for the best of them, by all
-        terms but appearance; mu and Sigma of whitened descriptors are those of the bank."""
+        """(N,) log scores of further views of the mesh for one described photograph, 0 for the best
+        of them, by all terms but appearance; mu and Sigma of whitened descriptors are those of the
+        bank."""
         radius = mesh_radius(self.bank.mesh)
-        parts = zip(views.rotations.split(VIEWS_AT_A_TIME), views.distance.split(VIEWS_AT_A_TIME), strict=True)
+        parts = zip(
+            views.rotations.split(VIEWS_AT_A_TIME),
+            views.distance.split(VIEWS_AT_A_TIME),
+            strict=True,
+        )
         described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
         tensors = {name: torch.cat([part[name] for part in described]) for name in described[0]}
         few = ViewBank(self.bank.mesh, views, self.bank.pipeline, tensors)
@@ -286,13 +328,20 @@ class ViewMatcher(nn.Module):
         log = torch.stack(scores).sum(dim=0)[0]
         return log - log.max()
 
-    def _with_appearance(self, query: QueryFeatures, log: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views not compared."""
+    def _with_appearance(
+        self, query: QueryFeatures, log: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Log scores (B, N) with those of the appearance term, and its raw scores, NaN for views
+        not compared."""
         if (appearance := self._appearance) is None:
             return log, {}
-        term, raw, score = appearance.term, torch.full_like(log, torch.nan), torch.zeros_like(log)
+        term = appearance.term
+        raw = torch.full_like(log, torch.nan)
+        score = torch.zeros_like(log)
         if len(log) and len(self.bank) <= term.exhaustive_limit:
-            raw = appearance.compare(query, self._features_of_views(torch.arange(len(self.bank)))).to(log)
+            raw = appearance.compare(
+                query, self._features_of_views(torch.arange(len(self.bank)))
+            ).to(log)
             score = term.log_score(raw)
         elif len(log):
             R = self.bank.rotations
@@ -302,22 +351,27 @@ class ViewMatcher(nn.Module):
             similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
             for b, index in enumerate(selected):
                 raw[b, index] = similarity[b, torch.searchsorted(compared, index)]
-                traces = R.flatten(1) @ R[index].flatten(1).T  # a relative rotation's trace grows as its angle falls
+                # a relative rotation's trace grows as its angle falls
+                traces = R.flatten(1) @ R[index].flatten(1).T
                 score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return log + term.weight * score, {term.name: raw}
 
     @cached_property
     def _packing(self) -> tuple[Tensor, Tensor]:
-        """(C,) views that are at least the appearance term's ``min_angle`` apart, and (N,) the nearest of these to each
-        view. They are the same for every photograph, so that few views of a mesh are ever described."""
+        """(C,) views that are at least the appearance term's ``min_angle`` apart, and (N,) the
+        nearest of these to each view. They are the same for every photograph, so that few views of
+        a mesh are ever described."""
         assert self._appearance is not None
         R = self.bank.rotations
         every = torch.arange(len(R), device=R.device)
-        representatives = distinct_views(every, R, count=len(R), angle=self._appearance.term.min_angle)
+        representatives = distinct_views(
+            every, R, count=len(R), angle=self._appearance.term.min_angle
+        )
         return representatives, cells_of_views(R, representatives)
 
     def _features_of_views(self, views: Tensor) -> Tensor:
-        """(U, D) features of (U,) ascending views: from the bank, described before, or described now."""
+        """(U, D) features of (U,) ascending views: from the bank, described before, or described
+        now."""
         if (features := self.bank.appearance) is not None:
             return features if len(views) == len(features) else features[views.to(self.bank.device)]
         return self._described_views.features(views.tolist(), self._describe_views)
@@ -328,25 +382,35 @@ class ViewMatcher(nn.Module):
         assert appearance is not None
 
         def describe(chunk: list[int]) -> Tensor:
-            R, distances = self.bank.rotations[chunk], self.bank.distances[chunk]
+            R = self.bank.rotations[chunk]
+            distances = self.bank.distances[chunk]
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        chunks = [views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)]
+        chunks = [
+            views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)
+        ]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
     @in_full_precision
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
-        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the appearance term, minus
-        that of the most similar view of its ranking."""
+        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the
+        appearance term, minus that of the most similar view of its ranking."""
         assert self._appearance is not None
-        raw = self._appearance.compare(query, self._appearance.describe(pictures, together=True))[0].cpu().double()
+        raw = (
+            self._appearance.compare(query, self._appearance.describe(pictures, together=True))[0]
+            .cpu()
+            .double()
+        )
         views = ranking.terms[Appearance.name][0].cpu().double()
         views = views[views.isfinite()].expand(len(raw), -1)
         scores = self._appearance.term.log_score(torch.cat([views, raw[:, None]], dim=1))
-        return scores[:, -1] - scores[:, :-1].amax(dim=1)  # positive if the pose is more similar than every view
+        # positive if the pose is more similar than every view
+        return scores[:, -1] - scores[:, :-1].amax(dim=1)
 
     @cached_property
     def describer(self) -> ViewDescriber:
         """Render and describe further views as the bank's; built on first use."""
-        return ViewDescriber(self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device)
+        return ViewDescriber(
+            self.bank.mesh, self.bank.settings, renderer=self._renderer, device=self.bank.device
+        )

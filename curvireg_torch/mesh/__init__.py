@@ -1,4 +1,5 @@
-"""Meshes: files of several formats become one trimesh with metadata for unit, up axis and colours."""
+"""Meshes: files of several formats become one trimesh with metadata for unit, up axis and
+colours."""
 
 from .colours import SurfaceColours as SurfaceColours
 from .colours import has_colours as has_colours

@@ -1,4 +1,5 @@
-"""STEP and IGES files by cascadio, which is OpenCASCADE, and Collada files by pycollada: the extra ``cad``."""
+"""STEP and IGES files by cascadio, which is OpenCASCADE, and Collada files by pycollada: the extra
+``cad``."""
 
 import subprocess
 import sys
@@ -27,9 +28,10 @@ from .scenes import joined_scene
 from .source import MeshSource, ReadMesh, spellings
 from .xml_files import check_xml, local_name
 
-# Chords of curves may be off by so much of a curve's length, and turn by so many radians: of a cylinder 0.1 % of the
-# radius. Tenfold finer ones change no contour of 256 px.
-LINEAR_TOLERANCE, ANGULAR_TOLERANCE = 0.002, 0.1
+# Chords of curves may be off by so much of a curve's length, and turn by so many radians: of a
+# cylinder 0.1 % of the radius. Tenfold finer ones change no contour of 256 px.
+LINEAR_TOLERANCE = 0.002
+ANGULAR_TOLERANCE = 0.1
 # In a process of its own: OpenCASCADE prints, and damaged files may end or stop it
 _CONVERT = f"""
 import sys
@@ -39,7 +41,7 @@ kind = cascadio.FileType.IGES if sys.argv[3] == "iges" else cascadio.FileType.ST
 options = dict(tol_linear={LINEAR_TOLERANCE}, tol_angular={ANGULAR_TOLERANCE}, tol_relative=True, use_parallel=False)
 content = cascadio.to_glb_bytes(Path(sys.argv[1]).read_bytes(), kind, **options)
 Path(sys.argv[2]).write_bytes(content)
-"""
+"""  # noqa: E501
 IGES_METRES = 1e-3  # OpenCASCADE leaves the triangles of IGES files in mm
 _PREFIXES = {b".MILLI.": "mm", b".CENTI.": "cm", b".DECI.": "dm", b"$": "m"}
 _CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
@@ -50,7 +52,9 @@ def check_extra(package: str, suffix: str) -> None:
     """Refuse a format whose package is not installed, with the commands that install it."""
     if find_spec(package) is None:
         text = (
-            f"{suffix} files need {package}: pip install 'curvireg_torch[cad]', in a checkout pip install -e '.[cad]'"
+            f"{suffix} files need {package}: pip install 'curvireg_torch[cad]', in a checkout "
+            f"pip "
+            f"install -e '.[cad]'"
         )
         raise MissingDependencyError(text)
 
@@ -58,12 +62,15 @@ def check_extra(package: str, suffix: str) -> None:
 def bounded(source: MeshSource) -> bytes:
     """The content of a file whose reader takes much more memory than the file."""
     if source.path.stat().st_size > MAX_CAD_BYTES:
-        raise ValueError(f"larger than {MAX_CAD_BYTES:,} bytes; export parts of it, or another format")
+        raise ValueError(
+            f"larger than {MAX_CAD_BYTES:,} bytes; export parts of it, or another format"
+        )
     return source.data()
 
 
 def read_step(source: MeshSource) -> ReadMesh:
-    """Read a STEP or IGES file: in its own unit where that is one of ``UNITS``, else in metres; z is up."""
+    """Read a STEP or IGES file: in its own unit where that is one of ``UNITS``, else in metres; z
+    is up."""
     suffix = source.path.suffix.lower()
     check_extra("cascadio", suffix)
     data = bounded(source)
@@ -83,15 +90,23 @@ def _converted(path: Path, kind: str) -> bytes:
         out = Path(folder, "part.glb")
         command = [sys.executable, "-P", "-c", _CONVERT, str(path), str(out), kind]
         try:
-            ended = subprocess.run(command, capture_output=True, timeout=MAX_CAD_SECONDS, check=False)
+            ended = subprocess.run(
+                command, capture_output=True, timeout=MAX_CAD_SECONDS, check=False
+            )
         except subprocess.TimeoutExpired:
-            message = f"OpenCASCADE took more than {MAX_CAD_SECONDS} seconds; export it as STL or OBJ"
+            message = (
+                f"OpenCASCADE took more than {MAX_CAD_SECONDS} seconds; export it as STL or OBJ"
+            )
             raise ValueError(message) from None
         size = out.stat().st_size if out.is_file() else 0
         if size > MAX_MESH_BYTES:
-            raise ValueError(f"its triangles take more than {MAX_MESH_BYTES:,} bytes; export it as STL or OBJ")
+            raise ValueError(
+                f"its triangles take more than {MAX_MESH_BYTES:,} bytes; export it as STL or OBJ"
+            )
         if ended.returncode != 0 or size == 0:
-            raise ValueError("OpenCASCADE finds no shape in it; the file is damaged, or of another kind")
+            raise ValueError(
+                "OpenCASCADE finds no shape in it; the file is damaged, or of another kind"
+            )
         return out.read_bytes()
 
 
@@ -107,7 +122,9 @@ def step_unit(data: bytes) -> str | None:
             units[name.strip()] = _length_unit(content.replace(b" ", b"").upper())
         _, found, arguments = content.partition(b"GLOBAL_UNIT_ASSIGNED_CONTEXT")
         if found:
-            contexts.append(arguments.partition(b"))")[0].replace(b"(", b" ").replace(b",", b" ").split())
+            contexts.append(
+                arguments.partition(b"))")[0].replace(b"(", b" ").replace(b",", b" ").split()
+            )
     used = [units[name] for names in contexts for name in names if name in units]
     return used[0] if used else None
 
@@ -122,7 +139,8 @@ def _length_unit(content: bytes) -> str | None:
 
 
 def iges_unit(data: bytes) -> str | None:
-    """The unit of length of an IGES file, its 14th global parameter; None if it is none of ``UNITS``."""
+    """The unit of length of an IGES file, its 14th global parameter; None if it is none of
+    ``UNITS``."""
     lines = [line for line in data.splitlines() if line[72:73] == b"G"]
     text = b"".join(line[:72].ljust(72) for line in lines[:100])
     separator = b"," if not text.startswith(b"1H") else text[2:3]
@@ -132,7 +150,8 @@ def iges_unit(data: bytes) -> str | None:
         if letter and digits.isdigit() and len(digits) < 5:  # a text, preceded by its length
             text = text.lstrip()
             end = len(digits) + 1 + int(digits)
-            value, rest = text[len(digits) + 1 : end], text[end:]
+            value = text[len(digits) + 1 : end]
+            rest = text[end:]
         else:
             value, _, rest = text.partition(separator)
             rest = separator + rest
@@ -180,7 +199,9 @@ def read_collada(source: MeshSource) -> ReadMesh:
     axis = (stated["up_axis"].text or "").strip() if "up_axis" in stated else "Y_UP"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        scene = trimesh.load(BytesIO(data), file_type="dae", resolver=_Pictures(source), process=False)
+        scene = trimesh.load(
+            BytesIO(data), file_type="dae", resolver=_Pictures(source), process=False
+        )
         mesh, colours = joined_scene(scene)
     for warning in caught:
         if "texture" in str(warning.message) or "colours" in str(warning.message):
@@ -190,7 +211,9 @@ def read_collada(source: MeshSource) -> ReadMesh:
     vertices = np.asarray(mesh.vertices, np.float64)
     unit = None
     if metres is not None:
-        unit = next((name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6), None)
+        unit = next(
+            (name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6), None
+        )
         if unit is None:
             vertices = vertices * metres
             unit = "m"
@@ -199,8 +222,13 @@ def read_collada(source: MeshSource) -> ReadMesh:
 
 
 def _check_copies(root: Any) -> None:
-    """Nodes that stand for others, which stand for others: the parts that they unfold to are counted first."""
-    named = {f"#{one.get('id')}": one for one in root.iter() if local_name(one) == "node" and one.get("id")}
+    """Nodes that stand for others, which stand for others: the parts that they unfold to are
+    counted first."""
+    named = {
+        f"#{one.get('id')}": one
+        for one in root.iter()
+        if local_name(one) == "node" and one.get("id")
+    }
     known: dict[Any, int] = {}
 
     def count(node: Any, depth: int) -> int:

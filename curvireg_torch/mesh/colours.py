@@ -14,19 +14,22 @@ from ..utils.pictures import PICTURE_STARTS, open_picture
 
 TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
 SAMPLES = 20_000  # Points of the surface at which colours are compared
-# Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a word on a box is
-# more, noise of a JPEG less
-VARIED_FRACTION, VARIED_BY = 0.002, 12
+# Colours vary if so large a fraction of the surface differs by so much, of 255, from the median: a
+# word on a box is more, noise of a JPEG less
+VARIED_FRACTION = 0.002
+VARIED_BY = 12
 LARGE = 1 << 25  # Pixels of a texture that is reduced in its own mode first
 ROW = 1024  # Samples in a row of the map that OpenCV is given, whose sides are limited
 _UNSET = (102, 102, 102)  # trimesh's colour for a material without one
 _PLAIN = 255
-_Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]  # by their ids, images, which so keep them, and pixels
+# by their ids, images, which so keep them, and pixels
+_Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]
 
 
 @dataclass(frozen=True)
 class SurfaceColours:
-    """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a texture.
+    """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a
+    texture.
 
     Attributes:
         corners: (F, 3, 3) uint8 RGB.
@@ -44,14 +47,19 @@ class SurfaceColours:
         return len(self.corners)
 
     def __getitem__(self, faces: Any) -> "SurfaceColours":
-        return SurfaceColours(self.corners[faces], self.uv[faces], self.texture[faces], self.textures)
+        return SurfaceColours(
+            self.corners[faces], self.uv[faces], self.texture[faces], self.textures
+        )
 
     def check(self, faces: int) -> None:
         """Raise ValueError unless these are valid colours of ``faces`` faces."""
         parts = (self.corners, (faces, 3, 3), np.uint8), (self.uv, (faces, 3, 2), np.float32)
         valid = all(x.shape == shape and x.dtype == dtype for x, shape, dtype in parts)
         valid = valid and self.texture.shape == (faces,) and self.texture.dtype == np.int32
-        valid = valid and all(t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8 for t in self.textures)
+        valid = valid and all(
+            t.ndim == 3 and t.shape[2] == 3 and t.size and t.dtype == np.uint8
+            for t in self.textures
+        )
         valid = valid and bool(np.isfinite(self.uv).all())
         if not (valid and -1 <= self.texture.min() <= self.texture.max() < len(self.textures)):
             raise ValueError("colours that do not match the mesh")
@@ -67,7 +75,9 @@ class SurfaceColours:
         """The colours of a mesh that is made of several, which may share textures."""
         textures = {id(texture): texture for part in parts for texture in part.textures}
         number = {key: k for k, key in enumerate(textures)}
-        texture = [np.array([*(number[id(t)] for t in part.textures), -1])[part.texture] for part in parts]
+        texture = [
+            np.array([*(number[id(t)] for t in part.textures), -1])[part.texture] for part in parts
+        ]
         return cls(
             np.concatenate([part.corners for part in parts]),
             np.concatenate([part.uv for part in parts]),
@@ -75,10 +85,15 @@ class SurfaceColours:
             tuple(textures.values()),
         )
 
-    def at(self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b, c."""
+    def at(
+        self, face: NDArray[np.int32], u: NDArray[np.float32], v: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """(N, 3) RGB in [0, 1] at the points (1 - u - v) a + u b + v c of faces with corners a, b,
+        c."""
         weights = np.stack([1.0 - u - v, u, v], axis=1).astype(np.float32)
-        colour: NDArray[np.float32] = np.einsum("ij,ijk->ik", weights, self.corners[face].astype(np.float32))
+        colour: NDArray[np.float32] = np.einsum(
+            "ij,ijk->ik", weights, self.corners[face].astype(np.float32)
+        )
         colour /= np.float32(255)
         uv = np.einsum("ij,ijk->ik", weights, self.uv[face])
         texture = self.texture[face]
@@ -89,8 +104,8 @@ class SurfaceColours:
 
 
 def has_colours(mesh: Any) -> bool:
-    """Whether a mesh has colours that vary over its surface: one plain material is no print. The only place where it is
-    decided; symmetries, appearance and fits to colours follow it."""
+    """Whether a mesh has colours that vary over its surface: one plain material is no print. The
+    only place where it is decided; symmetries, appearance and fits to colours follow it."""
     colours = surface_colours(mesh)
     return colours is not None and _vary(colours, mesh)
 
@@ -101,7 +116,11 @@ def _vary(colours: SurfaceColours, mesh: Any) -> bool:
         return False
     rng = np.random.default_rng(0)
     area = np.cumsum(mesh.area_faces)
-    face = np.searchsorted(area, rng.uniform(0.0, area[-1], SAMPLES)).clip(max=len(area) - 1).astype(np.int32)
+    face = (
+        np.searchsorted(area, rng.uniform(0.0, area[-1], SAMPLES))
+        .clip(max=len(area) - 1)
+        .astype(np.int32)
+    )
     u, v = rng.uniform(0.0, 1.0, (2, SAMPLES)).astype(np.float32)
     outside = u + v > 1.0
     u[outside] = 1.0 - u[outside]
@@ -112,8 +131,8 @@ def _vary(colours: SurfaceColours, mesh: Any) -> bool:
 
 
 def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
-    """The colours of each mesh, plain ones too; None, with a warning, where they cannot be used. A texture is decoded
-    once, however many meshes share it."""
+    """The colours of each mesh, plain ones too; None, with a warning, where they cannot be used. A
+    texture is decoded once, however many meshes share it."""
     known: _Textures = {}
     found = []
     for mesh in meshes:
@@ -122,15 +141,18 @@ def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
             if colours is not None and len(colours) != len(mesh.faces):
                 raise ValueError(f"{len(colours)} for {len(mesh.faces)} faces")
         except Exception as error:  # files may hold anything
-            warnings.warn(f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2)
+            warnings.warn(
+                f"the mesh's colours cannot be used ({error}); it is drawn in grey", stacklevel=2
+            )
             colours = None
         found.append(colours)
     return found
 
 
 def surface_colours(mesh: Any) -> SurfaceColours | None:
-    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are white. They come from
-    ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else from ``mesh.visual``."""
+    """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are
+    white. They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else
+    from ``mesh.visual``."""
     return _surface_colours(mesh, {})
 
 
@@ -138,7 +160,8 @@ def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
     colours = mesh.metadata.get("colours")
     if isinstance(colours, SurfaceColours) and len(colours) == len(mesh.faces):
         return colours
-    visual, faces = mesh.visual, np.asarray(mesh.faces)
+    visual = mesh.visual
+    faces = np.asarray(mesh.faces)
     plain = SurfaceColours.plain(len(faces))
     if visual.kind == "face":
         corners = np.repeat(np.asarray(visual.face_colors, np.uint8)[:, None, :3], 3, axis=1)
@@ -160,7 +183,9 @@ def _surface_colours(mesh: Any, known: _Textures) -> SurfaceColours | None:
     texture = None if image is None or visual.uv is None else _decoded(image, known)
     if texture is not None:
         tint = SurfaceColours.plain(len(faces), (_PLAIN,) * 3 if factor is None else colour)
-        uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][..., :2]
+        uv = np.nan_to_num(np.asarray(visual.uv, np.float32), posinf=0.0, neginf=0.0)[faces][
+            ..., :2
+        ]
         return SurfaceColours(tint.corners, uv, np.zeros(len(faces), np.int32), (texture,))
     unset = factor is None and tuple(colour) == _UNSET
     return None if unset else SurfaceColours.plain(len(faces), colour)
@@ -173,14 +198,17 @@ def _decoded(image: Any, known: _Textures) -> NDArray[np.uint8] | None:
         try:
             texture = _texture(image)
         except Exception as error:  # decoders raise anything
-            message = f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
+            message = (
+                f"a texture cannot be read ({error}); its faces are drawn in their plain colour"
+            )
             warnings.warn(message, stacklevel=2)
         known[id(image)] = image, texture
     return known[id(image)][1]
 
 
 def texture_pixels(content: bytes, most: int) -> tuple[NDArray[np.uint8], int]:
-    """(h, w, 3) uint8 of a picture's file, reduced, and how many pixels it has: ``most`` at most."""
+    """(h, w, 3) uint8 of a picture's file, reduced, and how many pixels it has: ``most`` at
+    most."""
     with open_picture(content) as image:
         count = image.width * image.height
         if count > most:
@@ -189,7 +217,8 @@ def texture_pixels(content: bytes, most: int) -> tuple[NDArray[np.uint8], int]:
 
 
 def _texture(image: Any) -> NDArray[np.uint8]:
-    """The pixels of a PIL image; of one that is not decoded yet, only in the formats of photographs."""
+    """The pixels of a PIL image; of one that is not decoded yet, only in the formats of
+    photographs."""
     if image.format is not None and image.format not in PICTURE_STARTS:
         raise ValueError(f"the format {image.format} is not read")
     if image.width * image.height > MAX_IMAGE_PIXELS:

@@ -8,14 +8,16 @@ import trimesh
 
 WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are one
 CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
-SMOOTH_ANGLE = 40.0  # Degrees between two faces below which the surface counts as smooth across their edge
-MAX_EDGE_FACES = 4  # Faces of an edge that are looked at; polygon soups have edges with more than two
+# Degrees between two faces below which the surface counts as smooth across their edge
+SMOOTH_ANGLE = 40.0
+# Faces of an edge that are looked at; polygon soups have edges with more than two
+MAX_EDGE_FACES = 4
 
 
 class MeshEdges:
-    """Unique edges of a mesh that is simplified to ``max_faces``, the planes of their faces, and which of them are
-    creases. Polygon soups work: vertices are welded, doubled faces count once, and the orientation of faces does not
-    matter.
+    """Unique edges of a mesh that is simplified to ``max_faces``, the planes of their faces, and
+    which of them are creases. Polygon soups work: vertices are welded, doubled faces count once,
+    and the orientation of faces does not matter.
 
     Attributes:
         vertices: (V, 3) float64, relative to ``centre``.
@@ -40,12 +42,18 @@ class MeshEdges:
         first = np.searchsorted(edge[order], np.arange(len(self.edges)))
         count = np.bincount(edge, minlength=len(self.edges))
         slot = first[:, None] + np.minimum(np.arange(MAX_EDGE_FACES), count[:, None] - 1)
-        self._edge_faces, signs = owner[order][slot], sign[order][slot]  # (E, 4), the last one repeated
-        depth = min(MAX_EDGE_FACES, max(2, int(count.max(initial=1))))  # closed meshes have two faces at every edge
-        self._edge_faces, signs = self._edge_faces[:, :depth], signs[:, :depth]
+        # (E, 4), the last one repeated
+        self._edge_faces = owner[order][slot]
+        signs = sign[order][slot]
+        # closed meshes have two faces at every edge
+        depth = min(MAX_EDGE_FACES, max(2, int(count.max(initial=1))))
+        self._edge_faces = self._edge_faces[:, :depth]
+        signs = signs[:, :depth]
         self._flips = (signs < 0).T
-        boundary, many = count == 1, count > 2
-        # Unit vectors within the faces, away from the edge: they do not depend on the orientation of faces.
+        boundary = count == 1
+        many = count > 2
+        # Unit vectors within the faces, away from the edge: they do not depend on the orientation
+        # of faces.
         along = vertices[self.edges[:, 1]] - vertices[self.edges[:, 0]]
         normal = self._plane / np.maximum(np.linalg.norm(self._plane, axis=1), 1e-300)[:, None]
         inward = np.cross(normal[self._edge_faces] * signs[..., None], along[:, None])
@@ -61,9 +69,10 @@ class MeshEdges:
         self.normals: np.ndarray = normals.astype(np.float32)
 
     def sides(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which edges are on the occluding contour, seen from cameras (N, 3) relative to ``centre``. (N, E) bool:
-        the third corners of all faces lie on one side of the plane through camera and edge. (N, E) bool: whether
-        ((a - eye) x (b - eye)) . (corner - eye) is positive there."""
+        """Which edges are on the occluding contour, seen from cameras (N, 3) relative to
+        ``centre``. (N, E) bool: the third corners of all faces lie on one side of the plane through
+        camera and edge. (N, E) bool: whether ((a - eye) x (b - eye)) . (corner - eye) is positive
+        there."""
         behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
         flips = zip(self._edge_faces.T, self._flips, strict=True)
         first, *others = (behind.take(faces, axis=1) ^ flip for faces, flip in flips)
@@ -74,27 +83,39 @@ class MeshEdges:
 
 
 def encloses_volumes(mesh: trimesh.Trimesh) -> bool:
-    """Whether each edge has two faces, which run along it in opposite directions, apart from faces without area, and
-    every connected surface has its outer side outside."""
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    _, number = _unique(np.round(vertices / max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)).astype(np.int64))
+    """Whether each edge has two faces, which run along it in opposite directions, apart from faces
+    without area, and every connected surface has its outer side outside."""
+    vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)
+    _, number = _unique(
+        np.round(vertices / max(np.ptp(vertices, axis=0).max() * WELD, 1e-300)).astype(np.int64)
+    )
     corners = number[faces]
     ends = np.roll(corners, -1, axis=1)
     has_area = (corners != ends).all(axis=1)
-    corners, ends = corners[has_area], ends[has_area]
-    a, b = corners.ravel(), ends.ravel()
-    along, back = np.sort(a * len(vertices) + b), np.sort(b * len(vertices) + a)
+    corners = corners[has_area]
+    ends = ends[has_area]
+    a = corners.ravel()
+    b = ends.ravel()
+    along = np.sort(a * len(vertices) + b)
+    back = np.sort(b * len(vertices) + a)
     if not len(along) or (along != back).any() or not (np.diff(along) > 0).all():
         return False
-    body = trimesh.graph.connected_component_labels(np.column_stack([a, b]), node_count=len(vertices))[corners[:, 0]]
+    body = trimesh.graph.connected_component_labels(
+        np.column_stack([a, b]), node_count=len(vertices)
+    )[corners[:, 0]]
     volume = np.bincount(body, np.linalg.det(vertices[faces[has_area]] - vertices.mean(axis=0)))
     return bool((volume[np.unique(body)] > 0).all())
 
 
-def simplified(mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most about
-    ``max_faces``."""
-    vertices, faces = _welded(np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces))
+def simplified(
+    mesh: trimesh.Trimesh, centre: np.ndarray, max_faces: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float64 relative to ``centre`` and faces (F, 3) of a mesh, welded, F at most
+    about ``max_faces``."""
+    vertices, faces = _welded(
+        np.asarray(mesh.vertices, np.float64) - centre, np.asarray(mesh.faces)
+    )
     if len(faces) <= max_faces:
         return vertices, faces
     points, triangles = fast_simplification.simplify(
@@ -109,16 +130,19 @@ def _welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     index, inverse = _unique(np.round(vertices / cell).astype(np.int64))
     a, b, c = inverse[faces].T
     has_area = (a != b) & (b != c) & (c != a)
-    if not has_area.any():  # parts that are smaller than a cell: welding would leave nothing of the mesh
+    # parts that are smaller than a cell: welding would leave nothing of the mesh
+    if not has_area.any():
         return vertices, faces
-    vertices, faces = vertices[index], inverse[faces][has_area]
+    vertices = vertices[index]
+    faces = inverse[faces][has_area]
     first, _ = _unique(np.sort(faces, axis=1))
     return vertices, faces[np.sort(first)]
 
 
 def _unique(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the distinct rows of whole numbers (N, K), in lexical order, so that edges of one vertex are
-    neighbours, and the number of each row among them; much faster than ``np.unique`` with an axis."""
+    """Indices of the distinct rows of whole numbers (N, K), in lexical order, so that edges of one
+    vertex are neighbours, and the number of each row among them; much faster than ``np.unique``
+    with an axis."""
     index, inverse = trimesh.grouping.unique_rows(rows)
     order = np.lexsort(rows[index].T[::-1])
     number = np.empty_like(order)

@@ -1,4 +1,5 @@
-"""Mesh files: which reader reads which format, the files that a mesh names, and the digest of all of them."""
+"""Mesh files: which reader reads which format, the files that a mesh names, and the digest of all
+of them."""
 
 import contextlib
 import logging
@@ -21,15 +22,16 @@ from .stl import read_stl
 from .threemf import read_threemf
 from .urdf import read_urdf
 
-logging.getLogger("trimesh").addHandler(logging.NullHandler())  # it would print tracebacks of files that it cannot read
+# it would print tracebacks of files that it cannot read
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 # Formats whose files may name buffers, material files, textures or meshes beside them
 _WITH_COMPANIONS = (".dae", ".glb", ".gltf", ".obj", ".ply", ".urdf")
 
 
 def mesh_files(path: Path, *, textures: Iterable[Path] = ()) -> list[Path]:
-    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL files, textures, meshes
-    of a URDF. They are found by reading the mesh; if that fails, those requested before are listed. Other files stand
-    alone."""
+    """The mesh file and those that it names, missing ones too: buffers and images of glTF, MTL
+    files, textures, meshes of a URDF. They are found by reading the mesh; if that fails, those
+    requested before are listed. Other files stand alone."""
     source = MeshSource(path, textures)
     if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
         with contextlib.suppress(CurviregError):  # reported where the mesh is loaded
@@ -38,13 +40,15 @@ def mesh_files(path: Path, *, textures: Iterable[Path] = ()) -> list[Path]:
 
 
 def mesh_digest(path: Path, *, textures: Iterable[Path] = ()) -> str:
-    """16 hexadecimal digits of the contents of :func:`mesh_files`, whatever their folder; missing files count too."""
+    """16 hexadecimal digits of the contents of :func:`mesh_files`, whatever their folder; missing
+    files count too."""
     return text_digest(" ".join(map(file_digest, mesh_files(path, textures=textures))))
 
 
 def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
-    """Read a mesh file and the files that it names; :class:`MeshError` if that fails. What could not be used is in the
-    ``warnings`` of the source. ``link`` is one of a URDF, of which all are read by default."""
+    """Read a mesh file and the files that it names; :class:`MeshError` if that fails. What could
+    not be used is in the ``warnings`` of the source. ``link`` is one of a URDF, of which all are
+    read by default."""
     path = source.path
     suffix = path.suffix.lower()
     if link is not None and suffix != ".urdf":
@@ -58,13 +62,25 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
     except CurviregError as error:
         raise error.with_subject(path) from None
     except IndexError as error:
-        message = "cannot be read as a mesh (a face names a vertex that the file lacks); re-export the file"
+        message = (
+            "cannot be read as a mesh (a face names a vertex that the file lacks); "
+            "re-export the "
+            "file"
+        )
         raise MeshError(message, subject=path) from error
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[:300]
+        reason = " ".join(f"{type(error).__name__}: {error}".removeprefix("ValueError: ").split())[
+            :300
+        ]
         if "unexpected length" in reason:  # what trimesh says of both
-            reason = "the file ends too early, or has binary faces with different numbers of corners: export triangles"
-        raise MeshError(f"cannot be read as a mesh ({reason}); re-export the file", subject=path) from error
+            reason = (
+                "the file ends too early, or has binary faces with different numbers of "
+                "corners: "
+                "export triangles"
+            )
+        raise MeshError(
+            f"cannot be read as a mesh ({reason}); re-export the file", subject=path
+        ) from error
 
 
 def read_off(source: MeshSource) -> ReadMesh:

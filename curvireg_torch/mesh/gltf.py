@@ -1,4 +1,5 @@
-"""glTF and GLB files: triangles, strips and fans at their places, with vertex colours, materials and textures."""
+"""glTF and GLB files: triangles, strips and fans at their places, with vertex colours, materials
+and textures."""
 
 import base64
 import json
@@ -15,7 +16,8 @@ from ..errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_B
 from .colours import SurfaceColours
 from .source import MeshSource, Pixels, ReadMesh, as_plain_numbers
 
-# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are read here
+# Beginnings of glTF extensions that a file may require: they leave shape and colours alone, or are
+# read here
 _READ_EXTENSIONS = (
     "KHR_materials_",
     "KHR_lights_",
@@ -26,13 +28,17 @@ _READ_EXTENSIONS = (
 )
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6  # Modes of primitives that have faces
+# Modes of primitives that have faces
+_TRIANGLES = 4
+_STRIP = 5
+_FAN = 6
 _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 _TRANSFORM = "KHR_texture_transform"
 
 
 def read_gltf(source: MeshSource, data: bytes | None = None) -> ReadMesh:
-    """Read a glTF or GLB file, or the ``data`` of one, as one mesh in its scene's frame; skins as the joints stand."""
+    """Read a glTF or GLB file, or the ``data`` of one, as one mesh in its scene's frame; skins as
+    the joints stand."""
     data = source.data() if data is None else data
     text, binary = _chunks(data)
     if len(text) > MAX_TABLE_BYTES:
@@ -56,7 +62,8 @@ def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
         raise ValueError("only glTF version 2 is read; export version 2")
     if kind != b"JSON" or length > len(data) or 20 + size > len(data):
         raise ValueError("the file ends too early, or is no GLB")
-    text, rest = data[20 : 20 + size], data[20 + size :]
+    text = data[20 : 20 + size]
+    rest = data[20 + size :]
     if len(rest) < 8:
         return text, None
     size, kind = struct.unpack_from("<I4s", rest)
@@ -70,10 +77,17 @@ def _check(tree: Any) -> None:
     if not str(tree["asset"]["version"]).startswith("2."):
         raise ValueError("only glTF version 2 is read; export version 2")
     names = [str(name) for name in tree.get("extensionsRequired", [])]
-    names += [name for node in tree.get("nodes", []) for name in node.get("extensions", {}) if "instancing" in name]
+    names += [
+        name
+        for node in tree.get("nodes", [])
+        for name in node.get("extensions", {})
+        if "instancing" in name
+    ]
     for name in names:
         if not name.startswith(_READ_EXTENSIONS):
-            raise ValueError(f"it requires the glTF extension {name[:60]}, which is not read; export without it")
+            raise ValueError(
+                f"it requires the glTF extension {name[:60]}, which is not read; export without it"
+            )
     _check_sizes(tree)
     _check_nodes(tree)
 
@@ -89,14 +103,21 @@ def _check_sizes(tree: dict[str, Any]) -> None:
     """Bounds on views of buffers, accessors, and every copy of a part."""
     accessors = tree.get("accessors", [])
     copied = sum(_natural(view["byteLength"]) for view in tree.get("bufferViews", []))
-    claimed = sum(4 * _WIDTHS[accessor["type"]] * _natural(accessor["count"]) for accessor in accessors)
+    claimed = sum(
+        4 * _WIDTHS[accessor["type"]] * _natural(accessor["count"]) for accessor in accessors
+    )
     if max(copied, claimed) > 4 * MAX_MESH_BYTES:
-        raise ValueError(f"its buffer views or accessors claim more than {4 * MAX_MESH_BYTES:,} bytes")
+        raise ValueError(
+            f"its buffer views or accessors claim more than {4 * MAX_MESH_BYTES:,} bytes"
+        )
 
     def count(index: Any) -> int:
         accessor = accessors[_natural(index)]
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("an accessor of a part is sparse or without data, which is not read; export without it")
+            raise ValueError(
+                "an accessor of a part is sparse or without data, which is not read; export "
+                "without it"
+            )
         return int(accessor["count"])
 
     def corners(part: dict[str, Any]) -> int:
@@ -105,7 +126,10 @@ def _check_sizes(tree: dict[str, Any]) -> None:
         factor = 3 if part.get("mode") in (_STRIP, _FAN) else 1
         return factor * max(map(count, used), default=0)
 
-    meshes = [(len(mesh["primitives"]), sum(map(corners, mesh["primitives"]))) for mesh in tree.get("meshes", [])]
+    meshes = [
+        (len(mesh["primitives"]), sum(map(corners, mesh["primitives"])))
+        for mesh in tree.get("meshes", [])
+    ]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
     for each in (meshes, copies):
         parts, most = (sum(column) for column in zip((0, 0), *each, strict=True))
@@ -116,8 +140,10 @@ def _check_sizes(tree: dict[str, Any]) -> None:
 
 
 def _check_nodes(tree: dict[str, Any]) -> None:
-    """Every node must be the child of one node at most, and a root of none: else the nodes form a circle, or more."""
-    nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
+    """Every node must be the child of one node at most, and a root of none: else the nodes form a
+    circle, or more."""
+    nodes = tree.get("nodes", [])
+    scenes = tree.get("scenes", [])
     if len(nodes) > 10 * MAX_MESH_PARTS:
         raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} nodes; join them")
     named = [child for node in nodes for child in node.get("children", [])]
@@ -155,7 +181,9 @@ class _File:
         vertices = self._skinned(node["skin"], attributes, mesh.vertices)
         return ReadMesh(vertices, mesh.faces, mesh.colours)
 
-    def _skinned(self, index: int, attributes: dict[str, int], vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _skinned(
+        self, index: int, attributes: dict[str, int], vertices: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Vertices moved by the joints of a skin; its node's own place does not count."""
         skin = self._tree["skins"][_natural(index)]
         T = np.stack([self._places.get(joint, np.eye(4)) for joint in skin["joints"]])
@@ -164,18 +192,25 @@ class _File:
             T = T @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(T)]
         joints = self._accessor(attributes["JOINTS_0"]).astype(np.int64)
         weights = self._accessor(attributes["WEIGHTS_0"])
-        if len(joints) != len(vertices) or len(weights) != len(vertices) or joints.max(initial=0) >= len(T):
+        if (
+            len(joints) != len(vertices)
+            or len(weights) != len(vertices)
+            or joints.max(initial=0) >= len(T)
+        ):
             raise ValueError("a skin does not fit its mesh")
         weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
         moved = np.zeros_like(vertices)
         for k in range(joints.shape[1]):
             at = T[joints[:, k]]
-            moved += weights[:, k, None] * (np.einsum("nij,nj->ni", at[:, :3, :3], vertices) + at[:, :3, 3])
+            moved += weights[:, k, None] * (
+                np.einsum("nij,nj->ni", at[:, :3, :3], vertices) + at[:, :3, 3]
+            )
         return moved
 
     def _nodes(self) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """The nodes of the scene and their places in it."""
-        nodes, scenes = self._tree.get("nodes", []), self._tree.get("scenes", [])
+        nodes = self._tree.get("nodes", [])
+        scenes = self._tree.get("scenes", [])
         if scenes:
             roots = scenes[self._tree.get("scene", 0)].get("nodes", [])
         else:
@@ -192,9 +227,17 @@ class _File:
         if index not in self._parts:
             mesh = self._tree["meshes"][index]
             if any(mesh.get("weights", [])):
-                self._source.warn("skin", "its morph targets are left out: the shape is that without them")
-            parts = [part for part in mesh["primitives"] if part.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)]
-            self._parts[index] = [(part, self._part(part)) for part in parts if "POSITION" in part["attributes"]]
+                self._source.warn(
+                    "skin", "its morph targets are left out: the shape is that without them"
+                )
+            parts = [
+                part
+                for part in mesh["primitives"]
+                if part.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
+            ]
+            self._parts[index] = [
+                (part, self._part(part)) for part in parts if "POSITION" in part["attributes"]
+            ]
         return self._parts[index]
 
     def _part(self, part: dict[str, Any]) -> ReadMesh:
@@ -208,7 +251,9 @@ class _File:
         faces = _faces(indices, part.get("mode", _TRIANGLES))
         return ReadMesh(vertices, faces, self._colours(part, faces, len(vertices)))
 
-    def _colours(self, part: dict[str, Any], faces: NDArray[np.int64], count: int) -> SurfaceColours | None:
+    def _colours(
+        self, part: dict[str, Any], faces: NDArray[np.int64], count: int
+    ) -> SurfaceColours | None:
         """Vertex colours times the colour of the material times its texture."""
         attributes = part["attributes"]
         if "material" not in part and "COLOR_0" not in attributes:
@@ -231,13 +276,18 @@ class _File:
             return SurfaceColours(corners, plain.uv, plain.texture)
         return SurfaceColours(corners, uv[faces], np.zeros(len(faces), np.int32), (pixels,))
 
-    def _coordinates(self, info: dict[str, Any], attributes: dict[str, int], count: int) -> NDArray[np.float32] | None:
-        """(V, 2) texture coordinates from the bottom left, in the set and by the transform that the texture names."""
+    def _coordinates(
+        self, info: dict[str, Any], attributes: dict[str, int], count: int
+    ) -> NDArray[np.float32] | None:
+        """(V, 2) texture coordinates from the bottom left, in the set and by the transform that the
+        texture names."""
         transform = info.get("extensions", {}).get(_TRANSFORM, {})
         number = _natural(transform.get("texCoord", info.get("texCoord", 0)))
         name = f"TEXCOORD_{number}"
         if name not in attributes:
-            self._source.warn("texture", f"a textured part lacks {name}; it is shown in its plain colour")
+            self._source.warn(
+                "texture", f"a textured part lacks {name}; it is shown in its plain colour"
+            )
             return None
         uv = self._accessor(attributes[name], normalized=True)
         if uv.shape != (count, 2):
@@ -246,8 +296,10 @@ class _File:
         scale = as_plain_numbers(transform.get("scale"), 2, (1.0, 1.0))
         offset = as_plain_numbers(transform.get("offset"), 2, (0.0, 0.0))
         angle = float(transform.get("rotation", 0.0))
-        u, v = scale[0] * u, scale[1] * v
-        cos, sin = math.cos(angle), math.sin(angle)
+        u = scale[0] * u
+        v = scale[1] * v
+        cos = math.cos(angle)
+        sin = math.sin(angle)
         turned_u = cos * u + sin * v + offset[0]
         turned_v = cos * v - sin * u + offset[1]
         return np.column_stack([turned_u, 1.0 - turned_v]).astype(np.float32)
@@ -257,7 +309,10 @@ class _File:
         webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
         index = webp.get("source", texture.get("source"))
         if index is None:
-            self._source.warn("texture", "a texture is in a format that is not read; its faces are in plain colour")
+            self._source.warn(
+                "texture",
+                "a texture is in a format that is not read; its faces are in plain colour",
+            )
             return None
         image = self._tree["images"][_natural(index)]
         name = str(image.get("name", f"number {index}"))
@@ -268,13 +323,19 @@ class _File:
             return self._source.texture(index, _data_of(uri), name)
         return self._source.texture_file(urllib.parse.unquote(uri))
 
-    def _accessor(self, index: Any, *, normalized: bool = False, as_stored: bool = False) -> NDArray[Any]:
-        """(count, width) values of an accessor as float64; integers that stand for fractions are divided."""
+    def _accessor(
+        self, index: Any, *, normalized: bool = False, as_stored: bool = False
+    ) -> NDArray[Any]:
+        """(count, width) values of an accessor as float64; integers that stand for fractions are
+        divided."""
         accessor = self._tree["accessors"][_natural(index)]
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("an accessor is sparse or without data, which is not read; export without it")
+            raise ValueError(
+                "an accessor is sparse or without data, which is not read; export without it"
+            )
         kind = np.dtype(_TYPES[accessor["componentType"]])
-        width, count = _WIDTHS[accessor["type"]], accessor["count"]
+        width = _WIDTHS[accessor["type"]]
+        count = accessor["count"]
         view = self._tree["bufferViews"][_natural(accessor["bufferView"])]
         data = self._view(accessor["bufferView"])
         start = _natural(accessor.get("byteOffset", 0))
@@ -282,7 +343,9 @@ class _File:
         stride = _natural(view.get("byteStride", 0)) or size
         if count and start + stride * (count - 1) + size > len(data):
             raise ValueError("an accessor is longer than its data; the file ends too early")
-        stored: NDArray[Any] = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+        stored: NDArray[Any] = np.ndarray(
+            (count, width), kind, data, start, (stride, kind.itemsize)
+        )
         if as_stored or kind.kind == "f":
             return stored if as_stored else stored.astype(np.float64)
         values = stored.astype(np.float64)
@@ -323,7 +386,10 @@ def _local(node: dict[str, Any]) -> NDArray[np.float64]:
     x, y, z, w = as_plain_numbers(node.get("rotation"), 4, (0.0, 0.0, 0.0, 1.0))
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if norm > 0.0:
-        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        x = x / norm
+        y = y / norm
+        z = z / norm
+        w = w / norm
         T[0, :3] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
         T[1, :3] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
         T[2, :3] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
@@ -338,7 +404,8 @@ def _faces(indices: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
         return indices[: len(indices) // 3 * 3].reshape(-1, 3)
     if len(indices) < 3:
         return np.zeros((0, 3), np.int64)
-    second, third = indices[1:-1], indices[2:]
+    second = indices[1:-1]
+    third = indices[2:]
     if mode == _FAN:
         return np.column_stack([np.full(len(second), indices[0]), second, third])
     faces = np.column_stack([indices[:-2], second, third])
@@ -362,4 +429,8 @@ def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _data_of(uri: str) -> bytes:
     head, _, content = uri.partition(",")
-    return base64.b64decode(content) if head.endswith(";base64") else urllib.parse.unquote_to_bytes(content)
+    return (
+        base64.b64decode(content)
+        if head.endswith(";base64")
+        else urllib.parse.unquote_to_bytes(content)
+    )

@@ -1,4 +1,5 @@
-"""What is wrong with a mesh that can be used: parts left over far away, and coordinates without digits."""
+"""What is wrong with a mesh that can be used: parts left over far away, and coordinates without
+digits."""
 
 import numpy as np
 import trimesh
@@ -9,19 +10,25 @@ from scipy.sparse.csgraph import connected_components
 from .source import MeshWarning
 
 SAMPLES = 20_000  # Points of the surface that say where it is
-# Parts that together hold less than this fraction of the surface, and lie farther from the rest than one to two cells
-# of this fraction of its size, are left over: a leftover of a scan, a marker of the origin
-STRAY_FRACTION, STRAY_GAP = 0.002, 0.1
-SPREAD = 1.15  # The box is looked at if it is so many times as large as that of almost all of the surface
-COARSE_STEP = 2e-4  # Steps between coordinates, as a fraction of the mesh's size, that show in its contours
+# Parts that together hold less than this fraction of the surface, and lie farther from the rest
+# than one to two cells of this fraction of its size, are left over: a leftover of a scan, a marker
+# of the origin
+STRAY_FRACTION = 0.002
+STRAY_GAP = 0.1
+# The box is looked at if it is so many times as large as that of almost all of the surface
+SPREAD = 1.15
+# Steps between coordinates, as a fraction of the mesh's size, that show in its contours
+COARSE_STEP = 2e-4
 
 
 def stray_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
-    """(F,): which faces belong to parts of almost no area that lie apart from the rest and enlarge the mesh's box.
+    """(F,): which faces belong to parts of almost no area that lie apart from the rest and enlarge
+    the mesh's box.
 
     Space is divided into cells; what shares a cell, or lies in neighbouring ones, is one part.
     """
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)
     none = np.zeros(len(faces), bool)
     area = np.asarray(mesh.area_faces)
     face = _random_faces(area)
@@ -56,7 +63,8 @@ def stray_warning(mesh: trimesh.Trimesh, stray: NDArray[np.bool_]) -> MeshWarnin
 
 
 def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:
-    """A warning where coordinates are so large, as those of maps, that single precision has rounded them."""
+    """A warning where coordinates are so large, as those of maps, that single precision has rounded
+    them."""
     vertices = np.asarray(mesh.vertices)
     largest = float(np.abs(vertices).max())
     step = float(np.spacing(np.float32(largest)))
@@ -64,7 +72,10 @@ def precision_warning(mesh: trimesh.Trimesh) -> MeshWarning | None:
     is_single = bool((vertices.astype(np.float32) == vertices).all())
     if step < COARSE_STEP * size or not is_single:
         return None
-    text = f"its coordinates are rounded to steps of {step:.2g}: move the object near the origin, and export it again"
+    text = (
+        f"its coordinates are rounded to steps of {step:.2g}: move the object near the origin, "
+        f"and export it again"
+    )
     return MeshWarning("precision", text)
 
 
@@ -82,12 +93,14 @@ def _random_points(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parts(cells: NDArray[np.int64], face: NDArray[np.int64], count: int) -> NDArray[np.int32]:
-    """(F,) numbers of the parts that the faces belong to; ``cells`` are those of the samples, which are of ``face``,
-    and then of the three corners of each of the ``count`` faces."""
+    """(F,) numbers of the parts that the faces belong to; ``cells`` are those of the samples, which
+    are of ``face``, and then of the three corners of each of the ``count`` faces."""
     key = (cells + 2**19) @ np.array([2**40, 2**20, 1])
     unique, place = np.unique(key, return_inverse=True)
     links = []
-    shifts = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+    shifts = np.stack(
+        np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     for shift in shifts[:13]:  # the others are their opposites
         wanted = unique + shift @ np.array([2**40, 2**20, 1])
         found = np.searchsorted(unique, wanted).clip(max=len(unique) - 1)

@@ -15,7 +15,14 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_MESH_COORDINATE, MAX_MESH_FACES, MIN_MESH_EXTENT, CurviregWarning, MeshError, MissingFileError
+from ..errors import (
+    MAX_MESH_COORDINATE,
+    MAX_MESH_FACES,
+    MIN_MESH_EXTENT,
+    CurviregWarning,
+    MeshError,
+    MissingFileError,
+)
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
 from .colours import colours_of_parts
@@ -37,29 +44,34 @@ def load_mesh(
 ) -> trimesh.Trimesh:
     """Read a mesh file; scenes become one mesh, polygons become triangles, normals are ignored.
 
-    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's frame and unit.
+    Nothing is rescaled: vertices, and every pose computed from them, stay in the file's frame and
+    unit.
 
     Args:
-        path: .obj, .ply, .stl, .off, .glb, .gltf, .3mf or .urdf; with the extra ``cad`` also .step, .stp, .iges, .igs
-            and .dae.
-        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``. None: that which
-            the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else m. An object that would be smaller
+        path: .obj, .ply, .stl, .off, .glb, .gltf, .3mf or .urdf; with the extra ``cad`` also .step,
+            .stp, .iges, .igs and .dae.
+        unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
+            None: that which the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else
+                m. An object that would be smaller
             than 5 mm or larger than 100 m gets a warning.
-        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in ``mesh.metadata["up"]``; None: that
-            which the file states, else y for glTF and z for other formats.
-        link: the link of a URDF whose mesh is read, in the link's frame; None: all links, with all joints at zero.
+        up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
+            ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
+            other formats.
+        link: the link of a URDF whose mesh is read, in the link's frame; None: all links, with all
+            joints at zero.
         textures: a further folder in which files are looked for that the mesh names.
 
     Returns:
-        Vertices (V, 3) float64, faces (F, 3) without degenerate ones and without small parts far away, and textures
-        and other colours as one :class:`SurfaceColours` in ``mesh.metadata["colours"]``, which count if they vary
-        (:func:`has_colours`). What the mesh lacks is in :func:`mesh_warnings`, and a :class:`CurviregWarning` each.
+        Vertices (V, 3) float64, faces (F, 3) without degenerate ones and without small parts far
+        away, and textures and other colours as one :class:`SurfaceColours` in
+        ``mesh.metadata["colours"]``, which count if they vary (:func:`has_colours`). What the mesh
+        lacks is in :func:`mesh_warnings`, and a :class:`CurviregWarning` each.
 
     Raises:
         MissingFileError: the file does not exist.
         MissingDependencyError: a package is needed for the format.
-        MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices, beyond
-            :mod:`curvireg_torch.errors`, or states another unit than ``unit``.
+        MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices,
+            beyond :mod:`curvireg_torch.errors`, or states another unit than ``unit``.
     """
     path = Path(path)
     if unit is not None:
@@ -69,13 +81,17 @@ def load_mesh(
     if not path.is_file():
         raise MissingFileError("no such file; check the path of the mesh", subject=path)
     if path.suffix.lower() not in MESHES:
-        raise MeshError(f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path)
+        raise MeshError(
+            f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path
+        )
     if textures is not None and not Path(textures).is_dir():
         raise MissingFileError("no such folder; check the folder of the textures", subject=textures)
     source = MeshSource(path, [] if textures is None else [Path(textures)])
     found = read_source(source, link)
     if unit is not None and found.unit not in (None, unit):
-        message = f"the file states its unit, {found.unit}, which is not {unit!r}; leave the unit out"
+        message = (
+            f"the file states its unit, {found.unit}, which is not {unit!r}; leave the unit out"
+        )
         raise MeshError(message, subject=path)
     whole = trimesh.Trimesh(found.vertices, found.faces, process=False)
     whole.metadata["colours"] = found.colours
@@ -94,7 +110,8 @@ def load_mesh(
 
 
 def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
-    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as :func:`load_mesh`."""
+    """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as
+    :func:`load_mesh`."""
     if isinstance(source, str | PathLike):
         return load_mesh(source)
     noticed = list(mesh_warnings(source)) if isinstance(source, trimesh.Trimesh) else []
@@ -102,11 +119,16 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         try:
             source, colours = joined_scene(source)
         except Exception as error:  # singular transforms, unconnected parts, malformed vertices
-            raise MeshError(f"its parts cannot be put together ({error}); re-export the file", subject=name) from error
+            raise MeshError(
+                f"its parts cannot be put together ({error}); re-export the file", subject=name
+            ) from error
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
-        raise MeshError("expected a mesh with faces, got none; points and curves cannot be rendered", subject=name)
+        raise MeshError(
+            "expected a mesh with faces, got none; points and curves cannot be rendered",
+            subject=name,
+        )
     triangles, is_degenerate = checked_triangles(source, name)
     vertices = np.asarray(source.vertices, dtype=np.float64)
     mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
@@ -117,7 +139,11 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
         mesh = trimesh.Trimesh(vertices=vertices, faces=mesh.faces[~stray], process=False)
         colours = None if colours is None else colours[~stray]
     mesh.remove_unreferenced_vertices()
-    noticed += [warning for warning in [precision_warning(mesh)] if warning is not None and warning not in noticed]
+    noticed += [
+        warning
+        for warning in [precision_warning(mesh)]
+        if warning is not None and warning not in noticed
+    ]
     unit = mesh_unit(source)
     if unit is not None:  # trimesh keeps None as the word "none"
         mesh.units = unit
@@ -135,58 +161,87 @@ def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
     return tuple(warning for warning in found if isinstance(warning, MeshWarning))
 
 
-MANY_POINTS = 4096  # Points of a hull: to project more of them in every view costs more than to cast the rays
+# Points of a hull: to project more of them in every view costs more than to cast the rays
+MANY_POINTS = 4096
 
 
-def checked_triangles(mesh: trimesh.Trimesh, name: str) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(F, 3) faces, and (F,) whether a face has no area; :class:`MeshError` for triangles that are no mesh."""
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+def checked_triangles(
+    mesh: trimesh.Trimesh, name: str
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(F, 3) faces, and (F,) whether a face has no area; :class:`MeshError` for triangles that are
+    no mesh."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    faces = np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) > MAX_MESH_FACES:
-        raise MeshError(f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name)
+        raise MeshError(
+            f"{len(faces):,} faces, more than {MAX_MESH_FACES:,}; simplify it", subject=name
+        )
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
-        message = f"expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}"
+        message = (
+            f"expected vertices (V, 3) and faces (F, 3), got {vertices.shape} and {faces.shape}"
+        )
         raise MeshError(message, subject=name)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("faces name vertices that do not exist; the file is damaged, re-export it", subject=name)
+        raise MeshError(
+            "faces name vertices that do not exist; the file is damaged, re-export it", subject=name
+        )
     corners = vertices[faces]
     if not np.isfinite(corners).all():
         count = int((~np.isfinite(corners).all(axis=(1, 2))).sum())
-        raise MeshError(f"{count} faces have NaN or infinite vertices; repair the mesh", subject=name)
+        raise MeshError(
+            f"{count} faces have NaN or infinite vertices; repair the mesh", subject=name
+        )
     if float(np.abs(corners).max()) > MAX_MESH_COORDINATE:
-        raise MeshError(f"vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh", subject=name)
-    extent = max(float(np.ptp(corners[..., axis])) for axis in range(3))  # 20 times as fast as by one reduction
+        raise MeshError(
+            f"vertices farther than {MAX_MESH_COORDINATE:g} from the origin; repair the mesh",
+            subject=name,
+        )
+    # 20 times as fast as by one reduction
+    extent = max(float(np.ptp(corners[..., axis])) for axis in range(3))
     if 0 < extent < MIN_MESH_EXTENT:
-        raise MeshError(f"only {extent:.1g} units across; scale it up, or export it in a smaller unit", subject=name)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        raise MeshError(
+            f"only {extent:.1g} units across; scale it up, or export it in a smaller unit",
+            subject=name,
+        )
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     if not (area > 0).any():
         raise MeshError("every face is degenerate (area 0); repair the mesh", subject=name)
     return faces, ~(area > 0)
 
 
 def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
-    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of them."""
+    """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of
+    them."""
     if mesh.units in UNITS:
         return str(mesh.units)
     try:
         metres = trimesh.units.unit_conversion(mesh.units, "meters")
     except (AttributeError, ValueError):
         return None
-    return next((unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None)
+    return next(
+        (unit for unit, length in UNITS.items() if math.isclose(metres, length, rel_tol=1e-6)), None
+    )
 
 
 def format_up(suffix: str) -> str:
-    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in CAD."""
+    """The axis that points up in files of a format: y in glTF, by its specification; else z, as in
+    CAD."""
     return "y" if suffix.lower() in (".glb", ".gltf") else "z"
 
 
 def mesh_up(mesh: trimesh.Trimesh) -> str:
-    """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in the file's frame."""
+    """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in
+    the file's frame."""
     return str(mesh.metadata.get("up", "z"))
 
 
-def cached_in_mesh(function: Callable[[trimesh.Trimesh], Found]) -> Callable[[trimesh.Trimesh], Found]:
-    """Decorate a function of a mesh whose value stays in trimesh's cache, by the function's name, until vertices or
-    faces change; callers get copies of tensors. Banks store such values."""
+def cached_in_mesh(
+    function: Callable[[trimesh.Trimesh], Found],
+) -> Callable[[trimesh.Trimesh], Found]:
+    """Decorate a function of a mesh whose value stays in trimesh's cache, by the function's name,
+    until vertices or faces change; callers get copies of tensors. Banks store such values."""
     cached = trimesh.caching.cache_decorator(function).fget
 
     @wraps(function)
@@ -199,8 +254,9 @@ def cached_in_mesh(function: Callable[[trimesh.Trimesh], Found]) -> Callable[[tr
 
 @cached_in_mesh
 def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
-    """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than 4096 of them, those
-    outermost in 2562 directions of the object scaled to equal extents: sides of boxes move by 0.1 % at most."""
+    """(P, 3) float64 vertices of the convex hull, which determine projected boxes. Of more than
+    4096 of them, those outermost in 2562 directions of the object scaled to equal extents: sides of
+    boxes move by 0.1 % at most."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.array(mesh.vertices, dtype=np.float64)
@@ -209,7 +265,8 @@ def extreme_points(mesh: trimesh.Trimesh) -> Tensor:
     if len(points) > MANY_POINTS:
         directions = trimesh.creation.icosphere(subdivisions=4).vertices
         scaled, _, _ = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-        outermost = [(some @ scaled.T).argmax(axis=1) for some in np.array_split(directions, 32)]  # bounded memory
+        # bounded memory
+        outermost = [(some @ scaled.T).argmax(axis=1) for some in np.array_split(directions, 32)]
         points = points[np.unique(np.concatenate(outermost))]
     return torch.from_numpy(points)
 
@@ -232,9 +289,10 @@ def mesh_radius(mesh: trimesh.Trimesh) -> float:
 def normalization_transform(mesh: trimesh.Trimesh) -> Tensor:
     """(4, 4) float64 similarity from the model's frame to the paper's normalised frame.
 
-    The area-weighted centroid goes to the origin and the farthest vertex to distance 1; the principal axes of the
-    surface go to x, y, z in decreasing order of variance. The third moments of the surface along x and y are positive,
-    and z completes a right-handed frame. Of axes with equal variance, rounding decides.
+    The area-weighted centroid goes to the origin and the farthest vertex to distance 1; the
+    principal axes of the surface go to x, y, z in decreasing order of variance. The third moments
+    of the surface along x and y are positive, and z completes a right-handed frame. Of axes with
+    equal variance, rounding decides.
 
     Example:
         >>> T = normalization_transform(trimesh.creation.box((2.0, 4.0, 4.0)))

@@ -13,7 +13,10 @@ from .source import MeshSource, Pixels, ReadMesh, numbers, plain_text, spellings
 
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
 # Corners of one form: v, v/vt and v/vt/vn. Possessive, so that no text takes long to be refused.
-_FORMS = {fields: re.compile(rb"(?:\s++" + rb"/".join([rb"-?+\d++"] * fields) + rb")++\s*+") for fields in (1, 2, 3)}
+_FORMS = {
+    fields: re.compile(rb"(?:\s++" + rb"/".join([rb"-?+\d++"] * fields) + rb")++\s*+")
+    for fields in (1, 2, 3)
+}
 _NAMES = (b"usemtl", b"o", b"g", b"mtllib")
 _NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 # Options of a texture in an MTL file, and how many words follow; "numbers": up to three numbers
@@ -37,7 +40,8 @@ _MAP_OPTIONS: dict[bytes, int | str] = {
 
 @dataclass
 class _Material:
-    """One material: its colour in [0, 1], if any, and its texture with scale and offset of the coordinates."""
+    """One material: its colour in [0, 1], if any, and its texture with scale and offset of the
+    coordinates."""
 
     colour: tuple[float, ...] | None = None
     texture: bytes | None = None
@@ -68,7 +72,8 @@ class _Lines:
 
 
 def read_obj(source: MeshSource) -> ReadMesh:
-    """Read an OBJ file with its colours: textures, colours of materials, or colours behind the coordinates."""
+    """Read an OBJ file with its colours: textures, colours of materials, or colours behind the
+    coordinates."""
     data = plain_text(source.data())
     if data.count(b"\n") > MAX_MESH_LINES:
         raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
@@ -85,9 +90,12 @@ def read_obj(source: MeshSource) -> ReadMesh:
 def _lines_of(data: bytes) -> _Lines:
     if b"\\\n" in data:
         data = data.replace(b"\\\n", b" ")
-    found, current = _Lines(), -1
+    found = _Lines()
+    current = -1
     parts: set[bytes] = set()
-    points, faces, uv = found.points, found.faces, found.uv
+    points = found.points
+    faces = found.faces
+    uv = found.uv
     has_remarks = b"#" in data
     for line in data.split(b"\n"):
         start = line[:2]  # most lines, without a search for their words
@@ -115,7 +123,8 @@ def _lines_of(data: bytes) -> _Lines:
 
 
 def _noted(found: _Lines, parts: set[bytes], key: bytes, name: bytes, current: int) -> int:
-    """Note the name of a material, part or library; returns the number of the material that now holds."""
+    """Note the name of a material, part or library; returns the number of the material that now
+    holds."""
     if key == b"usemtl":
         current = found.materials.setdefault(name, len(found.materials)) if name else -1
     elif key == b"mtllib":
@@ -127,7 +136,9 @@ def _noted(found: _Lines, parts: set[bytes], key: bytes, name: bytes, current: i
     return current
 
 
-def _table(lines: list[bytes], least: int, what: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _table(
+    lines: list[bytes], least: int, what: str
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """All numbers of some lines, and how many each line has, at least ``least``."""
     counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
     if len(counts) and counts.min() < least:
@@ -150,8 +161,8 @@ def _points(lines: list[bytes]) -> tuple[NDArray[np.float64], NDArray[np.uint8] 
 
 
 def _corners(lines: _Lines) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(N, 2) vertex and texture coordinate (-1: none) of the corners of all faces, counted from 0, and (F,) how many
-    corners each face has."""
+    """(N, 2) vertex and texture coordinate (-1: none) of the corners of all faces, counted from 0,
+    and (F,) how many corners each face has."""
     counts = np.fromiter((len(line.split()) for line in lines.faces), np.int64, len(lines.faces))
     if np.maximum(counts - 2, 0).sum() > MAX_MESH_FACES:
         raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
@@ -195,7 +206,9 @@ def _triangles(
     polygons = [corners[first[k] : first[k] + counts[k], 0].tolist() for k in many]
     divided = divide_faces(points, polygons)
     lengths = np.fromiter(map(len, divided), np.int64, len(divided))
-    places = np.array([triangle for triangles in divided for triangle in triangles], np.int64).reshape(-1, 3)
+    places = np.array(
+        [triangle for triangles in divided for triangle in triangles], np.int64
+    ).reshape(-1, 3)
     owner = np.repeat(many, lengths)
     face_of = np.concatenate([simple, owner])
     picked = np.concatenate([picked, first[owner][:, None] + places])
@@ -222,12 +235,15 @@ def _colours(
         return None
     colours = SurfaceColours.plain(len(faces))
     corners = colours.corners.copy() if point_colours is None else point_colours[faces]
-    uv, texture = colours.uv, colours.texture
+    uv = colours.uv
+    texture = colours.texture
     textures: list[Pixels] = []
     values, counts = _table(lines.uv, 1, "a texture coordinate")
     first = np.cumsum(counts) - counts
     is_flat = counts < 2  # of a texture with one dimension
-    table = np.column_stack([values[first], np.where(is_flat, 0.0, values[np.minimum(first + 1, len(values) - 1)])])
+    table = np.column_stack(
+        [values[first], np.where(is_flat, 0.0, values[np.minimum(first + 1, len(values) - 1)])]
+    )
     table = np.nan_to_num(table, posinf=0.0, neginf=0.0)
     has_uv = (uv_index >= 0).all(axis=1)
     order = np.argsort(material, kind="stable")

@@ -1,4 +1,5 @@
-"""PLY files, as trimesh parses them; which of their properties are coordinates, faces and colours is decided here."""
+"""PLY files, as trimesh parses them; which of their properties are coordinates, faces and colours
+is decided here."""
 
 import re
 from io import BytesIO
@@ -21,12 +22,13 @@ _COLOURS = (
 )
 _COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("s_tex", "t_tex"))
 _FACE_LISTS = ("vertex_indices", "vertex_index")
-_TEXTURE_FILE = re.compile(rb"^comment[ \t]+TextureFile[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE)
-# A name by which trimesh would look for the texture coordinates of triangles, and one that it does not know
-_CORNERS, _OWN_CORNERS = (
-    re.compile(rb"^(property[ \t]+list[ \t]+\w+[ \t]+\w+[ \t]+)texcoord\b", re.MULTILINE),
-    "corner_uv",
+_TEXTURE_FILE = re.compile(
+    rb"^comment[ \t]+TextureFile[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE
 )
+# A name by which trimesh would look for the texture coordinates of triangles, and one that it does
+# not know
+_CORNERS = re.compile(rb"^(property[ \t]+list[ \t]+\w+[ \t]+\w+[ \t]+)texcoord\b", re.MULTILINE)
+_OWN_CORNERS = "corner_uv"
 _REMARK = re.compile(rb"^(?:comment|obj_info)[^\n]*\n", re.MULTILINE)
 
 
@@ -41,10 +43,14 @@ def read_ply(source: MeshSource) -> ReadMesh:
     names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
     if b"ascii" in header[:100] and max(body.count(b"\n"), body.count(b"\r")) > MAX_MESH_LINES:
         raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
-    plain = _REMARK.sub(b"", header.replace(b"\r\n", b"\n")).decode("ascii", errors="replace").encode()
+    plain = (
+        _REMARK.sub(b"", header.replace(b"\r\n", b"\n")).decode("ascii", errors="replace").encode()
+    )
     plain = _CORNERS.sub(rb"\1" + _OWN_CORNERS.encode(), plain)
     body = body.removeprefix(b"\r") if b"ascii" not in header[:100] else body
-    raw = trimesh.exchange.ply.load_ply(BytesIO(plain + end + body), skip_materials=True, fix_texture=False)
+    raw = trimesh.exchange.ply.load_ply(
+        BytesIO(plain + end + body), skip_materials=True, fix_texture=False
+    )
     elements: dict[str, dict[str, Any]] = raw["metadata"]["_ply_raw"]
     for name, element in elements.items():
         values = element.get("data")
@@ -60,9 +66,13 @@ def read_ply(source: MeshSource) -> ReadMesh:
     polygons = _Element(elements.get("face", {}))
     if not polygons.names:
         return ReadMesh(vertices, np.zeros((0, 3), np.int64))
-    lists = polygons.lists(next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0]))
+    lists = polygons.lists(
+        next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
+    )
     faces, owner, places = _divided(vertices, lists)
-    return ReadMesh(vertices, faces, _colours(source, points, polygons, names, faces, owner, places))
+    return ReadMesh(
+        vertices, faces, _colours(source, points, polygons, names, faces, owner, places)
+    )
 
 
 class _Element:
@@ -103,7 +113,9 @@ class _Element:
             return values
         # trimesh takes the first face's number of corners for that of all
         if (values["f0"] != values["f1"].shape[1]).any():
-            raise ValueError("binary faces with different numbers of corners are not read; export triangles")
+            raise ValueError(
+                "binary faces with different numbers of corners are not read; export triangles"
+            )
         return values["f1"]
 
 
@@ -134,16 +146,27 @@ def _colours(
         pixels = [source.texture_file(*spellings(name)) for name in names]
         number = polygons.table(("texnumber",))
         if number is None and len(names) > 1:
-            text = f"it names {len(names)} textures and does not say which face has which; the first is used"
+            text = (
+                f"it names {len(names)} textures and does not say which face has which; the "
+                f"first "
+                f"is used"
+            )
             source.warn("texture", text)
-        texture = np.zeros(len(faces), np.int32) if number is None else number[owner, 0].astype(np.int32)
+        texture = (
+            np.zeros(len(faces), np.int32) if number is None else number[owner, 0].astype(np.int32)
+        )
         if any(found is not None for found in pixels):
             return _textured(plain, uv, texture, pixels)
     elif names:
-        source.warn("texture", "it names a texture and has no texture coordinates; the mesh is shown without it")
+        source.warn(
+            "texture",
+            "it names a texture and has no texture coordinates; the mesh is shown without it",
+        )
     colours = polygons.colours()
     if colours is not None:
-        return SurfaceColours(np.repeat(colours[owner][:, None], 3, axis=1), plain.uv, plain.texture)
+        return SurfaceColours(
+            np.repeat(colours[owner][:, None], 3, axis=1), plain.uv, plain.texture
+        )
     colours = points.colours()
     if colours is not None:
         return SurfaceColours(colours[faces], plain.uv, plain.texture)
@@ -151,13 +174,18 @@ def _colours(
 
 
 def _textured(
-    plain: SurfaceColours, uv: NDArray[np.float32], texture: NDArray[np.int32], pixels: list[Pixels | None]
+    plain: SurfaceColours,
+    uv: NDArray[np.float32],
+    texture: NDArray[np.int32],
+    pixels: list[Pixels | None],
 ) -> SurfaceColours:
     used = [k for k, found in enumerate(pixels) if found is not None]
     number = np.full(len(pixels) + 1, -1, np.int32)
     number[used] = np.arange(len(used))
     known = np.where((texture >= 0) & (texture < len(pixels)), texture, len(pixels))
-    return SurfaceColours(plain.corners, uv, number[known], tuple(found for found in pixels if found is not None))
+    return SurfaceColours(
+        plain.corners, uv, number[known], tuple(found for found in pixels if found is not None)
+    )
 
 
 def _coordinates(
@@ -171,7 +199,11 @@ def _coordinates(
     if _OWN_CORNERS in polygons.names:
         rows = polygons.lists(_OWN_CORNERS)
         starts = np.cumsum([0, *map(len, rows)])
-        values = np.concatenate([np.asarray(row, np.float64) for row in rows]) if len(rows) else np.zeros(0)
+        values = (
+            np.concatenate([np.asarray(row, np.float64) for row in rows])
+            if len(rows)
+            else np.zeros(0)
+        )
         at = starts[:-1][owner][:, None] + 2 * places
         if (at + 2 > starts[1:][owner][:, None]).any():
             raise ValueError("texture coordinates that do not fit the faces")

@@ -7,13 +7,16 @@ from .colours import SurfaceColours, colours_of_parts
 
 
 def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceColours | None]:
-    """One mesh of a scene's parts at their places: ``scene.dump()`` takes time with the cube of a part's depth, and
-    would pack textures into one that cannot repeat."""
-    geometry = {name: part for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)}
+    """One mesh of a scene's parts at their places: ``scene.dump()`` takes time with the cube of a
+    part's depth, and would pack textures into one that cannot repeat."""
+    geometry = {
+        name: part for name, part in scene.geometry.items() if isinstance(part, trimesh.Trimesh)
+    }
     colours = dict(zip(geometry, colours_of_parts(geometry.values()), strict=True))
     forest = scene.graph.transforms
     world = {scene.graph.base_frame: np.eye(4)}
-    parts, found = [], []
+    parts = []
+    found = []
     for node in scene.graph.nodes_geometry:
         path = [node]
         while path[-1] not in world and path[-1] in forest.parents:
@@ -32,5 +35,8 @@ def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceC
     mesh = trimesh.util.concatenate(parts)
     if all(each is None for each in found):
         return mesh, None
-    known = [each or SurfaceColours.plain(len(part.faces)) for each, part in zip(found, parts, strict=True)]
+    known = [
+        each or SurfaceColours.plain(len(part.faces))
+        for each, part in zip(found, parts, strict=True)
+    ]
     return mesh, SurfaceColours.concatenate(known)

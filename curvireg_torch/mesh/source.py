@@ -1,4 +1,5 @@
-"""What readers of mesh files share: access to the files that a mesh names, its textures, and its warnings."""
+"""What readers of mesh files share: access to the files that a mesh names, its textures, and its
+warnings."""
 
 import warnings
 from collections.abc import Iterable, Sequence
@@ -18,7 +19,8 @@ MOST_WARNINGS = 5  # Of one kind
 
 @dataclass(frozen=True)
 class MeshWarning:
-    """What a mesh lacks, or what was changed in it; load_mesh keeps them in ``mesh.metadata["warnings"]``.
+    """What a mesh lacks, or what was changed in it; load_mesh keeps them in
+    ``mesh.metadata["warnings"]``.
 
     Attributes:
         kind: "texture", "material", "stray", "skin", "precision", "cut" or "link".
@@ -48,23 +50,31 @@ class ReadMesh:
     up: str | None = None
 
     def transformed(self, T: NDArray[np.float64]) -> "ReadMesh":
-        """The mesh at another place, by a (4, 4) affine transform; mirrored faces are turned over."""
+        """The mesh at another place, by a (4, 4) affine transform; mirrored faces are turned
+        over."""
         vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
         if np.linalg.det(T[:3, :3]) >= 0.0:
             return ReadMesh(vertices, self.faces, self.colours, self.unit, self.up)
         colours = self.colours
         if colours is not None:
-            colours = SurfaceColours(colours.corners[:, ::-1], colours.uv[:, ::-1], colours.texture, colours.textures)
+            colours = SurfaceColours(
+                colours.corners[:, ::-1], colours.uv[:, ::-1], colours.texture, colours.textures
+            )
         return ReadMesh(vertices, self.faces[:, ::-1], colours, self.unit, self.up)
 
     @classmethod
-    def joined(cls, parts: Sequence["ReadMesh"], unit: str | None = None, up: str | None = None) -> "ReadMesh":
-        """One mesh of several, in one unit; parts without colours are white where others have some."""
+    def joined(
+        cls, parts: Sequence["ReadMesh"], unit: str | None = None, up: str | None = None
+    ) -> "ReadMesh":
+        """One mesh of several, in one unit; parts without colours are white where others have
+        some."""
         if not parts:
             return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64), None, unit, up)
         starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         vertices = np.concatenate([part.vertices for part in parts])
-        faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
+        faces = np.concatenate(
+            [part.faces + start for part, start in zip(parts, starts, strict=True)]
+        )
         colours = None
         if any(part.colours is not None for part in parts):
             known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
@@ -73,7 +83,8 @@ class ReadMesh:
 
 
 class MeshSource:
-    """A mesh file and the files that it names: those in its folder and below, and in the folders ``extra``.
+    """A mesh file and the files that it names: those in its folder and below, and in the folders
+    ``extra``.
 
     Attributes:
         path: the mesh file.
@@ -99,7 +110,8 @@ class MeshSource:
         return self.path.read_bytes()
 
     def beside(self, path: Path) -> "MeshSource":
-        """The source of another mesh file that this one names; what it requests and reads counts for this one."""
+        """The source of another mesh file that this one names; what it requests and reads counts
+        for this one."""
         other = MeshSource(path, [self.folder, *self.extra])
         other.requested = self.requested
         other._bytes_left = self._bytes_left - path.stat().st_size
@@ -141,7 +153,9 @@ class MeshSource:
         inside = [beside] if beside.is_relative_to(self.folder) else []
         for folder in self.extra:
             places = [beside, (folder / relative).resolve(), (folder / relative.name).resolve()]
-            inside += [place for place in places if place.is_relative_to(folder) and place not in inside]
+            inside += [
+                place for place in places if place.is_relative_to(folder) and place not in inside
+            ]
         return inside
 
     def read(self, name: str) -> bytes:
@@ -152,21 +166,29 @@ class MeshSource:
         return content
 
     def read_optional(self, kind: str, *names: str) -> bytes | None:
-        """The content of the first of several spellings of a file's name that exists; None, with a warning."""
+        """The content of the first of several spellings of a file's name that exists; None, with a
+        warning."""
         for name in names:
             content = self._content(name)
             if content is not None:
                 return content
         first = names[0][:100]
         if any(self._places(name) for name in names):
-            self.warn(kind, f"{first} is missing beside it; the mesh is shown without these colours")
+            self.warn(
+                kind, f"{first} is missing beside it; the mesh is shown without these colours"
+            )
         else:
-            text = f"{first} lies outside of its folder and is left out; name its folder (--textures DIR)"
+            text = (
+                f"{first} lies outside of its folder and is left out; name its folder "
+                f"(--textures "
+                f"DIR)"
+            )
             self.warn(kind, text)
         return None
 
     def texture(self, key: object, content: bytes | None, name: str) -> Pixels | None:
-        """The pixels of a picture, decoded once for each ``key``; None, with a warning, if it cannot be used."""
+        """The pixels of a picture, decoded once for each ``key``; None, with a warning, if it
+        cannot be used."""
         if key not in self._textures:
             self._textures[key] = None if content is None else self._decoded(content, name)
         return self._textures[key]
@@ -182,7 +204,10 @@ class MeshSource:
             pixels, count = texture_pixels(content, self._pixels_left)
         except Exception as error:  # decoders raise anything
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            text = f"the texture {name[:100]} cannot be used ({reason}); its faces are shown in their plain colour"
+            text = (
+                f"the texture {name[:100]} cannot be used ({reason}); its faces are shown in "
+                f"their plain colour"
+            )
             self.warn("texture", text)
             return None
         self._pixels_left -= count
@@ -199,7 +224,8 @@ class MeshSource:
 
     @staticmethod
     def _relative_name(name: str) -> PurePosixPath | None:
-        """A name as a relative path: backslashes separate folders too, and of absolute names the last part counts."""
+        """A name as a relative path: backslashes separate folders too, and of absolute names the
+        last part counts."""
         if "://" in name or "\0" in name or not name.strip():
             return None
         path = PurePosixPath(name.replace("\\", "/"))
@@ -226,7 +252,11 @@ class MeshSource:
     def _names_in(self, folder: Path) -> dict[str, str]:
         """Names of a folder by their lower case; of several the first in order."""
         if folder not in self._listings:
-            names = sorted((entry.name for entry in folder.iterdir()), reverse=True) if folder.is_dir() else []
+            names = (
+                sorted((entry.name for entry in folder.iterdir()), reverse=True)
+                if folder.is_dir()
+                else []
+            )
             self._listings[folder] = {name.lower(): name for name in names}
         return self._listings[folder]
 
@@ -245,7 +275,8 @@ def spellings(name: bytes) -> tuple[str, ...]:
 
 
 def plain_text(data: bytes) -> bytes:
-    """A text file without byte-order mark, in an encoding that contains ASCII, with one kind of line end."""
+    """A text file without byte-order mark, in an encoding that contains ASCII, with one kind of
+    line end."""
     for mark, encoding in ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
         if data.startswith(mark):
             data = data.decode(encoding, errors="replace").encode()
@@ -259,7 +290,8 @@ def numbers(text: bytes) -> NDArray[np.float64]:
     if b"," in text:
         raise ValueError("decimal commas; export it with decimal points")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of what is no number, which is counted below
+        # of what is no number, which is counted below
+        warnings.simplefilter("ignore", DeprecationWarning)
         try:
             values = np.fromstring(text.decode("latin-1"), dtype=np.float64, sep=" ")
         except ValueError:  # how newer versions of numpy say it

@@ -6,7 +6,9 @@ import numpy as np
 
 from .source import MeshSource, ReadMesh, numbers, plain_text
 
-_HEADER, _FACE = 84, 50  # Bytes before the faces of a binary file, and of each face
+# Bytes before the faces of a binary file, and of each face
+_HEADER = 84
+_FACE = 50
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(rb"^[ \t]*+vertex[ \t]++([^\n]*+)", re.MULTILINE)
 _FACET = re.compile(rb"^[ \t]*+facet\b", re.MULTILINE)
@@ -36,7 +38,9 @@ def _binary(data: bytes) -> ReadMesh:
     claimed = int.from_bytes(data[80:84], "little")
     whole = (len(data) - _HEADER) // _FACE
     if claimed > whole or (claimed == 0 and whole):
-        raise ValueError(f"it says {claimed:,} faces and holds {whole:,}: it was cut while it was written")
+        raise ValueError(
+            f"it says {claimed:,} faces and holds {whole:,}: it was cut while it was written"
+        )
     records = np.frombuffer(data, _RECORD, claimed, _HEADER)
     vertices = records["corners"].reshape(-1, 3).astype(np.float64)
     return ReadMesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
@@ -48,9 +52,14 @@ def _ascii(source: MeshSource, text: bytes) -> ReadMesh:
         raise ValueError("decimal commas; export it with decimal points")
     facets = len(_FACET.findall(text))
     if len(lines) != 3 * facets or len(_END_OF_FACET.findall(text)) != facets:
-        raise ValueError("it ends within a face, or has faces that are no triangles: it was cut short, or is damaged")
+        raise ValueError(
+            "it ends within a face, or has faces that are no triangles: it was cut short, or is "
+            "damaged"
+        )
     if _END.search(text) is None:
-        source.warn("cut", "it does not end with endsolid: it may have been cut short, and lack faces")
+        source.warn(
+            "cut", "it does not end with endsolid: it may have been cut short, and lack faces"
+        )
     values = numbers(b"\n".join(lines))
     if len(values) != 9 * facets:
         raise ValueError("a vertex does not have three coordinates")

@@ -14,23 +14,36 @@ from torch import Tensor
 from ..geometry import rotation_from_axis_angle
 from .mesh import cached_in_mesh, mesh_radius
 
-POINTS, TESTED = 40_000, 2_000  # Random points of the surface, and how many of them are compared with all
-# A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the surface: about 2 px of a
-# crop of 128 px, which hardly changes its contours. The pull tab of a can is less than the rest, a handle more.
-TOLERANCE, FRACTION = 0.03, 0.975
-# Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned meshes are tilted by a
-# degree or two and do not pass through the centroid: 104 symmetries of 76 meshes begin below 0.014.
+# Random points of the surface, and how many of them are compared with all
+POINTS = 40_000
+TESTED = 2_000
+# A rotation is a symmetry if so large a fraction of the points lands within 0.03 radii of the
+# surface: about 2 px of a crop of 128 px, which hardly changes its contours. The pull tab of a can
+# is less than the rest, a handle more.
+TOLERANCE = 0.03
+FRACTION = 0.975
+# Mean distance in radii of the trusted points from which a rotation is given up. Axes of scanned
+# meshes are tilted by a degree or two and do not pass through the centroid: 104 symmetries of 76
+# meshes begin below 0.014.
 NEAR_SYMMETRY = 0.04
-# Iterations of ICP, the points that it moves, the fraction of them that it trusts in each iteration, and the degrees by
-# which it may change a rotation
-ALIGNMENT_STEPS, ALIGNED_POINTS, ALIGNED_FRACTION, MAX_TILT = 8, 500, 0.9, 5.0
-# Distance in radii, and fraction of the surface that a symmetry moves farther off it, from which a feature tells it
-# from the identity: a bump of about 0.1 radii. Scans of symmetric objects have hardly such a point.
-FEATURE_HEIGHT, FEATURE_FRACTION, FEATURE_POINTS = 0.06, 0.001, 10_000
+# Iterations of ICP, the points that it moves, the fraction of them that it trusts in each
+# iteration, and the degrees by which it may change a rotation
+ALIGNMENT_STEPS = 8
+ALIGNED_POINTS = 500
+ALIGNED_FRACTION = 0.9
+MAX_TILT = 5.0
+# Distance in radii, and fraction of the surface that a symmetry moves farther off it, from which a
+# feature tells it from the identity: a bump of about 0.1 radii. Scans of symmetric objects have
+# hardly such a point.
+FEATURE_HEIGHT = 0.06
+FEATURE_FRACTION = 0.001
+FEATURE_POINTS = 10_000
 ROUND = 36  # Rotations that stand for a body of revolution; steps of 10 degrees are those of a bank
 ORDERS = (2, 3, 4, 5, 6, 8)  # Orders of rotation that are looked for about each axis
-LARGEST_GROUP = 2 * ROUND  # Those of a cylinder. A cube has 24; a sphere has more, of which as many are found.
-# A principal axis is well defined if its moment differs from the others by so large a fraction of the largest
+# Those of a cylinder. A cube has 24; a sphere has more, of which as many are found.
+LARGEST_GROUP = 2 * ROUND
+# A principal axis is well defined if its moment differs from the others by so large a fraction of
+# the largest
 DEFINED = 0.05
 # Trace of A^T B from which two rotations count as one: 5 degrees apart
 NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
@@ -38,18 +51,23 @@ NEARLY_EQUAL = 1.0 + 2.0 * math.cos(math.radians(5.0))
 
 @cached_in_mesh
 def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
-    """Rotations of a mesh that leave its shape as it is, up to small details, without colours. (S, 4, 4) float64
-    transforms of the model frame, the identity first; S = 1 for a mesh without symmetries.
+    """Rotations of a mesh that leave its shape as it is, up to small details, without colours. (S,
+    4, 4) float64 transforms of the model frame, the identity first; S = 1 for a mesh without
+    symmetries.
 
-    The axes that are tried are those of the mesh file and the principal axes of its surface, each aligned by ICP. About
-    each, bodies of revolution and rotations of order 2 to 6 and 8 are found; products of symmetries are symmetries too.
+    The axes that are tried are those of the mesh file and the principal axes of its surface, each
+    aligned by ICP. About each, bodies of revolution and rotations of order 2 to 6 and 8 are found;
+    products of symmetries are symmetries too.
 
     Example:
         >>> mesh_symmetries(trimesh.creation.box((1, 2, 3))).shape  # half turns about three axes
         torch.Size([4, 4, 4])
     """
-    centre, radius = np.array(mesh.centroid, dtype=np.float64), mesh_radius(mesh)
-    surface = _Surface((np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0]) - centre) / radius)
+    centre = np.array(mesh.centroid, dtype=np.float64)
+    radius = mesh_radius(mesh)
+    surface = _Surface(
+        (np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0]) - centre) / radius
+    )
     revolutions: list[_Line] = []
     turns: list[tuple[_Line, float]] = []
     for axis in _axes(surface.cloud):
@@ -57,10 +75,15 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
             revolutions += [line for line in lines[1:] if line is not None]
             continue
         angles = [2.0 * math.pi / order for order in ORDERS]
-        turns += [(line, angle) for angle in angles if (line := surface.aligned(axis, angle)) is not None]
-    if revolutions:  # any half turn about another axis turns it upside down; more of them would add nothing
+        turns += [
+            (line, angle) for angle in angles if (line := surface.aligned(axis, angle)) is not None
+        ]
+    # any half turn about another axis turns it upside down; more of them would add nothing
+    if revolutions:
         round_axis = revolutions[0]
-        upside_down = [(line, math.pi) for line in revolutions[1:]] + [turn for turn in turns if turn[1] == math.pi]
+        upside_down = [(line, math.pi) for line in revolutions[1:]] + [
+            turn for turn in turns if turn[1] == math.pi
+        ]
         turns = [(round_axis, 2.0 * math.pi / ROUND)]
         for (axis, point), angle in upside_down[:1]:  # about the nearest axis that is perpendicular
             across = axis - (axis @ round_axis.axis) * round_axis.axis
@@ -74,8 +97,9 @@ def mesh_symmetries(mesh: trimesh.Trimesh) -> Tensor:
 
 
 def feature_fractions(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
-    """(S,) fraction of a mesh's surface that symmetries (S, 4, 4) of its shape move off the surface by more than the
-    tolerance of :func:`mesh_symmetries`: small features, which differ between the poses that count as one.
+    """(S,) fraction of a mesh's surface that symmetries (S, 4, 4) of its shape move off the surface
+    by more than the tolerance of :func:`mesh_symmetries`: small features, which differ between the
+    poses that count as one.
 
     Example:
         >>> box = trimesh.creation.box((1, 2, 3))
@@ -101,12 +125,18 @@ class _Line(NamedTuple):
 
 
 def _common_point(lines: Sequence[_Line]) -> Tensor:
-    """(3,) point nearest to all lines, and among such points to the origin; the origin without lines."""
+    """(3,) point nearest to all lines, and among such points to the origin; the origin without
+    lines."""
     if not lines:
         return torch.zeros(3, dtype=torch.float64)
-    across = torch.stack([torch.eye(3, dtype=torch.float64) - torch.outer(line.axis, line.axis) for line in lines])
+    across = torch.stack(
+        [torch.eye(3, dtype=torch.float64) - torch.outer(line.axis, line.axis) for line in lines]
+    )
     points = torch.stack([line.point for line in lines])
-    point: Tensor = torch.linalg.pinv(across.sum(dim=0), rtol=1e-3) @ (across @ points[..., None]).sum(dim=0)[:, 0]
+    point: Tensor = (
+        torch.linalg.pinv(across.sum(dim=0), rtol=1e-3)
+        @ (across @ points[..., None]).sum(dim=0)[:, 0]
+    )
     return point
 
 
@@ -114,19 +144,26 @@ class _Surface:
     """Points (N, 3) of a surface whose radius is 1, near the origin."""
 
     def __init__(self, cloud: NDArray[np.float64]) -> None:
-        self.cloud, self._tree, self._some = cloud, cKDTree(cloud), cloud[:: POINTS // TESTED]
+        self.cloud = cloud
+        self._tree = cKDTree(cloud)
+        self._some = cloud[:: POINTS // TESTED]
 
     def aligned(self, axis: Tensor, angle: float) -> _Line | None:
-        """The axis near a given one through the origin about which a rotation leaves the shape as it is, if any."""
+        """The axis near a given one through the origin about which a rotation leaves the shape as
+        it is, if any."""
         R = start = rotation_from_axis_angle(angle * axis).numpy()
-        t, points = np.zeros(3), self._some[:: TESTED // ALIGNED_POINTS]
+        t = np.zeros(3)
+        points = self._some[:: TESTED // ALIGNED_POINTS]
         for _ in range(ALIGNMENT_STEPS):
             distance, nearest = self._tree.query(points @ R.T + t)
             near = distance <= np.quantile(distance, ALIGNED_FRACTION)
             if distance[near].mean() > NEAR_SYMMETRY:
                 return None
-            source, target = points[near], self.cloud[nearest[near]]
-            U, _, V = np.linalg.svd((source - source.mean(axis=0)).T @ (target - target.mean(axis=0)))
+            source = points[near]
+            target = self.cloud[nearest[near]]
+            U, _, V = np.linalg.svd(
+                (source - source.mean(axis=0)).T @ (target - target.mean(axis=0))
+            )
             V[2] *= np.sign(np.linalg.det(U @ V))
             R = (U @ V).T
             t = target.mean(axis=0) - R @ source.mean(axis=0)
@@ -135,14 +172,16 @@ class _Surface:
         distance, _ = self._tree.query(self._some @ R.T + t, distance_upper_bound=TOLERANCE)
         if float(np.isfinite(distance).mean()) < FRACTION:
             return None
-        # The axis is what R leaves in place; the point on it nearest to the origin solves (1 - R) x = t across it.
+        # The axis is what R leaves in place; the point on it nearest to the origin solves (1 - R) x
+        # = t across it.
         vectors, _, _ = np.linalg.svd(np.eye(3) - R.T)
         found = torch.from_numpy(vectors[:, 2] * np.sign(vectors[:, 2] @ axis.numpy()))
         return _Line(found, torch.from_numpy(np.linalg.pinv(np.eye(3) - R, rcond=1e-3) @ t))
 
 
 def _axes(cloud: NDArray[np.float64]) -> list[Tensor]:
-    """Unit axes of the file, and the principal axes of the surface that are well defined and differ from them."""
+    """Unit axes of the file, and the principal axes of the surface that are well defined and differ
+    from them."""
     moments, vectors = np.linalg.eigh(cloud.T @ cloud)
     gaps = np.diff(moments, prepend=-np.inf, append=np.inf)
     principal = vectors.T[np.minimum(gaps[:-1], gaps[1:]) > DEFINED * moments[2]]

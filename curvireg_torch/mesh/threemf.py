@@ -1,5 +1,5 @@
-"""3MF files: the objects of the build at their places, with the colours and textures of the core and materials
-specifications."""
+"""3MF files: the objects of the build at their places, with the colours and textures of the core
+and materials specifications."""
 
 import xml.parsers.expat
 import zipfile
@@ -52,7 +52,9 @@ def read_threemf(source: MeshSource) -> ReadMesh:
     try:
         package = _Package(source)
     except zipfile.BadZipFile as error:
-        raise ValueError("no zip archive, as a 3MF file is; it ends too early, or is of another kind") from error
+        raise ValueError(
+            "no zip archive, as a 3MF file is; it ends too early, or is of another kind"
+        ) from error
     root = package.root()
     model = package.model(root)
     parts = []
@@ -65,7 +67,8 @@ def read_threemf(source: MeshSource) -> ReadMesh:
 
 
 class _Package:
-    """The zip archive: its files, of which a few bytes may not unpack to more than a mesh file may hold."""
+    """The zip archive: its files, of which a few bytes may not unpack to more than a mesh file may
+    hold."""
 
     def __init__(self, source: MeshSource) -> None:
         self._source = source
@@ -131,7 +134,9 @@ class _Package:
         if not any(rows):
             return None
         plain = SurfaceColours.plain(len(rows))
-        corners, uv, texture = plain.corners.copy(), plain.uv.copy(), plain.texture.copy()
+        corners = plain.corners.copy()
+        uv = plain.uv.copy()
+        texture = plain.texture.copy()
         pixels: list[Pixels] = []
         number: dict[str, int] = {}
         for row, found in enumerate(rows):
@@ -149,7 +154,10 @@ class _Package:
                 texture[row] = number[group]
             elif group not in model.lost:
                 model.lost.add(group)
-                self._source.warn("material", "it has materials of a kind that is not read; they are shown in white")
+                self._source.warn(
+                    "material",
+                    "it has materials of a kind that is not read; they are shown in white",
+                )
         return SurfaceColours(corners, np.nan_to_num(uv), texture, tuple(pixels))
 
     def _texture(self, model: _Model, group: str) -> Pixels | None:
@@ -157,7 +165,10 @@ class _Package:
         try:
             content = self._content(path)
         except KeyError:
-            self._source.warn("texture", f"the texture {path[:100]} is missing in it; its faces are shown in white")
+            self._source.warn(
+                "texture",
+                f"the texture {path[:100]} is missing in it; its faces are shown in white",
+            )
             return None
         return self._source.texture(path, content, path)
 
@@ -200,11 +211,17 @@ def _parsed(data: bytes) -> _Model:
             current.triangles.extend((int(plain["v1"]), int(plain["v2"]), int(plain["v3"])))
             current.properties.append(_property(plain, current))
         elif kind == "object":
-            current = model.objects[plain["id"]] = _Object(plain.get("pid", ""), int(plain.get("pindex", 0)))
+            current = model.objects[plain["id"]] = _Object(
+                plain.get("pid", ""), int(plain.get("pindex", 0))
+            )
         elif kind == "component":
-            current.components.append((plain.get("path", ""), plain["objectid"], plain.get("transform", "")))
+            current.components.append(
+                (plain.get("path", ""), plain["objectid"], plain.get("transform", ""))
+            )
         elif kind == "item":
-            model.items.append((plain.get("path", ""), plain["objectid"], plain.get("transform", "")))
+            model.items.append(
+                (plain.get("path", ""), plain["objectid"], plain.get("transform", ""))
+            )
         elif kind == "model":
             model.unit = plain.get("unit", "millimeter")
             if model.unit not in (*_UNITS, _MICRON):

@@ -1,4 +1,5 @@
-"""URDF: the visible meshes of a robot's links, all joints at zero, as one rigid mesh; or those of one link."""
+"""URDF: the visible meshes of a robot's links, all joints at zero, as one rigid mesh; or those of
+one link."""
 
 import math
 import xml.etree.ElementTree as ET
@@ -21,14 +22,17 @@ ReadPart = Callable[[MeshSource], ReadMesh]
 
 
 def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) -> ReadMesh:
-    """Read the meshes that a URDF names, in metres, in the frame of its root link or of ``link``; z is up."""
+    """Read the meshes that a URDF names, in metres, in the frame of its root link or of ``link``; z
+    is up."""
     if source.path.stat().st_size > MAX_TABLE_BYTES:
         raise ValueError(f"larger than {MAX_TABLE_BYTES:,} bytes")
     data = source.data()
     check_xml(data)
     robot = ET.fromstring(data)
     if robot.tag != "robot":
-        raise ValueError("no robot in it; of a xacro file, write the URDF first (xacro FILE > robot.urdf)")
+        raise ValueError(
+            "no robot in it; of a xacro file, write the URDF first (xacro FILE > robot.urdf)"
+        )
     links = {str(one.get("name")): one for one in robot.findall("link")}
     if link is not None and link not in links:
         raise ValueError(f"it has no link {link!r}; it has {', '.join(list(links)[:20])}"[:250])
@@ -43,7 +47,8 @@ def _places(robot: Any, links: dict[str, Any]) -> dict[str, NDArray[np.float64]]
     """The place of each link in the root's frame, all joints at zero."""
     above: dict[str, tuple[str, NDArray[np.float64]]] = {}
     for joint in robot.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
+        parent = joint.find("parent")
+        child = joint.find("child")
         if parent is None or child is None:
             raise ValueError("a joint without parent or child")
         above[str(child.get("link"))] = (str(parent.get("link")), _origin(joint))
@@ -74,7 +79,8 @@ def _origin(element: Any) -> NDArray[np.float64]:
 
 
 def _turn(angle: float, axis: int) -> NDArray[np.float64]:
-    first, second = (axis + 1) % 3, (axis + 2) % 3
+    first = (axis + 1) % 3
+    second = (axis + 2) % 3
     R = np.eye(3)
     R[first, first] = R[second, second] = math.cos(angle)
     R[first, second] = -math.sin(angle)
@@ -101,7 +107,9 @@ def _colour(material: Any) -> NDArray[np.uint8] | None:
 class _Parts:
     """The visible parts of links; each mesh file is read once."""
 
-    def __init__(self, source: MeshSource, read_part: ReadPart, colours: dict[str, NDArray[np.uint8] | None]) -> None:
+    def __init__(
+        self, source: MeshSource, read_part: ReadPart, colours: dict[str, NDArray[np.uint8] | None]
+    ) -> None:
         self._source = source
         self._read_part = read_part
         self._colours = colours
@@ -120,7 +128,10 @@ class _Parts:
             self._parts_left -= 1
             self._faces_left -= len(mesh.faces)
             if min(self._parts_left, self._faces_left) < 0:
-                raise ValueError(f"more than {MAX_MESH_PARTS:,} parts or {MAX_MESH_FACES:,} faces; leave some out")
+                raise ValueError(
+                    f"more than {MAX_MESH_PARTS:,} parts or {MAX_MESH_FACES:,} faces; leave some "
+                    f"out"
+                )
             colour = self._colour_of(visual)
             if mesh.colours is None and colour is not None:
                 mesh = replace(mesh, colours=SurfaceColours.plain(len(mesh.faces), colour))
@@ -154,7 +165,8 @@ class _Parts:
         path = self._find(name)
         if path is None:
             self._source.warn(
-                "link", f"the mesh {name[:100]} is missing in its folder; name its folder (--textures DIR)"
+                "link",
+                f"the mesh {name[:100]} is missing in its folder; name its folder (--textures DIR)",
             )
             return None
         if path not in self._meshes:
@@ -171,7 +183,8 @@ class _Parts:
         return mesh.transformed(T)
 
     def _find(self, name: str) -> Path | None:
-        """``package://robot/meshes/a.stl`` and ``file://`` names: their ends are looked for in the folders."""
+        """``package://robot/meshes/a.stl`` and ``file://`` names: their ends are looked for in the
+        folders."""
         scheme, _, rest = name.rpartition("://")
         parts = Path(rest).parts
         ends = [rest] if not scheme else ["/".join(parts[k:]) for k in range(len(parts))]

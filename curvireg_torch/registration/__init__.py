@@ -1,4 +1,5 @@
-"""From a ranking of views to poses: registration, refinement, following, and detection without a box."""
+"""From a ranking of views to poses: registration, refinement, following, and detection without a
+box."""
 
 from .confidence import RELIABLE as RELIABLE
 from .contour_fit import ContourFit as ContourFit

@@ -1,8 +1,9 @@
 """Probabilities that a pose or a detection is right: logistic models of measured features.
 
-Two models serve registrations: "instance", for the mesh of this very object, and "category", for the mesh of another
-object of its kind. Their constants, and those of refinement, tracking and
-detection, were fitted by scripts/calibration on generated photographs; docs/accuracy.md has their accuracy on others.
+Two models serve registrations: "instance", for the mesh of this very object, and "category", for
+the mesh of another object of its kind. Their constants, and those of refinement, tracking and
+detection, were fitted by scripts/calibration on generated photographs; docs/accuracy.md has their
+accuracy on others.
 """
 
 import json
@@ -18,17 +19,23 @@ from torch import Tensor
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
-# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and ``resolution``, see
-# :func:`shares`
-CALIBRATION: dict[str, Any] = json.loads(Path(__file__).with_name("calibration.json").read_text(encoding="utf-8"))
-# Factor of the least-squares covariance, which ignores edges that do not belong to the object: with it, nine in ten
-# true poses lie in the 90 % ellipsoid of a reliable result, on generated photographs
+# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and
+# ``resolution``, see :func:`shares`
+CALIBRATION: dict[str, Any] = json.loads(
+    Path(__file__).with_name("calibration.json").read_text(encoding="utf-8")
+)
+# Factor of the least-squares covariance, which ignores edges that do not belong to the object: with
+# it, nine in ten true poses lie in the 90 % ellipsoid of a reliable result, on generated
+# photographs
 COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
-# Landmarks that must agree on a pose, and the probability that the object is where they do, in a whole photograph: on
-# generated shelves 84 of 88. It is less where other objects have a similar print
-MIN_LANDMARKS, LANDMARK_PROBABILITY = 8, 0.95
+# Landmarks that must agree on a pose, and the probability that the object is where they do, in a
+# whole photograph: on generated shelves 84 of 88. It is less where other objects have a similar
+# print
+MIN_LANDMARKS = 8
+LANDMARK_PROBABILITY = 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
-EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")  # the more, the better
+# the more, the better
+EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
 DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
@@ -40,7 +47,8 @@ Features = Mapping[str, float | None]  # by name; None where there is no rival v
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """P = 1 / (1 + exp(-(bias + sum of weight x feature))), with weights by the names of features."""
+    """P = 1 / (1 + exp(-(bias + sum of weight x feature))), with weights by the names of
+    features."""
 
     weights: Mapping[str, float]
     bias: float
@@ -51,27 +59,40 @@ class LogisticModel:
         return cls(CALIBRATION[name]["weights"], CALIBRATION[name]["bias"])
 
     def __call__(self, features: Features) -> float:
-        """Probability in (0, 1); at most ``UNCOMPARED_CONFIDENCE`` if a feature is None, which counts as 0, a tie."""
-        logit = self.bias + sum(weight * (features[name] or 0.0) for name, weight in self.weights.items())
-        probability = 0.5 * (1.0 + math.tanh(0.5 * logit))  # the logistic function, which overflows nowhere
-        return probability if None not in features.values() else min(probability, UNCOMPARED_CONFIDENCE)
+        """Probability in (0, 1); at most ``UNCOMPARED_CONFIDENCE`` if a feature is None, which
+        counts as 0, a tie."""
+        logit = self.bias + sum(
+            weight * (features[name] or 0.0) for name, weight in self.weights.items()
+        )
+        # the logistic function, which overflows nowhere
+        probability = 0.5 * (1.0 + math.tanh(0.5 * logit))
+        return (
+            probability
+            if None not in features.values()
+            else min(probability, UNCOMPARED_CONFIDENCE)
+        )
 
 
 def model_name(*, exact: bool) -> str:
-    """Which model serves: "instance" for the mesh of this very object and a known camera, else "category"."""
+    """Which model serves: "instance" for the mesh of this very object and a known camera, else
+    "category"."""
     return "instance" if exact else "category"
 
 
 def is_calibrated(pipeline: Pipeline) -> bool:
-    """Whether the models were fitted for such a pipeline: learned field, default terms, contour fit, default views.
+    """Whether the models were fitted for such a pipeline: learned field, default terms, contour
+    fit, default views.
 
-    The number of hypotheses, the box jitter, the size of the views, their spacing, and how many of them the appearance
-    term compares may differ.
+    The number of hypotheses, the box jitter, the size of the views, their spacing, and how many of
+    them the appearance term compares may differ.
     """
-    default, bank = Pipeline(), pipeline.bank
+    default = Pipeline()
+    bank = pipeline.bank
 
     def compared(pipeline: Pipeline) -> Any:
-        terms = [(term.name, term.weight, getattr(term, "whitening", None)) for term in pipeline.terms]
+        terms = [
+            (term.name, term.weight, getattr(term, "whitening", None)) for term in pipeline.terms
+        ]
         return pipeline.field, pipeline.weights, terms
 
     usual = bank == BankSettings(image_size=bank.image_size) and pipeline.contours
@@ -79,30 +100,34 @@ def is_calibrated(pipeline: Pipeline) -> bool:
 
 
 def probability_of_any(features: Features, *, exact: bool) -> float:
-    """Probability that one of the hypotheses is within 30 degrees of the truth, from :func:`confidence_features`."""
+    """Probability that one of the hypotheses is within 30 degrees of the truth, from
+    :func:`confidence_features`."""
     return LogisticModel.named(model_name(exact=exact))(features)
 
 
 def refinement_confidence(features: Features) -> float:
-    """Probability that a pose refined from a good start is within 10 degrees and 10 % of the distance of the truth,
-    from its ``similarity`` and ``edge_support``."""
+    """Probability that a pose refined from a good start is within 10 degrees and 10 % of the
+    distance of the truth, from its ``similarity`` and ``edge_support``."""
     return LogisticModel.named("refinement")(features)
 
 
 def tracking_confidence(features: Features) -> float:
-    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth, if it was before,
-    from the features of :class:`.tracker.TrackedPose`."""
+    """Probability that a tracked pose is within 10 degrees and 10 % of the distance of the truth,
+    if it was before, from the features of :class:`.tracker.TrackedPose`."""
     model = LogisticModel.named("tracking")
     return model({name: features[name] for name in model.weights})
 
 
-def detection_probability(response: float, similarity: float, *, rival: float | None = None) -> float:
+def detection_probability(
+    response: float, similarity: float, *, rival: float | None = None
+) -> float:
     """Probability that a photograph shows the object in a box.
 
     Args:
         response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        rival: where landmarks led to the box, whose number is the response, the largest number at another place.
+        rival: where landmarks led to the box, whose number is the response, the largest number at
+            another place.
 
     Example:
         >>> detection_probability(8.0, 0.9) > detection_probability(4.0, 0.6)
@@ -114,7 +139,8 @@ def detection_probability(response: float, similarity: float, *, rival: float | 
 
 
 def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(N,) bool: rotations (N, 3, 3) within ``RIVAL_ANGLE`` of one (3, 3), or of what a symmetry makes of it.
+    """(N,) bool: rotations (N, 3, 3) within ``RIVAL_ANGLE`` of one (3, 3), or of what a symmetry
+    makes of it.
 
     ``symmetries`` are (K, 4, 4) or (K, 3, 3).
     """
@@ -125,7 +151,8 @@ def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = No
 
 
 def concentration(scores: Tensor, near: Tensor) -> float | None:
-    """Fraction of the sum of S^4 over all views (N,) that the views ``near`` (N,) a pose have; None if all are near.
+    """Fraction of the sum of S^4 over all views (N,) that the views ``near`` (N,) a pose have; None
+    if all are near.
 
     Example:
         >>> round(concentration(torch.tensor([1.0, 0.5]), torch.tensor([True, False])), 4)
@@ -133,13 +160,18 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
     """
     scores = scores.double()
     weights = (scores / scores.max().clamp(min=1e-300)) ** 4  # all scores may be 0
-    return None if bool(near.all()) else float((weights * near).sum() / weights.sum().clamp(min=1e-300))
+    return (
+        None
+        if bool(near.all())
+        else float((weights * near).sum() / weights.sum().clamp(min=1e-300))
+    )
 
 
 def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> float:
-    """How many axes of rotation a fit leaves undetermined, in [0, 3]: the sum of the standard deviations in radians
-    about the three axes, each at most 1. 3 without a covariance (6, 6): one that is NaN. The axis of a body of
-    revolution, whose ``symmetries`` (S, 4, 4) are many, need not be determined.
+    """How many axes of rotation a fit leaves undetermined, in [0, 3]: the sum of the standard
+    deviations in radians about the three axes, each at most 1. 3 without a covariance (6, 6): one
+    that is NaN. The axis of a body of revolution, whose ``symmetries`` (S, 4, 4) are many, need not
+    be determined.
 
     Example:
         >>> round(undetermined_axes(torch.diag(torch.tensor([0.01, 0.04, 9.0, 1.0, 1.0, 1.0]))), 3)
@@ -163,8 +195,8 @@ def confidence_features(
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest of its rivals,
-    clamped to +-5; None without rivals.
+    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest
+    of its rivals, clamped to +-5; None without rivals.
 
     Args:
         evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
@@ -173,25 +205,41 @@ def confidence_features(
         undetermined: :func:`undetermined_axes` of the best hypothesis.
         outside: fraction of the object that lies outside the photograph.
         border: number of the box's sides that lie on the border of the photograph.
-        focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count as 1.
+        focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count
+            as 1.
     """
     _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
     rivals = scores[1:]
-    margin = min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
-    values = similarity, margin, edge_support, share, landmarks, undetermined, outside, border, min(focal, 1.0)
+    margin = (
+        min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
+    )
+    values = (
+        similarity,
+        margin,
+        edge_support,
+        share,
+        landmarks,
+        undetermined,
+        outside,
+        border,
+        min(focal, 1.0),
+    )
     return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
 
 
 def resolution(*, exact: bool) -> float:
-    """Difference of two scores up to which a photograph does not tell which of two poses is right."""
+    """Difference of two scores up to which a photograph does not tell which of two poses is
+    right."""
     return float(CALIBRATION[model_name(exact=exact)]["resolution"])
 
 
 def shares(scores: Tensor, *, exact: bool) -> Tensor:
-    r"""(H,) probability of each hypothesis to be the right one, if one of them is, from their scores (H,).
+    r"""(H,) probability of each hypothesis to be the right one, if one of them is, from their
+    scores (H,).
 
-    In proportion to :math:`e^{-a \max(0, s - s_k - r)}` with the best score s and the slope a: scores that differ by
-    less than the resolution r, as the fits of two equally good poses do, are a tie, whose members have equal shares.
+    In proportion to :math:`e^{-a \max(0, s - s_k - r)}` with the best score s and the slope a:
+    scores that differ by less than the resolution r, as the fits of two equally good poses do, are
+    a tie, whose members have equal shares.
 
     Args:
         scores: by which hypotheses are ordered.
@@ -208,8 +256,9 @@ def shares(scores: Tensor, *, exact: bool) -> Tensor:
 
 
 def hypothesis_probabilities(any_right: float, scores: Tensor, *, exact: bool) -> tuple[float, ...]:
-    """Probability of each hypothesis of one photograph to be within 30 degrees of the truth: the probability that any
-    of them is, times their :func:`shares`. Of two poses that fit equally well, neither has more than one half.
+    """Probability of each hypothesis of one photograph to be within 30 degrees of the truth: the
+    probability that any of them is, times their :func:`shares`. Of two poses that fit equally well,
+    neither has more than one half.
 
     Example:
         >>> hypothesis_probabilities(0.9, torch.tensor([3.0, 3.0]), exact=True)

@@ -1,4 +1,5 @@
-"""Contour fit: projected contours of the mesh are pulled onto image edges, by least squares over SE(3)."""
+"""Contour fit: projected contours of the mesh are pulled onto image edges, by least squares over
+SE(3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -29,13 +30,16 @@ from .least_squares import (
 )
 
 QUARTER_SIZE_RADII = (6.0, 4.0)
-FIRST_RADII, SECOND_RADII, FULL_SIZE_RADII = (6.0, 4.0), (3.0, 2.0), (4.0, 2.0, 2.0)
-"""Search radius for edges in px, one a round: from all starts and then from the best at half size, and at full size."""
+FIRST_RADII = (6.0, 4.0)
+SECOND_RADII = (3.0, 2.0)
+FULL_SIZE_RADII = (4.0, 2.0, 2.0)
+"""Search radius for edges in px, one a round: from all starts and then from the best at half size,
+and at full size."""
 
 COARSE_DENSITY = 0.25
 DENSITY = {1: 1.0, 2: 0.5, 4: COARSE_DENSITY}
-"""Contour points in crops whose sides are smaller by a factor, as a fraction of those at full size. ``COARSE_DENSITY``
-also holds at half size where starts are compared."""
+"""Contour points in crops whose sides are smaller by a factor, as a fraction of those at full size.
+``COARSE_DENSITY`` also holds at half size where starts are compared."""
 
 KEPT_STARTS = 3
 """Starts of a pose that continue after the first round, those with the most support."""
@@ -43,14 +47,20 @@ KEPT_STARTS = 3
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
 
-START_ANGLE, START_ROLL, FAR_ANGLE = 8.0, 6.0, 16.0
-"""Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for further starts: about
-half the spacing of a bank's views. ``FAR_ANGLE``: more starts of a pose that is fitted again."""
+START_ANGLE = 8.0
+START_ROLL = 6.0
+FAR_ANGLE = 16.0
+"""Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for
+further starts: about half the spacing of a bank's views. ``FAR_ANGLE``: more starts of a pose that
+is fitted again."""
 
-SUPPORTED, GAINED = 0.5, 0.2
-"""Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated scenes."""
+SUPPORTED = 0.5
+GAINED = 0.2
+"""Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated
+scenes."""
 
-STEPS_PER_ROUND, SELECTIONS_PER_STEP = 2, 3
+STEPS_PER_ROUND = 2
+SELECTIONS_PER_STEP = 3
 """Least-squares steps per round, and selections of edges per step."""
 
 STALE_SHIFT = 0.6
@@ -62,7 +72,8 @@ EDGE_DAMPING = 1e-2
 
 @dataclass(frozen=True)
 class ContourState:
-    """Poses ``T`` (N, 4, 4), nearby ones ``seen`` at which contours were last found, and the contour points there."""
+    """Poses ``T`` (N, 4, 4), nearby ones ``seen`` at which contours were last found, and the
+    contour points there."""
 
     T: Tensor
     seen: Tensor
@@ -79,8 +90,8 @@ class ContourState:
 
 @dataclass(frozen=True)
 class ContourProblem:
-    """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras ``K`` (N, 3, 3); a
-    ``mask`` weights the edges."""
+    """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras
+    ``K`` (N, 3, 3); a ``mask`` weights the edges."""
 
     contours: MeshContours
     edges: EdgeField
@@ -92,15 +103,29 @@ class ContourProblem:
 
     @classmethod
     def of(
-        cls, contours: MeshContours, crops: EdgeCrops, K: Tensor, image_index: Tensor | None = None, *, factor: int = 1
+        cls,
+        contours: MeshContours,
+        crops: EdgeCrops,
+        K: Tensor,
+        image_index: Tensor | None = None,
+        *,
+        factor: int = 1,
     ) -> "ContourProblem":
-        """The problem in ``crops`` whose sides are smaller by a ``factor``, with cameras ``K`` (N, 3, 3) of the whole
-        photographs ``image_index`` (N,), by default the first."""
+        """The problem in ``crops`` whose sides are smaller by a ``factor``, with cameras ``K`` (N,
+        3, 3) of the whole photographs ``image_index`` (N,), by default the first."""
         index = torch.zeros(len(K), dtype=torch.long) if image_index is None else image_index
         shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
         shrink[:2, 2] = 0.5 / factor - 0.5
         K = shrink @ crops.transforms[index] @ K
-        return cls(contours, crops.edges(factor), index, K, CROP_SIZE // factor, crops.mask, DENSITY[factor])
+        return cls(
+            contours,
+            crops.edges(factor),
+            index,
+            K,
+            CROP_SIZE // factor,
+            crops.mask,
+            DENSITY[factor],
+        )
 
     @property
     def centre(self) -> Tensor:
@@ -115,7 +140,8 @@ class ContourProblem:
         return ContourState(T, T, self.contours.points(T, self.K, self.size, density=self.density))
 
     def descend(self, state: ContourState, radii: Sequence[float]) -> ContourState:
-        """Poses after one round for each search radius in px; contours are found again where they moved."""
+        """Poses after one round for each search radius in px; contours are found again where they
+        moved."""
         for radius in radii:
             state = self.with_current_contours(self.moved(state, radius))
         return state
@@ -128,7 +154,8 @@ class ContourProblem:
         return replace(state, T=T)
 
     def with_current_contours(self, state: ContourState) -> ContourState:
-        # Decided for each pose separately: up to rounding, a result must not depend on the rest of the batch.
+        # Decided for each pose separately: up to rounding, a result must not depend on the rest of
+        # the batch.
         stale = self.mean_shift(state.points, state.seen, state.T) > STALE_SHIFT
         if not bool(stale.any()):
             return state
@@ -138,35 +165,52 @@ class ContourProblem:
 
     def mean_shift(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
         """(N,) mean shift of the points in px between two poses."""
-        shift = pixels(points.model, after, self.K, self.centre) - pixels(points.model, before, self.K, self.centre)
+        shift = pixels(points.model, after, self.K, self.centre) - pixels(
+            points.model, before, self.K, self.centre
+        )
         length = torch.linalg.vector_norm(shift, dim=-1) * points.valid
         mean: Tensor = length.sum(dim=1) / points.valid.sum(dim=1).clamp(min=1)
         return mean
 
-    def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
-        """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and ``others`` measurements."""
+    def step(
+        self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()
+    ) -> Tensor:
+        """(N, 4, 4) poses after a least-squares step towards edges within ``radius`` px and
+        ``others`` measurements."""
         uv, J = project(points.model, points.normals, T, self.K, self.centre)
         step = self.selected_step(points, uv, J, radius, [other.equations() for other in others])
         return apply_twist(T, step * self.step_fraction(step, T)[:, None], self.centre)
 
     def selected_step(
-        self, points: ContourPoints, uv: Tensor, J: Tensor, radius: float, equations: Sequence[tuple[Tensor, Tensor]]
+        self,
+        points: ContourPoints,
+        uv: Tensor,
+        J: Tensor,
+        radius: float,
+        equations: Sequence[tuple[Tensor, Tensor]],
     ) -> Tensor:
-        """(N, D) solutions for edges within ``radius`` px of points at ``uv`` (N, P, 2) px, which shift along their
-        normals by ``J`` (N, P, D), and of other normal ``equations``; edges are selected again near the solution."""
+        """(N, D) solutions for edges within ``radius`` px of points at ``uv`` (N, P, 2) px, which
+        shift along their normals by ``J`` (N, P, D), and of other normal ``equations``; edges are
+        selected again near the solution."""
         distance, strength = self._candidates(uv, points, radius)
         J = J.to(distance.dtype)
         if self.mask is not None:
-            strength = strength * self.mask.weights(uv, points, _offsets(radius)[1:-1], self.image_index, self.size)
-        log, residual = strength.log(), distance
+            strength = strength * self.mask.weights(
+                uv, points, _offsets(radius)[1:-1], self.image_index, self.size
+            )
+        log = strength.log()
+        residual = distance
         for _ in range(SELECTIONS_PER_STEP):
             # The largest strength times exp(-2 (residual / radius)^2)
-            index = torch.addcmul(log, residual, residual, value=-2.0 / radius**2).argmax(dim=-1, keepdim=True)
+            index = torch.addcmul(log, residual, residual, value=-2.0 / radius**2).argmax(
+                dim=-1, keepdim=True
+            )
             tukey = (1.0 - (residual.gather(-1, index) / radius).square()).clamp(min=0.0).square()
             edges = Measurements(J, distance.gather(-1, index), strength.gather(-1, index) * tukey)
             A, b = (each.double() for each in edges.equations())
             for more_A, more_b in equations:
-                A, b = A + more_A, b + more_b
+                A = A + more_A
+                b = b + more_b
             step = self.solution(A, b)
             residual = distance - J @ step[..., None].to(J.dtype)
         return step
@@ -179,15 +223,20 @@ class ContourProblem:
         """(N,) see :func:`step_fraction`."""
         return step_fraction(step, T, self.centre)
 
-    def _candidates(self, uv: Tensor, points: ContourPoints, radius: float) -> tuple[Tensor, Tensor]:
-        """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a step; the strength is 0
-        where there is no edge."""
+    def _candidates(
+        self, uv: Tensor, points: ContourPoints, radius: float
+    ) -> tuple[Tensor, Tensor]:
+        """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a
+        step; the strength is 0 where there is no edge."""
         offsets = _offsets(radius)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
-        before, here, behind = profile[..., :-2], profile[..., 1:-1], profile[..., 2:]
+        before = profile[..., :-2]
+        here = profile[..., 1:-1]
+        behind = profile[..., 2:]
         is_peak = (here > before) & (here >= behind) & points.valid[..., None]
         curvature = (before - 2.0 * here + behind).clamp(max=-1e-9)
-        vertex = (0.5 * (before - behind) / curvature).clamp(-0.5, 0.5)  # of the parabola through the three values
+        # of the parabola through the three values
+        vertex = (0.5 * (before - behind) / curvature).clamp(-0.5, 0.5)
         return offsets[1:-1] + vertex, torch.where(is_peak, here, 0.0)
 
     def edge_support(self, state: ContourState) -> Tensor:
@@ -195,19 +244,23 @@ class ContourProblem:
         return self.supports(state)[0]
 
     def supports(self, state: ContourState) -> tuple[Tensor, Tensor]:
-        """(N,) :meth:`edge_support`, and the same with the weights of the mask, if there is one: what fits are compared
-        by."""
+        """(N,) :meth:`edge_support`, and the same with the weights of the mask, if there is one:
+        what fits are compared by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
         offsets = torch.arange(-3, 4, dtype=torch.float32)
         counts = self.edges.counts(uv, points.valid, self.image_index)
-        near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(-0.5 * offsets**2)
+        near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(
+            -0.5 * offsets**2
+        )
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
         near = near * self.mask.weights(uv, points, offsets, self.image_index, self.size)
         most = self.mask.largest_weights(points) * counts  # a long outline alone is no support
-        return plain, (near.amax(dim=-1).double() * counts).sum(dim=1) / most.sum(dim=1).clamp(min=1)
+        return plain, (near.amax(dim=-1).double() * counts).sum(dim=1) / most.sum(dim=1).clamp(
+            min=1
+        )
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
@@ -233,8 +286,10 @@ class ContourFit:
     Attributes:
         transform: (N, 4, 4) float64 ``T_cam_from_model``.
         covariance: (N, 6, 6) float64, see :func:`fit_contours`; NaN where too few edges were found.
-        edge_support: (N,) float64 in [0, 1), mean strength of the edges within about 1 px of the contour points.
-        start_support: (N,) edge support of the starts (at half size for starts that are not finished).
+        edge_support: (N,) float64 in [0, 1), mean strength of the edges within about 1 px of the
+            contour points.
+        start_support: (N,) edge support of the starts (at half size for starts that are not
+            finished).
         observable: (N,) int64, number of the six directions that the contours determine.
     """
 
@@ -249,7 +304,8 @@ class ContourFit:
 
     @property
     def trustworthy(self) -> Tensor:
-        """(N,) bool: edge support of at least 0.5, or 0.2 more than the start's; less where the mesh is another."""
+        """(N,) bool: edge support of at least 0.5, or 0.2 more than the start's; less where the
+        mesh is another."""
         return (self.edge_support >= SUPPORTED) | (self.edge_support - self.start_support >= GAINED)
 
 
@@ -269,46 +325,49 @@ def fit_contours(
 ) -> ContourFit:
     """Poses whose contours lie on a photograph's edges, by robust least squares over SE(3).
 
-    At each start, occluding contours and creases of the mesh become 3D points X_i with image normals n_i
-    (:class:`.MeshContours`), and edges of similar direction are searched along n_i. With d_i the distance to the
-    selected edge and J_i = n_i^T du_i/dxi, every step solves
+    At each start, occluding contours and creases of the mesh become 3D points X_i with image
+    normals n_i (:class:`.MeshContours`), and edges of similar direction are searched along n_i.
+    With d_i the distance to the selected edge and J_i = n_i^T du_i/dxi, every step solves
 
         (J^T W J + lambda diag(J^T W J)) xi = J^T W d,
 
-    where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges are selected again
-    near the predicted position; the search radius shrinks from round to round, and the contours are found again where
-    they have moved. The fit begins at half size from each start and from six poses rotated away from it, with few
-    points; the three with the most edge support after the first round go on. The best of them and the next best that
-    differs from it end at full size. If no fit improves the edge support, the start is kept.
+    where W is the strength of the edge times Tukey's weight of the residual. Within a step, edges
+    are selected again near the predicted position; the search radius shrinks from round to round,
+    and the contours are found again where they have moved. The fit begins at half size from each
+    start and from six poses rotated away from it, with few points; the three with the most edge
+    support after the first round go on. The best of them and the next best that differs from it end
+    at full size. If no fit improves the edge support, the start is kept.
 
-    Prints and clutter have edges too. With an ``object_mask`` they are weighted (``ObjectMask``) in the least squares
-    and in the choice among the fits, not in the reported support.
+    Prints and clutter have edges too. With an ``object_mask`` they are weighted (``ObjectMask``) in
+    the least squares and in the choice among the fits, not in the reported support.
 
-    The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units) along them: with the
-    true pose R, t,
+    The covariance is of rotation (rad) about the camera's x, y, z, then translation (model units)
+    along them: with the true pose R, t,
 
         R = exp([w]x) R_fit,   t = t_fit + e,   (w, e) of mean 0 and that covariance,
 
-    see ``pose_covariance``; it is scaled by the errors of reliable results on photographs. Computed on the CPU.
+    see ``pose_covariance``; it is scaled by the errors of reliable results on photographs. Computed
+    on the CPU.
 
     Args:
         contours: of the mesh.
-        images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one photograph (C, H, W).
-            Missing pixels (NaN or infinite) are filled from their neighbours.
+        images: (B, C, H, W) or a list of (C, H, W), C = 1 or 3, in [0, 1] or uint8; or one
+            photograph (C, H, W). Missing pixels (NaN or infinite) are filled from their neighbours.
         boxes: (B, 4) x0, y0, x1, y1 in px, which need not be exact; (4,) for one photograph.
         camera_matrices: (B, 3, 3) or (3, 3) in px; or (N, 3, 3), one for each start.
         starts: (N, 4, 4) rigid poses, within about 15 degrees.
         image_index: (N,) the photograph of each start; optional for one photograph.
         margin: added around the box, as a fraction of its longer side.
-        finish: number of starts of each photograph that are fitted to the end, those with the most support after the
-            first rounds; None: all, each as if alone, up to rounding.
-        wide_angles: degrees by which starts are rotated up, down, left and right, to begin there too at a quarter
-            of the size: for starts that may be worse than views of a bank.
-        object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their margin, belong to
-            the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
+        finish: number of starts of each photograph that are fitted to the end, those with the most
+            support after the first rounds; None: all, each as if alone, up to rounding.
+        wide_angles: degrees by which starts are rotated up, down, left and right, to begin there
+            too at a quarter of the size: for starts that may be worse than views of a bank.
+        object_mask: (B, 1, s, s) probability that pixels of the square crops, the boxes with their
+            margin, belong to the object, for instance of :meth:`LearnedCurvilinearSaliency.mask`.
 
     Raises:
-        InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or camera matrix.
+        InvalidInputError: wrong shapes, a pose that is not rigid and finite, an unusable box or
+            camera matrix.
 
     Example:
         >>> import curvireg_torch as cr, trimesh
@@ -318,7 +377,7 @@ def fit_contours(
         >>> T[:3, :3] = cr.rotation_from_viewpoint(30.0, 20.0, 5.0)
         >>> mesh = trimesh.creation.box((1, 1.5, 2))
         >>> image = (cr.render_depth(mesh, T[None], K, (128, 128))[0] > 0).float()
-        >>> start = T.clone(); start[0, 3] = 0.1                                              # 2 % to the right
+        >>> start = T.clone(); start[0, 3] = 0.1  # 2 % to the right
         >>> box = torch.tensor([24.0, 18, 102, 110])
         >>> fit = fit_contours(MeshContours(mesh), image, box, K, start[None])
         >>> abs(float(fit.transform[0, 0, 3])) < 0.01
@@ -349,23 +408,32 @@ def fit_to_edges(
     quick: Tensor | None = None,
     again: bool = False,
 ) -> ContourFit:
-    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras ``K`` (N, 3, 3).
-    ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there was one. A pose that is fitted
-    ``again`` is kept if the best fit at half size returns to it."""
+    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras
+    ``K`` (N, 3, 3). ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there
+    was one. A pose that is fitted ``again`` is kept if the best fit at half size returns to it."""
     N = len(T0)
-    full, half = (ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2))
+    full, half = (
+        ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2)
+    )
     if quick is None:
         wide = _turned(T0, half.centre, wide_angles)
         every = torch.arange(N).repeat_interleave(wide.shape[1])
         quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
     angles = (START_ANGLE, FAR_ANGLE) if again else (START_ANGLE,)
-    around = torch.cat([_turned(T0, half.centre, angles, roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1)
+    around = torch.cat(
+        [_turned(T0, half.centre, angles, roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1
+    )
     M = around.shape[1]
     every = torch.arange(N).repeat_interleave(M)
-    begun, coarse = half.state(T0), replace(half[every], density=COARSE_DENSITY)
+    begun = half.state(T0)
+    coarse = replace(half[every], density=COARSE_DENSITY)
     before, weighted_before = half.supports(begun)
     fits = coarse.moved(coarse.state(around.flatten(0, 1)), FIRST_RADII[0])
-    kept = coarse.supports(fits)[1].view(N, M).argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+    kept = (
+        coarse.supports(fits)[1]
+        .view(N, M)
+        .argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+    )
     T = fits.T[(kept + M * torch.arange(N)[:, None]).flatten()]
     M = kept.shape[1]
     every = torch.arange(N).repeat_interleave(M)
@@ -373,15 +441,26 @@ def fit_to_edges(
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
     first = fits[torch.arange(N) * M + best]
-    chosen = torch.ones(N, dtype=torch.bool) if finish is None else _among_best(support, image_index, finish)
-    index, others = chosen.nonzero()[:, 0], (~chosen).nonzero()[:, 0]
+    chosen = (
+        torch.ones(N, dtype=torch.bool)
+        if finish is None
+        else _among_best(support, image_index, finish)
+    )
+    index = chosen.nonzero()[:, 0]
+    others = (~chosen).nonzero()[:, 0]
     source, T = _two_best(half, fits, supports, index)
     if again:
-        leaves = half[index].mean_shift(begun.points[index], T0[index], T[: len(index)]) > SAME_POSE_SHIFT
+        leaves = (
+            half[index].mean_shift(begun.points[index], T0[index], T[: len(index)])
+            > SAME_POSE_SHIFT
+        )
         source, T = source[leaves[source]], T[leaves[source]]
-    # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties go to the first.
+    # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties
+    # go to the first.
     owner = torch.cat([index, others, index[source]])
-    unfinished = torch.where((support > weighted_before)[others, None, None], first.T[others], T0[others])
+    unfinished = torch.where(
+        (support > weighted_before)[others, None, None], first.T[others], T0[others]
+    )
     fixed = torch.cat([T0[index], unfinished])
     state = full[owner[: len(fixed)]].state(fixed)
     if len(T):
@@ -390,22 +469,32 @@ def fit_to_edges(
     support, weighted = full[owner].supports(state)
     before[index] = support[: len(index)]
     best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
-    state, support = state[best], support[best]
+    state = state[best]
+    support = support[best]
     return measured_fit(full, state, support, before)
 
 
-def measured_fit(full: ContourProblem, state: ContourState, support: Tensor, before: Tensor) -> ContourFit:
-    """A fit that ended in a ``state`` with its edge ``support`` (N,), that of its start being ``before`` (N,)."""
-    edges, contours = full.measured_edges(state, FULL_SIZE_RADII[-1]), full.contours
+def measured_fit(
+    full: ContourProblem, state: ContourState, support: Tensor, before: Tensor
+) -> ContourFit:
+    """A fit that ended in a ``state`` with its edge ``support`` (N,), that of its start being
+    ``before`` (N,)."""
+    edges = full.measured_edges(state, FULL_SIZE_RADII[-1])
+    contours = full.contours
     covariance, observable = pose_covariance(
         edges, state.points, state.T, full.K, contours.centre, radius=contours.radius
     )
-    return ContourFit(state.T, covariance, edge_support=support, start_support=before, observable=observable)
+    return ContourFit(
+        state.T, covariance, edge_support=support, start_support=before, observable=observable
+    )
 
 
 @torch.no_grad()
-def measure_contours(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor) -> ContourFit:
-    """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay as they are."""
+def measure_contours(
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+) -> ContourFit:
+    """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay
+    as they are."""
     full = ContourProblem.of(contours, crops, K, image_index)
     state = full.state(T)
     support = full.edge_support(state)
@@ -414,43 +503,68 @@ def measure_contours(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Ten
 
 @torch.no_grad()
 def quick_fit(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor | None = None
+    contours: MeshContours,
+    crops: EdgeCrops,
+    K: Tensor,
+    T: Tensor,
+    image_index: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Poses (N, 4, 4) that a short fit at a quarter of the size reaches from ``T`` (N, 4, 4), in a tenth of the time of
-    a fit, and their edge support (N,) with the weights of the mask, which tells where a fit is worth it."""
+    """Poses (N, 4, 4) that a short fit at a quarter of the size reaches from ``T`` (N, 4, 4), in a
+    tenth of the time of a fit, and their edge support (N,) with the weights of the mask, which
+    tells where a fit is worth it."""
     quarter = ContourProblem.of(contours, crops, K, image_index, factor=4)
     state = quarter.descend(quarter.state(T), QUARTER_SIZE_RADII)
     return state.T, quarter.supports(state)[1]
 
 
 @torch.no_grad()
-def contour_support(contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor) -> Tensor:
-    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of fitted ones."""
+def contour_support(
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+) -> Tensor:
+    """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
+    fitted ones."""
     problem = ContourProblem.of(contours, crops, K, image_index)
     return problem.edge_support(problem.state(T))
 
 
-def _turned(T: Tensor, centre: Tensor, angles: Sequence[float], *, roll: float | None = None) -> Tensor:
-    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes by +-``angles`` degrees, and
-    about its z axis by +-``roll``."""
-    both = torch.cat([torch.eye(6, dtype=torch.float64)[:3], -torch.eye(6, dtype=torch.float64)[:3]])
-    aside = [angle * both[[0, 3, 1, 4]] for angle in angles] + ([] if roll is None else [roll * both[[2, 5]]])
+def _turned(
+    T: Tensor, centre: Tensor, angles: Sequence[float], *, roll: float | None = None
+) -> Tensor:
+    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes by
+    +-``angles`` degrees, and about its z axis by +-``roll``."""
+    both = torch.cat(
+        [torch.eye(6, dtype=torch.float64)[:3], -torch.eye(6, dtype=torch.float64)[:3]]
+    )
+    aside = [angle * both[[0, 3, 1, 4]] for angle in angles] + (
+        [] if roll is None else [roll * both[[2, 5]]]
+    )
     twists = torch.deg2rad(torch.cat([0.0 * both[:1], *aside]))
-    N, M = len(T), len(twists)
+    N = len(T)
+    M = len(twists)
     return apply_twist(T.repeat_interleave(M, 0), twists.repeat(N, 1), centre).view(N, M, 4, 4)
 
 
-def _two_best(half: ContourProblem, fits: ContourState, supports: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
+def _two_best(
+    half: ContourProblem, fits: ContourState, supports: Tensor, index: Tensor
+) -> tuple[Tensor, Tensor]:
     """Refine the best fit of each start ``index`` and the next best that is another pose.
 
     Returns the number within ``index`` of the start that each pose belongs to, and the poses.
     """
-    n, M = len(index), supports.shape[1]
-    each, supports = half[index], supports[index]
+    n = len(index)
+    M = supports.shape[1]
+    each = half[index]
+    supports = supports[index]
     of_start = index[:, None] * M + torch.arange(M)
-    best, rows = supports.argmax(dim=1), torch.arange(n)
-    other, reference = fits[of_start.flatten()], fits[of_start[rows, best].repeat_interleave(M)]
-    gap = each[rows.repeat_interleave(M)].mean_shift(reference.points, reference.T, other.T).view(n, M)
+    best = supports.argmax(dim=1)
+    rows = torch.arange(n)
+    other = fits[of_start.flatten()]
+    reference = fits[of_start[rows, best].repeat_interleave(M)]
+    gap = (
+        each[rows.repeat_interleave(M)]
+        .mean_shift(reference.points, reference.T, other.T)
+        .view(n, M)
+    )
     rival, second = torch.where(gap > SAME_POSE_SHIFT, supports, -1.0).max(dim=1)
     source = torch.cat([rows, rows[rival >= 0]])
     chosen = of_start[source, torch.cat([best, second[rival >= 0]])]
@@ -458,41 +572,58 @@ def _two_best(half: ContourProblem, fits: ContourState, supports: Tensor, index:
 
 
 def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
-    """(N,) bool: whether fewer than ``count`` other starts of the same photograph have more support."""
+    """(N,) bool: whether fewer than ``count`` other starts of the same photograph have more
+    support."""
     order = torch.arange(len(support))
-    ahead = (support > support[:, None]) | ((support == support[:, None]) & (order < order[:, None]))
+    ahead = (support > support[:, None]) | (
+        (support == support[:, None]) & (order < order[:, None])
+    )
     return (ahead & (image_index == image_index[:, None])).sum(dim=1) < count
 
 
 def _checked(
-    images: Tensor | Sequence[Tensor], boxes: Any, camera_matrices: Any, poses: Tensor, image_index: Tensor | None
+    images: Tensor | Sequence[Tensor],
+    boxes: Any,
+    camera_matrices: Any,
+    poses: Tensor,
+    image_index: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
-    """Images, and on the CPU boxes (B, 4), camera matrices (N, 3, 3) of the poses and (N,) image indices."""
+    """Images, and on the CPU boxes (B, 4), camera matrices (N, 3, 3) of the poses and (N,) image
+    indices."""
     check_tensor(poses, "starts", (None, 4, 4))
     check_pose(poses, "starts")
     if isinstance(images, Tensor) and images.ndim == 3:  # one photograph
         box = as_numbers(boxes, "box")
         check_tensor(box, "box", (4,))
-        images, boxes = images[None], box[None]
+        images = images[None]
+        boxes = box[None]
     for image in images:
         check_photograph(image)
-    B, N = len(images), len(poses)
+    B = len(images)
+    N = len(poses)
     boxes = as_boxes(boxes, B)
     K = as_numbers(camera_matrices, "camera_matrices", dtype=torch.float64)
     check_camera_matrix(K)
     given = len(K) if K.ndim == 3 else 1
     if given not in (1, B, N) or K.ndim not in (2, 3):
-        raise InvalidInputError(f"camera_matrices: expected one or {B} matrices (or {N}), got {given}")
+        raise InvalidInputError(
+            f"camera_matrices: expected one or {B} matrices (or {N}), got {given}"
+        )
     if image_index is None:
         if B != 1:
-            raise InvalidInputError(f"image_index: got {B} images; give the index of the image of each start")
+            raise InvalidInputError(
+                f"image_index: got {B} images; give the index of the image of each start"
+            )
         image_index = torch.zeros(N, dtype=torch.long)
     image_index = image_index.detach().cpu()
     if image_index.shape != (N,) or image_index.is_floating_point():
         got = f"{image_index.dtype} of shape {tuple(image_index.shape)}"
         raise InvalidInputError(f"image_index: expected {N} integers, got {got}")
     if N and not 0 <= int(image_index.min()) <= int(image_index.max()) < B:
-        raise InvalidInputError(f"image_index: expected indices of {B} images, got {image_index.tolist()}")
-    image_index, K = image_index.long(), K.detach().cpu()
+        raise InvalidInputError(
+            f"image_index: expected indices of {B} images, got {image_index.tolist()}"
+        )
+    image_index = image_index.long()
+    K = K.detach().cpu()
     K = K.expand(B, 3, 3)[image_index] if given in (1, B) else K
     return [image.detach() for image in images], boxes.detach().cpu().float(), K, image_index

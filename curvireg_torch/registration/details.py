@@ -8,7 +8,9 @@ from .contour_fit import ContourProblem
 from .edges import EdgeCrops
 from .least_squares import pixels
 
-APART = 4.0  # Pixels of a crop from all contours of the other pose beyond which a contour point is one pose's alone
+# Pixels of a crop from all contours of the other pose beyond which a contour point is one pose's
+# alone
+APART = 4.0
 MIN_POINTS = 6  # Contour points of one pose alone from which two poses look different
 ENOUGH_POINTS = 16  # Points from which details have their full weight
 DETAILS_WEIGHT = 10.0  # Score of a contour that is there, in the units of edge support
@@ -17,8 +19,8 @@ DETAILS_WEIGHT = 10.0  # Score of a contour that is there, in the units of edge 
 def compare_details(
     contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """How far the contours that only one of two poses predicts speak for it: those that are in the photograph count for
-    the pose, those that are not count against it.
+    """How far the contours that only one of two poses predicts speak for it: those that are in the
+    photograph count for the pose, those that are not count against it.
 
     Args:
         contours: of the mesh.
@@ -28,14 +30,16 @@ def compare_details(
         image_index: (N,) the crop of each pose.
 
     Returns:
-        (N, N) scores, positive where the pose of the row is better than that of the column, 0 where they look alike;
-        and (N, N) bool, whether they look different.
+        (N, N) scores, positive where the pose of the row is better than that of the column, 0 where
+        they look alike; and (N, N) bool, whether they look different.
     """
     problem = ContourProblem.of(contours, crops, K, image_index)
     points = problem.state(T).points
     uv = pixels(points.model, T, problem.K, problem.centre)
     offsets = torch.arange(-3, 4, dtype=torch.float32)
-    near = problem.edges.strength(uv, points.normals, offsets, image_index) * torch.exp(-0.5 * offsets**2)
+    near = problem.edges.strength(uv, points.normals, offsets, image_index) * torch.exp(
+        -0.5 * offsets**2
+    )
     strength = near.amax(dim=-1).double()
     counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
     N = len(T)
@@ -45,7 +49,8 @@ def compare_details(
         for b in range(N):
             alone = counted[a] & _is_apart(uv[a], uv[b][points.valid[b]])
             shared = counted[a] & ~alone
-            # Half of what contours have that both poses predict: the middle between a contour and none.
+            # Half of what contours have that both poses predict: the middle between a contour and
+            # none.
             middle = 0.5 * strength[a][shared].sum() / shared.sum().clamp(min=1)
             total[a, b] = ((strength[a] - middle) * alone).sum()
             count[a, b] = alone.sum()

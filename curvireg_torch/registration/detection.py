@@ -1,7 +1,8 @@
 """Detection: objects are found and registered in photographs that come without a box.
 
-A few representative views are compared with every position of the photograph, and landmarks with its features. The
-boxes that they propose are compared with all views, and the most probable ones are registered.
+A few representative views are compared with every position of the photograph, and landmarks with
+its features. The boxes that they propose are compared with all views, and the most probable ones
+are registered.
 """
 
 from collections.abc import Sequence
@@ -38,7 +39,8 @@ MIN_OBJECT_SIDE = 32.0  # Longer side in px of the smallest object that can be r
 MIN_REGISTERED = 2  # Places that are registered at least, as a fitted pose tells more than its box
 FOUND_CONFIDENCE = 0.1  # Confidence below which the object counts as not found
 MAX_PEAKS = 500  # Best peaks of a photograph that boxes are selected from
-MAX_COMPARED_VIEWS = 1500  # Largest number of views, evenly spread over the bank, whose pairwise distances are computed
+# Largest number of views, evenly spread over the bank, whose pairwise distances are computed
+MAX_COMPARED_VIEWS = 1500
 MEDOID_ROUNDS = 10  # Largest number of rounds of k-medoids
 Results = list[Registration | FailedRegistration]
 
@@ -54,8 +56,9 @@ def detect(
 ) -> list[Results]:
     """Find and register objects in whole photographs, the most probable pose first.
 
-    All proposals are compared with the views of the bank, which yields the probability that each shows the object. The
-    most probable ones are registered, two at least, and the box around each pose too where it is more probable.
+    All proposals are compared with the views of the bank, which yields the probability that each
+    shows the object. The most probable ones are registered, two at least, and the box around each
+    pose too where it is more probable.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
@@ -63,8 +66,8 @@ def detect(
         instances: largest number of objects in each photograph.
 
     Returns:
-        For each photograph one to ``instances`` registrations with their ``detection``; or one that failed, with
-        :class:`LostObjectError` where no place is convincing.
+        For each photograph one to ``instances`` registrations with their ``detection``; or one that
+        failed, with :class:`LostObjectError` where no place is convincing.
 
     Raises:
         InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
@@ -76,8 +79,14 @@ def detect(
     def detect_in(item: ImageItem, index: int) -> Results:
         registrar.report_progress("detection")
         proposals = propose(registrar, item)
-        found = _with_proposals(_register_candidates(registrar, item, proposals, instances), proposals)
-        convincing = [one for one in found if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE]
+        found = _with_proposals(
+            _register_candidates(registrar, item, proposals, instances), proposals
+        )
+        convincing = [
+            one
+            for one in found
+            if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
+        ]
         return [*convincing] or [_lost(found, f"image {index}")]
 
     found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
@@ -85,17 +94,22 @@ def detect(
 
 
 def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
-    """Boxes in which a photograph may show the object: those around poses on which landmarks of its print agree, their
-    number being the response, and those of the detector."""
-    extremes = torch.stack([item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1)
+    """Boxes in which a photograph may show the object: those around poses on which landmarks of its
+    print agree, their number being the response, and those of the detector."""
+    extremes = torch.stack(
+        [item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1
+    )
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
     distance = allowed = None
     poses, count = registrar.landmark_poses(registrar.landmark_matches(item))
     if item.prior is not None:
-        distance, allowed = item.prior.distance, _allowed_views(registrar, item)
-        distance = None if item.camera_matrix is None else distance  # sizes do not limit an unknown camera
+        distance = item.prior.distance
+        allowed = _allowed_views(registrar, item)
+        # sizes do not limit an unknown camera
+        distance = None if item.camera_matrix is None else distance
         kept = limits_of(registrar, item).keeps(poses)
-        poses, count = poses[kept], count[kept]
+        poses = poses[kept]
+        count = count[kept]
     focal = None if item.camera_matrix is None else float(item.camera_matrix[0, 0])
     others = registrar.detector(item.image, focal=focal, distance=distance, allowed=allowed)
     boxes, visible = boxes_at(registrar.describer.hull, poses.T, poses.cameras, item.size)
@@ -104,7 +118,9 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     boxes, responses, views = (torch.cat(pair) for pair in pairs)
     proposals = Proposals(boxes, responses, views, by_landmarks=int(visible.sum()))
     if not len(proposals.boxes):
-        raise InvalidInputError("nothing of such a size fits into the photograph; give other distances, or the box")
+        raise InvalidInputError(
+            "nothing of such a size fits into the photograph; give other distances, or the box"
+        )
     return proposals
 
 
@@ -120,15 +136,22 @@ def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
 
 
 def _allowed_views(registrar: "Registrar", item: ImageItem) -> Tensor:
-    """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph, which is the box."""
+    """(N,) bool: views of the bank that the prior does not exclude everywhere in the photograph,
+    which is the box."""
     off_centre = 0.0
     if item.camera_matrix is None and registrar.is_exact:
         item = replace(item, camera_matrix=usual_camera(item.size))
     if item.camera_matrix is not None:
         x0, y0, x1, y1 = item.box.double().tolist()
-        points = torch.tensor([((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)])
-        rays = F.normalize(torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0)
-        off_centre = float(torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min())))
+        points = torch.tensor(
+            [((x0 + x1) / 2, (y0 + y1) / 2, 1), (x0, y0, 1), (x1, y0, 1), (x0, y1, 1), (x1, y1, 1)]
+        )
+        rays = F.normalize(
+            torch.linalg.solve(item.camera_matrix.double(), points.double().T), dim=0
+        )
+        off_centre = float(
+            torch.rad2deg(torch.acos((rays[:, :1] * rays[:, 1:]).sum(dim=0).clamp(-1, 1).min()))
+        )
     return limits_of(registrar, item).allowed(off_centre=off_centre)
 
 
@@ -138,8 +161,8 @@ class Proposals:
 
     Attributes:
         boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
-        responses: (P,) similarity, in standard deviations above the view's mean over the photograph; of boxes that
-            landmarks led to, the number of these.
+        responses: (P,) similarity, in standard deviations above the view's mean over the
+            photograph; of boxes that landmarks led to, the number of these.
         views: (P,) int64 view of the bank.
         by_landmarks: how many of the boxes landmarks led to, the first ones.
     """
@@ -152,8 +175,8 @@ class Proposals:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A described box (4,) of a photograph, with its ``response`` and ``rival`` (:func:`detection_probability`), and as
-    ``score`` the probability that it shows the object."""
+    """A described box (4,) of a photograph, with its ``response`` and ``rival``
+    (:func:`detection_probability`), and as ``score`` the probability that it shows the object."""
 
     box: Tensor
     response: float
@@ -163,7 +186,12 @@ class Candidate:
 
     @classmethod
     def compared(
-        cls, registrar: "Registrar", item: ImageItem, box: Tensor, response: float, rival: float | None
+        cls,
+        registrar: "Registrar",
+        item: ImageItem,
+        box: Tensor,
+        response: float,
+        rival: float | None,
     ) -> "Candidate":
         """Compare a box (4,) with all views."""
         query = registrar.matcher.query([item.image], box[None].float())
@@ -182,7 +210,8 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Found:
-    """A registration, the ``box`` (4,) around its pose, and what is known of the box that led to it."""
+    """A registration, the ``box`` (4,) around its pose, and what is known of the box that led to
+    it."""
 
     registration: Registration
     box: Tensor
@@ -193,15 +222,22 @@ class Found:
     @property
     def probability(self) -> float:
         """That the object is there, and its pose right."""
-        return self.score * (1.0 if self.registration.confidence is None else self.registration.confidence)
+        return self.score * (
+            1.0 if self.registration.confidence is None else self.registration.confidence
+        )
 
 
-def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int) -> list[Found]:
-    """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of the best if there is
-    none."""
-    candidates, failed = [], None
+def _register_candidates(
+    registrar: "Registrar", item: ImageItem, proposals: Proposals, instances: int
+) -> list[Found]:
+    """The most probable objects, at most ``instances``, whose boxes do not overlap; the error of
+    the best if there is none."""
+    candidates = []
+    failed = None
     counts = proposals.responses[: proposals.by_landmarks].tolist()
-    for k, (box, response) in enumerate(zip(proposals.boxes, proposals.responses.tolist(), strict=True)):
+    for k, (box, response) in enumerate(
+        zip(proposals.boxes, proposals.responses.tolist(), strict=True)
+    ):
         rival = max([0.0, *counts[:k], *counts[k + 1 :]]) if k < len(counts) else None
         try:
             candidates.append(Candidate.compared(registrar, item, box, response, rival))
@@ -209,7 +245,8 @@ def _register_candidates(registrar: "Registrar", item: ImageItem, proposals: Pro
             failed = failed or error
     if not candidates and failed is not None:
         raise failed
-    boxes, scores = torch.stack([c.box for c in candidates]), torch.tensor([c.score for c in candidates])
+    boxes = torch.stack([c.box for c in candidates])
+    scores = torch.tensor([c.score for c in candidates])
     found: list[Found] = []
     for k in non_maximum_suppression(boxes, scores, SAME_OBJECT_OVERLAP).tolist():
         if len(found) < max(instances, MIN_REGISTERED):
@@ -221,14 +258,18 @@ def _refined(registrar: "Registrar", item: ImageItem, found: Found) -> Found:
     """The more certain one of a registration and of that of the box around its pose."""
     try:
         candidate = Candidate.compared(registrar, item, found.box, found.response, found.rival)
-    except InvalidInputError:  # the projected mesh lies outside the photograph: nothing there supports the pose
+    # the projected mesh lies outside the photograph: nothing there supports the pose
+    except InvalidInputError:
         return replace(found, score=0.0)
     return found if candidate.score <= found.score else candidate.register(registrar, item)
 
 
 def _add(found: list[Found], new: Found) -> None:
-    """Add ``new``. Of those whose boxes overlap the most certain is kept: proposals may lead to the same object."""
-    overlap = box_iou(new.box[None], torch.stack([new.box, *(one.box for one in found)]))[0, 1:].tolist()
+    """Add ``new``. Of those whose boxes overlap the most certain is kept: proposals may lead to the
+    same object."""
+    overlap = box_iou(new.box[None], torch.stack([new.box, *(one.box for one in found)]))[
+        0, 1:
+    ].tolist()
     same = [one for one, iou in zip(found, overlap, strict=True) if iou > SAME_OBJECT_OVERLAP]
     if all(new.score > one.score for one in same):
         found[:] = [one for one in found if not any(one is other for other in same)]
@@ -236,10 +277,12 @@ def _add(found: list[Found], new: Found) -> None:
 
 
 def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registration]:
-    """Registrations with all proposals, their own boxes first, and the score as a factor of their probabilities."""
+    """Registrations with all proposals, their own boxes first, and the score as a factor of their
+    probabilities."""
     boxes = torch.cat([torch.stack([one.box for one in found]), proposals.boxes.double()])
     responses = torch.cat([torch.tensor([one.response for one in found]), proposals.responses])
-    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)  # in their present order
+    # in their present order
+    kept = non_maximum_suppression(boxes, -torch.arange(len(boxes)), SAME_OBJECT_OVERLAP)
     results = []
     for one in found:
         probabilities = tuple(p * one.score for p in one.registration.probabilities)
@@ -251,10 +294,11 @@ def _with_proposals(found: list[Found], proposals: Proposals) -> list[Registrati
 class Detector(nn.Module):
     r"""Proposes boxes in which a photograph may show a bank's object.
 
-    A few representative views are compared with every position of the photograph, at sizes in steps of :math:`\sqrt 2`.
-    A view's similarity is the mean cosine of the backbone's features of view and photograph, in grey or in colour, over
-    the cells that the view covers; its response is the similarity in standard deviations above its mean over the
-    photograph. Peaks over position, size and view are boxes.
+    A few representative views are compared with every position of the photograph, at sizes in steps
+    of :math:`\sqrt 2`. A view's similarity is the mean cosine of the backbone's features of view
+    and photograph, in grey or in colour, over the cells that the view covers; its response is the
+    similarity in standard deviations above its mean over the photograph. Peaks over position, size
+    and view are boxes.
 
     Args:
         matcher: of the bank; ``detection`` of its pipeline holds the settings.
@@ -262,7 +306,8 @@ class Detector(nn.Module):
     Example:
         >>> import trimesh
         >>> from curvireg_torch.geometry import sample_views
-        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45, elevations=[20]),
+        >>> bank = ViewBank.build(trimesh.creation.box((1, 2, 3)), sample_views(azimuth_step=45,
+        ...     elevations=[20]),
         ...                       image_size=64, progress=False)
         >>> proposals = Detector(ViewMatcher(bank))(torch.rand(3, 96, 128))
         >>> proposals.boxes.shape[0] == len(proposals.responses)
@@ -271,15 +316,19 @@ class Detector(nn.Module):
 
     def __init__(self, matcher: ViewMatcher) -> None:
         super().__init__()
-        self.matcher, self.settings = matcher, matcher.pipeline.detection
+        self.matcher = matcher
+        self.settings = matcher.pipeline.detection
         networks = (module for module in matcher.modules() if isinstance(module, Backbone))
         self.backbone = (next(networks, None) or Backbone()).to(matcher.bank.device)
         bank = matcher.bank
         self._views = representative_views(bank, self.settings.views)
-        boxes, away = bank.boxes[self._views].double(), bank.distances[self._views]
+        boxes = bank.boxes[self._views].double()
+        away = bank.distances[self._views]
         A = crop_transforms(square_boxes(boxes, bank.settings.margin), TEMPLATE_SIDE)
-        scale, shift = A[:, 0, 0, None], A[:, :2, 2]
-        # In px of the templates, from the outer border; and distances at which a focal length of 1 px shows this size.
+        scale = A[:, 0, 0, None]
+        shift = A[:, :2, 2]
+        # In px of the templates, from the outer border; and distances at which a focal length of 1
+        # px shows this size.
         self._boxes = (boxes * scale + shift.repeat(1, 2) + 0.5).float()
         away = torch.ones_like(away) if bank.settings.camera == "orthographic" else away
         self._unit = (away.to(scale) / scale[:, 0]).float()
@@ -288,13 +337,19 @@ class Detector(nn.Module):
     def _template_weights(self) -> list[list[Tensor]]:
         """(K, C, h, w) for each stride and each shading."""
         bank = self.matcher.bank
-        pictures = self.matcher.describer.shaded(bank.rotations[self._views], bank.distances[self._views])
+        pictures = self.matcher.describer.shaded(
+            bank.rotations[self._views], bank.distances[self._views]
+        )
         masks = bank.silhouettes_at(self._views)[:, None].float()
-        small = F.interpolate(pictures, (TEMPLATE_SIDE,) * 2, mode="bilinear", antialias=True, align_corners=False)
+        small = F.interpolate(
+            pictures, (TEMPLATE_SIDE,) * 2, mode="bilinear", antialias=True, align_corners=False
+        )
         weights: list[list[Tensor]] = [[] for _ in STRIDES]
         # Grey, and in colour where the mesh has colours.
         for shaded in (small[:, :1], small[:, 1:])[: 2 if small.shape[1] > 1 else 1]:
-            for stride, cells, templates in zip(STRIDES, self._features(shaded), weights, strict=True):
+            for stride, cells, templates in zip(
+                STRIDES, self._features(shaded), weights, strict=True
+            ):
                 mask = F.interpolate(masks, size=(TEMPLATE_SIDE // stride,) * 2, mode="area")
                 common = (cells * mask).sum(dim=(0, 2, 3)) / mask.sum()
                 unit = F.normalize(cells - common[:, None, None], dim=1) * mask
@@ -302,14 +357,20 @@ class Detector(nn.Module):
         return weights
 
     def _features(self, image: Tensor) -> list[Tensor]:
-        """(B, C, H / stride, W / stride) for each of ``STRIDES``, of (B, 1 or 3, H, W) images in [0, 1]."""
-        return [f / s[:, None, None] for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)]
+        """(B, C, H / stride, W / stride) for each of ``STRIDES``, of (B, 1 or 3, H, W) images in
+        [0, 1]."""
+        return [
+            f / s[:, None, None]
+            for f, s in zip(self.backbone(image), self.backbone.spreads, strict=True)
+        ]
 
     @cached_property
     def _template_of_view(self) -> Tensor:
         """(N,) template that is most similar to each view of the bank; on the CPU."""
         bank = self.matcher.bank
-        views, chosen = (_view_features(bank, index) for index in (torch.arange(len(bank)), self._views))
+        views, chosen = (
+            _view_features(bank, index) for index in (torch.arange(len(bank)), self._views)
+        )
         return torch.cdist(views, chosen).argmin(dim=1).cpu()
 
     @torch.no_grad()
@@ -326,10 +387,12 @@ class Detector(nn.Module):
         Args:
             focal: focal length in px, for ``distance``.
             distance: range of the distance of the object's centre, in the mesh's unit.
-            allowed: (N,) bool; views that stand for none of these views of the bank are not compared.
+            allowed: (N,) bool; views that stand for none of these views of the bank are not
+                compared.
 
         Raises:
-            InvalidInputError: wrong shape or dtype, or a ``distance`` without ``focal`` or not 0 < NEAR <= FAR.
+            InvalidInputError: wrong shape or dtype, or a ``distance`` without ``focal`` or not 0 <
+                NEAR <= FAR.
             ImageError: missing pixels (NaN or infinite), or pixels outside [0, 1].
         """
         check_photograph(image)
@@ -338,21 +401,29 @@ class Detector(nn.Module):
             raise InvalidInputError("distance: needs the camera matrix of every photograph")
         usable = torch.ones(len(self._views), dtype=torch.bool)
         if allowed is not None:
-            usable = torch.zeros_like(usable).index_fill(0, self._template_of_view[allowed.cpu()], True)
+            usable = torch.zeros_like(usable).index_fill(
+                0, self._template_of_view[allowed.cpu()], True
+            )
         side = (self._boxes[:, 2:] - self._boxes[:, :2]).amax(dim=1)
         maps: list[Tensor] = []
-        fitting, ratios = [], []
+        fitting = []
+        ratios = []
         for scale in self._scales(image, focal, distance, float(side.quantile(0.5))):
             h, w = (max(1, round(s * scale / 16)) * 16 for s in image.shape[-2:])
             if not maps:  # the largest copy comes first; the smaller ones are resized from it
                 largest = resized(image, (h, w)).to(self.matcher.bank.device)
-                check_pixels(largest, "of the photograph")  # on the resized copy, which missing pixels spread to
+                # on the resized copy, which missing pixels spread to
+                check_pixels(largest, "of the photograph")
             maps.append(self._similarity(resized(largest, (h, w))[None]))
             ratios.append((w / image.shape[-1], h / image.shape[-2]))
             fits = usable.to(side.device)
             if distance is not None and focal is not None:
                 away = self._unit * focal * scale
-                fits = fits & (away >= distance[0] / SIZE_STEP**0.5) & (away <= distance[1] * SIZE_STEP**0.5)
+                fits = (
+                    fits
+                    & (away >= distance[0] / SIZE_STEP**0.5)
+                    & (away <= distance[1] * SIZE_STEP**0.5)
+                )
             fitting.append(fits)
         if not maps:
             return Proposals(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0, dtype=torch.long))
@@ -361,54 +432,74 @@ class Detector(nn.Module):
     def _scales(
         self, image: Tensor, focal: float | None, distance: tuple[float, float] | None, side: float
     ) -> list[float]:
-        """Factors by which the photograph is resized, so that objects of all sizes match templates of ``side`` px."""
+        """Factors by which the photograph is resized, so that objects of all sizes match templates
+        of ``side`` px."""
         longer = float(max(image.shape[-2:]))
-        small, large = min(max(self.settings.min_size * longer, MIN_OBJECT_SIDE), longer), longer
+        small = min(max(self.settings.min_size * longer, MIN_OBJECT_SIDE), longer)
+        large = longer
         if focal is not None and distance is not None:
             extent = side * focal * self._unit  # px at distance 1
             small = max(small, float(extent.min()) / distance[1])
             large = min(large, float(extent.max()) / distance[0])
-        scales, size = [], small
+        scales = []
+        size = small
         while size <= large * SIZE_STEP**0.5:
             scales.append(side / size)
             size *= SIZE_STEP
         return scales
 
     def _similarity(self, image: Tensor) -> Tensor:
-        """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8 j."""
+        """(K, h, w) mean cosines; position (i, j) is that of a view whose centre is at px 8 i, 8
+        j."""
         cosines: list[Tensor] = []
         for cells, weights in zip(self._features(image), self._weights, strict=True):
             cells = F.normalize(cells - cells.mean(dim=(0, 2, 3))[:, None, None], dim=1)
             padded = F.pad(cells, (weights[0].shape[-1] // 2,) * 4)
-            cosines.append(torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0))
+            cosines.append(
+                torch.stack([F.conv2d(padded, shading)[0] for shading in weights]).amax(dim=0)
+            )
         size = cosines[0].shape[1:]
-        fine = [F.interpolate(c[None], size=size, mode="bilinear", align_corners=True)[0] for c in cosines[1:]]
+        fine = [
+            F.interpolate(c[None], size=size, mode="bilinear", align_corners=True)[0]
+            for c in cosines[1:]
+        ]
         return sum(fine, cosines[0]) / len(cosines)
 
-    def _peaks(self, maps: list[Tensor], fitting: list[Tensor], ratios: list[tuple[float, float]]) -> Proposals:
+    def _peaks(
+        self, maps: list[Tensor], fitting: list[Tensor], ratios: list[tuple[float, float]]
+    ) -> Proposals:
         every = torch.cat([m.flatten(1) for m in maps], dim=1)
-        mean, spread = every.mean(dim=1), every.std(dim=1).clamp(min=1e-6)
-        boxes, responses, views = [], [], []
+        mean = every.mean(dim=1)
+        spread = every.std(dim=1).clamp(min=1e-6)
+        boxes = []
+        responses = []
+        views = []
         for similarity, fits, ratio in zip(maps, fitting, ratios, strict=True):
             z = (similarity - mean[:, None, None]) / spread[:, None, None]
             best, view = z.masked_fill(~fits[:, None, None], -torch.inf).max(dim=0)
             peak = (best == F.max_pool2d(best[None], 3, stride=1, padding=1)[0]) & best.isfinite()
             i, j = peak.nonzero(as_tuple=True)
             corner = torch.stack([j, i], dim=1).repeat(1, 2) * 8.0 - TEMPLATE_SIDE / 2.0
-            boxes.append((self._boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5)
+            boxes.append(
+                (self._boxes[view[i, j]] + corner) / best.new_tensor([*ratio, *ratio]) - 0.5
+            )
             responses.append(best[i, j])
             views.append(self._views[view[i, j].cpu()])
         response, index = torch.cat(responses).sort(descending=True, stable=True)
         index = index[:MAX_PEAKS]
-        box, view = torch.cat(boxes)[index], torch.cat(views)[index.cpu()]
-        kept = non_maximum_suppression(box, response[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[: self.settings.proposals]
+        box = torch.cat(boxes)[index]
+        view = torch.cat(views)[index.cpu()]
+        kept = non_maximum_suppression(box, response[:MAX_PEAKS], SAME_OBJECT_OVERLAP)[
+            : self.settings.proposals
+        ]
         return Proposals(box[kept].cpu(), response[kept].cpu(), view[kept.cpu()])
 
 
 def representative_views(bank: ViewBank, count: int) -> Tensor:
-    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than ``count``. The
-    distance of two views is the squared distance of their unit descriptors plus that of the logarithms of their boxes'
-    aspect ratios. The first medoid is the most central view, each further one the farthest from those before."""
+    """(K,) k-medoids of a bank's views, ascending, on the CPU; all of a bank that has no more than
+    ``count``. The distance of two views is the squared distance of their unit descriptors plus that
+    of the logarithms of their boxes' aspect ratios. The first medoid is the most central view, each
+    further one the farthest from those before."""
     views = torch.arange(len(bank))
     if len(views) > MAX_COMPARED_VIEWS:
         views = torch.arange(MAX_COMPARED_VIEWS) * len(bank) // MAX_COMPARED_VIEWS
@@ -419,7 +510,10 @@ def representative_views(bank: ViewBank, count: int) -> Tensor:
 def _view_features(bank: ViewBank, views: Tensor) -> Tensor:
     sides = (bank.boxes[:, 2:] - bank.boxes[:, :2])[views]
     ratios = (sides[:, :1] / sides[:, 1:]).log().float()
-    return torch.cat([F.normalize(bank.descriptors[views].float(), dim=1), ratios.to(bank.descriptors.device)], dim=1)
+    return torch.cat(
+        [F.normalize(bank.descriptors[views].float(), dim=1), ratios.to(bank.descriptors.device)],
+        dim=1,
+    )
 
 
 def _medoids(distances: Tensor, count: int) -> Tensor:

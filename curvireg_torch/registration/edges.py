@@ -16,34 +16,38 @@ CROP_SIZE = 256
 """Side of the crops in px; the first rounds use half of it."""
 
 MASK_DISTANCE = 6.0 / 256.0
-"""Distance from an edge at which the mask is read on both sides, as a fraction of the crop's side: about 1.5 px of the
-learned mask."""
+"""Distance from an edge at which the mask is read on both sides, as a fraction of the crop's side:
+about 1.5 px of the learned mask."""
 
 MASK_TRUST = 0.7
 """Weight that an edge loses where the mask contradicts it."""
 
 OUTLINE_WEIGHT = 2.0
-"""Weight of the outline relative to creases and inner contours, which prints and reflections imitate."""
+"""Weight of the outline relative to creases and inner contours, which prints and reflections
+imitate."""
 
 
 class EdgeField:
     """Edges of image crops (B, C, S, S) in [0, 1]; the strongest of several channels counts.
 
-    ``inside`` (B, 1, S, S), if given, is 0 outside the photograph: there are no edges, though crops repeat its border.
+    ``inside`` (B, 1, S, S), if given, is 0 outside the photograph: there are no edges, though crops
+    repeat its border.
     """
 
     def __init__(self, crops: Tensor, inside: Tensor | None = None) -> None:
         gx, gy = central_gradient(smooth(crops, 1.0))
         self._inside = torch.ones_like(crops[:, :1]) if inside is None else inside.to(crops)
         self._gradient = torch.stack([gx, gy], dim=2).flatten(1, 2) * self._inside
-        energy, area = self._gradient.square().sum(dim=(1, 2, 3)), self._inside.sum(dim=(1, 2, 3))
+        energy = self._gradient.square().sum(dim=(1, 2, 3))
+        area = self._inside.sum(dim=(1, 2, 3))
         self._level = (energy / area.clamp(min=1)).sqrt().clamp(min=1e-6)
 
     def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
         """Strength of the image gradient across a contour, at offsets along its normals.
 
-        With g the gradient, m the crop's root mean square gradient and c = ``|n . g| / |g|``, r = ``|n . g| c^4`` gives
-        the strength r / (r + m). It is 0 outside the crop; c^4 is one half where n and g differ by 33 degrees.
+        With g the gradient, m the crop's root mean square gradient and c = ``|n . g| / |g|``, r =
+        ``|n . g| c^4`` gives the strength r / (r + m). It is 0 outside the crop; c^4 is one half
+        where n and g differ by 33 degrees.
 
         Args:
             uv, normals: (N, P, 2) pixels of the crops and unit vectors.
@@ -54,7 +58,8 @@ class EdgeField:
             (N, P, L) float32 in [0, 1).
         """
         gradient = _sampled_lines(self._gradient, uv, normals, offsets, image_index)
-        gx, gy = gradient[:, 0::2], gradient[:, 1::2]
+        gx = gradient[:, 0::2]
+        gy = gradient[:, 1::2]
         nx, ny = normals.to(gx.dtype)[:, None, :, None].unbind(-1)
         across = (gx * nx).addcmul_(gy, ny).square_()
         cosine = across / (gx * gx).addcmul_(gy, gy).clamp_(min=1e-20)
@@ -63,8 +68,8 @@ class EdgeField:
         return strength
 
     def counts(self, uv: Tensor, valid: Tensor, image_index: Tensor) -> Tensor:
-        """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but those outside the
-        photograph; but then half of the points at least."""
+        """(N, P) bool: ``valid`` points that count when the support of a pose is averaged, all but
+        those outside the photograph; but then half of the points at least."""
         S = self._inside.shape[-1]
         x, y = uv.round().long().clamp(0, S - 1).unbind(-1)
         here = valid & (self._inside[image_index[:, None], 0, y, x] > 0)
@@ -78,11 +83,14 @@ class ObjectMask:
     def __init__(self, probability: Tensor) -> None:
         self.probability = probability.detach().cpu().float()
 
-    def weights(self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int) -> Tensor:
+    def weights(
+        self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int
+    ) -> Tensor:
         """How well edges at offsets along the normals of contour points agree with the mask.
 
-        With p and q the probabilities 6/256 of the crop's side inward and outward of an edge, an edge of the outline
-        has weight 2 (0.3 + 0.7 max(p - q, 0)), one within the object 0.3 + 0.7 min(p, q).
+        With p and q the probabilities 6/256 of the crop's side inward and outward of an edge, an
+        edge of the outline has weight 2 (0.3 + 0.7 max(p - q, 0)), one within the object 0.3 + 0.7
+        min(p, q).
 
         Args:
             uv: (N, P, 2) px of the points in crops of ``size`` px.
@@ -94,9 +102,12 @@ class ObjectMask:
         """
         aside = MASK_DISTANCE * size
         at = torch.cat([offsets - aside, offsets + aside])
-        probability = _sampled_lines(self.probability, uv, points.normals, at, image_index, size=size, padding="border")
+        probability = _sampled_lines(
+            self.probability, uv, points.normals, at, image_index, size=size, padding="border"
+        )
         inside, outside = probability[:, 0].chunk(2, dim=-1)
-        outline, within = (inside - outside).clamp(min=0.0), torch.minimum(inside, outside)
+        outline = (inside - outside).clamp(min=0.0)
+        within = torch.minimum(inside, outside)
         is_outline = points.outline[..., None]
         agreement = 1.0 - MASK_TRUST + MASK_TRUST * torch.where(is_outline, outline, within)
         return agreement * self.largest_weights(points)[..., None]
@@ -117,14 +128,17 @@ def _sampled_lines(
     size: int | None = None,
     padding: str = "zeros",
 ) -> Tensor:
-    """(N, C, P, L) float32 values of pictures (B, C, S, S) at offsets (L,) px from points (N, P, 2) along normals.
+    """(N, C, P, L) float32 values of pictures (B, C, S, S) at offsets (L,) px from points (N, P, 2)
+    along normals.
 
     ``size`` is the side of the crop in px, to which points and offsets refer, if it is not S.
     """
     scale = 2.0 / (size or pictures.shape[-1])
     # A matrix product is four times as fast as start + offset x normal with its short rows.
     lines = torch.cat([scale * uv + (0.5 * scale - 1.0), scale * normals], dim=-1).float()
-    steps = torch.kron(torch.stack([torch.ones_like(offsets), offsets]).float(), torch.eye(2, dtype=torch.float32))
+    steps = torch.kron(
+        torch.stack([torch.ones_like(offsets), offsets]).float(), torch.eye(2, dtype=torch.float32)
+    )
     grid = (lines.flatten(0, 1) @ steps).view(*lines.shape[:2], len(offsets), 2)
 
     def sampled(picture: Tensor, grid: Tensor) -> Tensor:
@@ -141,8 +155,8 @@ def _sampled_lines(
 
 
 class EdgeCrops:
-    """Crops of the boxes of B photographs, as contours are fitted to them: at full size, half of it and a quarter,
-    each computed on first use.
+    """Crops of the boxes of B photographs, as contours are fitted to them: at full size, half of it
+    and a quarter, each computed on first use.
 
     Args:
         crops: (B, C, S, S) in [0, 1], without missing pixels.
@@ -151,16 +165,23 @@ class EdgeCrops:
         mask: (B, 1, s, s) probability that pixels of the crops belong to the object.
     """
 
-    def __init__(self, crops: Tensor, inside: Tensor, transforms: Tensor, mask: Tensor | None = None) -> None:
-        self.crops, self.transforms = crops, transforms.double()
+    def __init__(
+        self, crops: Tensor, inside: Tensor, transforms: Tensor, mask: Tensor | None = None
+    ) -> None:
+        self.crops = crops
+        self.transforms = transforms.double()
         self._inside = inside
         self.mask = None if mask is None else ObjectMask(mask)
         self._fields: dict[int, EdgeField] = {}
 
     @classmethod
-    def cut(cls, images: Sequence[Tensor], boxes: Tensor, margin: float, mask: Tensor | None = None) -> "EdgeCrops":
+    def cut(
+        cls, images: Sequence[Tensor], boxes: Tensor, margin: float, mask: Tensor | None = None
+    ) -> "EdgeCrops":
         """Cut the boxes (B, 4) with their ``margin`` out of photographs."""
-        crops = fill_missing(crop_regions(images, boxes[:, None], size=CROP_SIZE, margin=margin)[:, 0].float())
+        crops = fill_missing(
+            crop_regions(images, boxes[:, None], size=CROP_SIZE, margin=margin)[:, 0].float()
+        )
         check_pixels(crops, "of the box")
         transforms = crop_transforms(square_boxes(boxes, margin), CROP_SIZE)
         return cls(crops, inside_photographs(images, boxes, CROP_SIZE, margin), transforms, mask)
@@ -169,7 +190,8 @@ class EdgeCrops:
     def cat(cls, parts: Sequence["EdgeCrops"]) -> "EdgeCrops":
         """The crops of several photographs together."""
         crops, inside, transforms = (
-            torch.cat([getattr(part, name) for part in parts]) for name in ("crops", "_inside", "transforms")
+            torch.cat([getattr(part, name) for part in parts])
+            for name in ("crops", "_inside", "transforms")
         )
         masks = [part.mask.probability for part in parts if part.mask is not None]
         return cls(crops, inside, transforms, torch.cat(masks) if masks else None)
@@ -177,19 +199,25 @@ class EdgeCrops:
     def edges(self, factor: int) -> EdgeField:
         """The edges in crops whose sides are smaller by a factor."""
         if factor not in self._fields:
-            crops, inside = self.crops, self._inside
+            crops = self.crops
+            inside = self._inside
             if factor > 1:
-                crops, inside = F.avg_pool2d(crops, factor), F.avg_pool2d(inside, factor).floor()
+                crops = F.avg_pool2d(crops, factor)
+                inside = F.avg_pool2d(inside, factor).floor()
             self._fields[factor] = EdgeField(crops, inside)
         return self._fields[factor]
 
 
 def inside_photographs(images: Sequence[Tensor], boxes: Tensor, size: int, margin: float) -> Tensor:
-    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes show their photograph, 0 where they repeat its
-    border."""
+    """(B, 1, size, size) float32: 1 where crops around (B, 4) boxes show their photograph, 0 where
+    they repeat its border."""
     A = image_transforms(square_boxes(boxes, margin), size)
     at = torch.arange(size, dtype=A.dtype)
     x, y = (A[:, k, k, None] * at + A[:, k, 2, None] for k in (0, 1))
-    ends = torch.tensor([[image.shape[-1], image.shape[-2]] for image in images], dtype=A.dtype) - 0.5
-    across, down = ((p >= -0.5) & (p <= end[:, None]) for p, end in zip((x, y), ends.unbind(-1), strict=True))
+    ends = (
+        torch.tensor([[image.shape[-1], image.shape[-2]] for image in images], dtype=A.dtype) - 0.5
+    )
+    across, down = (
+        (p >= -0.5) & (p <= end[:, None]) for p, end in zip((x, y), ends.unbind(-1), strict=True)
+    )
     return (down[:, None, :, None] & across[:, None, None, :]).float()

@@ -21,8 +21,10 @@ from .registrar import Registrar
 from .result import FailedRegistration, Registration
 from .tracker import TrackedPose, Tracker
 
-# Confidence of a tracked pose from which it stands without a refinement, and after one that was no better
-TRUSTED_CONFIDENCE, KEPT_CONFIDENCE = 0.5, 0.2
+# Confidence of a tracked pose from which it stands without a refinement, and after one that was no
+# better
+TRUSTED_CONFIDENCE = 0.5
+KEPT_CONFIDENCE = 0.2
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
 
@@ -30,14 +32,15 @@ BELIEVED_CONFIDENCE = 0.5
 class Follower:
     """Registers frames one after the other: each starts from the pose of the frame before.
 
-    Frames are registered until a pose is believed, and tracked from then on (docs/method.md). Where tracking is not
-    trusted, contours are fitted around its pose and the result is compared with a registration (:func:`refine`); the
-    more certain pose counts. Where neither finds the object, the frame is registered, and that pose is used only if it
-    is reliable.
+    Frames are registered until a pose is believed, and tracked from then on (docs/method.md). Where
+    tracking is not trusted, contours are fitted around its pose and the result is compared with a
+    registration (:func:`refine`); the more certain pose counts. Where neither finds the object, the
+    frame is registered, and that pose is used only if it is reliable.
 
-    The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and 10 % of the distance
-    of the truth: the tracker's own, times that of the last pose that a registration confirmed. No pose gains confidence
-    from being followed, unless a further registration is reliable.
+    The ``confidence`` of a tracked frame is the probability that its pose is within 10 degrees and
+    10 % of the distance of the truth: the tracker's own, times that of the last pose that a
+    registration confirmed. No pose gains confidence from being followed, unless a further
+    registration is reliable.
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
@@ -47,20 +50,27 @@ class Follower:
     Example:
         >>> import curvireg_torch as cr
         >>> from curvireg_torch.synthetic import example_mesh
-        >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
+        >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90),
+        ...     image_size=64, progress=False)
         >>> follow = Follower(cr.Registrar(bank), cr.camera_matrix(150.0, 150.0, 79.5, 59.5))
         >>> follow(torch.rand(3, 120, 160), box=[40, 30, 120, 90]).translation.shape
         torch.Size([3])
     """
 
-    def __init__(self, registrar: Any, camera_matrix: Tensor | Camera, *, prior: PosePrior | None = None) -> None:
+    def __init__(
+        self, registrar: Any, camera_matrix: Tensor | Camera, *, prior: PosePrior | None = None
+    ) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         if self.registrar.others:
-            raise InvalidInputError("Follower: expected a registrar of one mesh, which is followed, got several")
-        self.camera_matrix, self.prior = camera_matrix, prior
+            raise InvalidInputError(
+                "Follower: expected a registrar of one mesh, which is followed, got several"
+            )
+        self.camera_matrix = camera_matrix
+        self.prior = prior
         describer = self.registrar.describer
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
-        self._base: float | None = None  # confidence of the pose that tracking goes on from, if there is one
+        # confidence of the pose that tracking goes on from, if there is one
+        self._base: float | None = None
 
     @torch.no_grad()
     def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
@@ -69,12 +79,12 @@ class Follower:
         Args:
             image: the frame, see :class:`Registrar`.
             pose: (4, 4) rigid ``T_cam_from_model``.
-            confidence: probability in [0, 1] that the pose is right; no tracked pose has more, unless a registration
-                confirms it. Below 0.5 each frame is checked.
+            confidence: probability in [0, 1] that the pose is right; no tracked pose has more,
+                unless a registration confirms it. Below 0.5 each frame is checked.
 
         Raises:
-            InvalidInputError: ``pose`` is not rigid and finite, ``confidence`` is no probability, or the frame cannot
-                be used.
+            InvalidInputError: ``pose`` is not rigid and finite, ``confidence`` is no probability,
+                or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
             ImageError: pixels around the mesh are outside [0, 1].
         """
@@ -97,9 +107,11 @@ class Follower:
 
         Args:
             image: see :class:`Registrar`.
-            box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None detects it.
+            box: x0, y0, x1, y1 in px of the object, for a frame that is registered; None detects
+                it.
         """
-        # All of it on one thread: rounding is always the same, and no idle threads of torch compete with it.
+        # All of it on one thread: rounding is always the same, and no idle threads of torch compete
+        # with it.
         return map_on_threads(lambda image: self._next(image, box), [image])[0]
 
     def _next(self, image: Any, box: Any) -> Registration | FailedRegistration:
@@ -115,11 +127,20 @@ class Follower:
         if tracked and found and _confidence(found) >= TRUSTED_CONFIDENCE:
             self._tracker.accept(tracked)
             return found
-        starts = [self._tracker.last_pose] if tracked is None else [tracked.state.T, self._tracker.last_pose]
+        starts = (
+            [self._tracker.last_pose]
+            if tracked is None
+            else [tracked.state.T, self._tracker.last_pose]
+        )
         refined = self._refined(item, torch.cat(starts))
-        if isinstance(refined, Registration) and _confidence(refined) >= (0.0 if found is None else _confidence(found)):
-            with suppress(LostObjectError, ImageError):  # track on from it, if it lies within the frame
-                self._tracker.accept(self._tracker.measure(item.image, item.K, refined.projection[0]))
+        if isinstance(refined, Registration) and _confidence(refined) >= (
+            0.0 if found is None else _confidence(found)
+        ):
+            # track on from it, if it lies within the frame
+            with suppress(LostObjectError, ImageError):
+                self._tracker.accept(
+                    self._tracker.measure(item.image, item.K, refined.projection[0])
+                )
                 self._base = _confidence(refined)
             return refined
         if tracked and found and _confidence(found) >= KEPT_CONFIDENCE:
@@ -127,11 +148,18 @@ class Follower:
             self._base = _confidence(found)
             return found
         registered = self._registered(item, image, box, RELIABLE)
-        return registered if isinstance(registered, Registration) and registered.reliable else refined
+        return (
+            registered if isinstance(registered, Registration) and registered.reliable else refined
+        )
 
-    def _registered(self, item: ImageItem, image: Any, box: Any, least: float) -> Registration | FailedRegistration:
-        """Register a frame; track from its pose if it lies within the frame, with a confidence of ``least``."""
-        result = self.registrar([image], None if box is None else [box], self.camera_matrix, prior=self.prior)[0]
+    def _registered(
+        self, item: ImageItem, image: Any, box: Any, least: float
+    ) -> Registration | FailedRegistration:
+        """Register a frame; track from its pose if it lies within the frame, with a confidence of
+        ``least``."""
+        result = self.registrar(
+            [image], None if box is None else [box], self.camera_matrix, prior=self.prior
+        )[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
             with suppress(LostObjectError, ImageError):
                 self._start(item, result.projection[0], _confidence(result))
@@ -149,7 +177,9 @@ class Follower:
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
-        describer, T, none = self.registrar.describer, tracked.state.T, torch.zeros(1, dtype=torch.long)
+        describer = self.registrar.describer
+        T = tracked.state.T
+        none = torch.zeros(1, dtype=torch.long)
         poses = Poses.at(T, item.K[None], describer.centre, none, none)
         poses = replace(
             poses,
@@ -164,7 +194,9 @@ class Follower:
         notes = self.registrar.mesh_notes
         features = dict(tracked.features)
         ranking = Ranking.none()
-        return Registration((hypothesis,), probabilities, ranking, features, warnings=warnings, notes=notes)
+        return Registration(
+            (hypothesis,), probabilities, ranking, features, warnings=warnings, notes=notes
+        )
 
 
 def _confidence(result: Registration) -> float:

@@ -8,7 +8,8 @@ from torch import Tensor
 from ..geometry.cameras import project_points
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
-MUCH_OUTSIDE = 0.1  # Fraction of the object outside the photograph from which a result carries a warning
+# Fraction of the object outside the photograph from which a result carries a warning
+MUCH_OUTSIDE = 0.1
 
 
 def photograph_box(size: tuple[int, int]) -> Tensor:
@@ -26,7 +27,8 @@ def clipped(box: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def border_sides(box: Tensor, size: tuple[int, int]) -> int:
-    """Number of sides of a box (4,) that lie on the border of a photograph of ``size`` (H, W), or beyond it.
+    """Number of sides of a box (4,) that lie on the border of a photograph of ``size`` (H, W), or
+    beyond it.
 
     Example:
         >>> border_sides(torch.tensor([0.0, 10.0, 50.0, 60.0]), (480, 640))
@@ -69,4 +71,7 @@ def outside_warnings(fraction: float) -> tuple[str, ...]:
     """What is questionable about a photograph that does not show a ``fraction`` of the object."""
     if fraction < MUCH_OUTSIDE:
         return ()
-    return (f"{100 * fraction:.0f} % of the object lies outside the photograph; take one that shows all of it",)
+    return (
+        f"{100 * fraction:.0f} % of the object lies outside the photograph; take one that shows "
+        f"all of it",
+    )

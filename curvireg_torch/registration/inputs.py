@@ -1,6 +1,7 @@
 """Photographs, boxes, masks and cameras in the forms that callers have them, checked one by one.
 
-Boxes and cameras that are possible, but probably a mistake, give warnings: a result from them is never reliable.
+Boxes and cameras that are possible, but probably a mistake, give warnings: a result from them is
+never reliable.
 """
 
 import math
@@ -37,28 +38,40 @@ from ..utils.checks import (
 )
 from .framing import clipped
 
-MIN_BOX_SIDE = 12  # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of 0.98.
+# Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of
+# 0.98.
+MIN_BOX_SIDE = 12
 MAX_FRACTION = 1.5  # largest coordinate of a box that is probably meant in fractions of the picture
-FRACTIONS = "box: in px, not fractions of the photograph; multiply them, or give --box-format fractions, or yolo"
+FRACTIONS = (
+    "box: in px, not fractions of the photograph; multiply them, or give --box-format "
+    "fractions, "
+    "or yolo"
+)
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
-# Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of 113 to 3 degrees
+# Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of
+# 113 to 3 degrees
 FOCAL_RANGE = (1 / 3, 20.0)
-SAME_PLACE = 1e-4  # Relative difference of poses and cameras up to which two photographs come from the same place
-SAME_PICTURE = 0.8  # Correlation of small copies of two photographs from which they may come from the same place
-# Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with the box of the pose
-# on 60 generated photographs
+# Relative difference of poses and cameras up to which two photographs come from the same place
+SAME_PLACE = 1e-4
+# Correlation of small copies of two photographs from which they may come from the same place
+SAME_PICTURE = 0.8
+# Overlap (IoU) from which two boxes count as the same: boxes drawn by hand had at least 0.86 with
+# the box of the pose on 60 generated photographs
 SAME_BOX_OVERLAP = 0.85
-MISSING_SHARE = 0.2  # Part of a box without pixels of the photograph, from which a result carries a warning
+# Part of a box without pixels of the photograph, from which a result carries a warning
+MISSING_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class ImageItem:
-    """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8, ``box`` (4,),
-    ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and what is questionable about them;
-    ``focal_deviation`` and ``camera_source`` as in :class:`Camera`.
+    """One photograph to register, without distortion: ``image`` (1 or 3, H, W) float or uint8,
+    ``box`` (4,), ``camera_matrix`` (3, 3), ``mask`` (H, W) float32 in [0, 1] of the object, and
+    what is questionable about them; ``focal_deviation`` and ``camera_source`` as in
+    :class:`Camera`.
 
     Raises:
-        InvalidInputError: something else, an empty box or one outside the image, skew, or pixels that are not square.
+        InvalidInputError: something else, an empty box or one outside the image, skew, or pixels
+            that are not square.
     """
 
     image: Tensor
@@ -109,12 +122,14 @@ class ImageItem:
         found = [] if self.camera_matrix is None else camera_warnings(self.camera_matrix, self.size)
         if (side := _visible_side(self.box, self.size)) < SMALL_BOX_SIDE:
             found.append(
-                f"the box shows {side:.0f} px on its shorter side; use a picture with at least {SMALL_BOX_SIDE}"
+                f"the box shows {side:.0f} px on its shorter side; use a picture with at least "
+                f"{SMALL_BOX_SIDE}"
             )
         return (*found, *self.notes)
 
     def shows_other_part(self, box: Tensor) -> bool:
-        """Whether a box (4,) is partly inside the photograph and shows another part of it than the item's box."""
+        """Whether a box (4,) is partly inside the photograph and shows another part of it than the
+        item's box."""
         H, W = self.size
         pair = torch.stack([box, self.box.to(box)]).clamp(min=-0.5)
         pair = torch.minimum(pair, torch.tensor([W, H, W, H]).to(pair) - 0.5)
@@ -123,7 +138,11 @@ class ImageItem:
 
     def mask_crop(self, size: int, margin: float) -> Tensor | None:
         """(1, 1, size, size) of the mask, as the photograph is cropped to its box."""
-        return None if self.mask is None else crop_squares(self.mask[None], square_boxes(self.box[None], margin), size)
+        return (
+            None
+            if self.mask is None
+            else crop_squares(self.mask[None], square_boxes(self.box[None], margin), size)
+        )
 
 
 def image_items(
@@ -133,25 +152,36 @@ def image_items(
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
     masks: Any | None = None,
 ) -> Sequence[ImageItem | CurviregError]:
-    """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or their errors.
-    Arguments and errors are those of ``Registrar``; each is read and checked whenever it is asked for, so that many
-    large files need the memory of few. A :class:`Camera` is scaled to the photograph, and its distortion removed; a
-    file without one has the camera of its EXIF data. A box of which less than ``MIN_BOX_SIDE`` px lie inside its
-    photograph in a direction is refused."""
+    """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or
+    their errors. Arguments and errors are those of ``Registrar``; each is read and checked whenever
+    it is asked for, so that many large files need the memory of few. A :class:`Camera` is scaled to
+    the photograph, and its distortion removed; a file without one has the camera of its EXIF data.
+    A box of which less than ``MIN_BOX_SIDE`` px lie inside its photograph in a direction is
+    refused."""
     if isinstance(images, str | PathLike) or (isinstance(images, Tensor) and images.ndim != 4):
-        raise InvalidInputError("images: expected a batch (B, C, H, W) or a list; put a single image into a list")
-    n, no_box = len(images), boxes is None
+        raise InvalidInputError(
+            "images: expected a batch (B, C, H, W) or a list; put a single image into a list"
+        )
+    n = len(images)
+    no_box = boxes is None
     if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
-        boxes = [None if is_missing(box) else as_boxes([box], 1)[0] for box in _one_each(boxes, n, "boxes")]
+        boxes = [
+            None if is_missing(box) else as_boxes([box], 1)[0]
+            for box in _one_each(boxes, n, "boxes")
+        ]
     else:
         boxes = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
     masks = [None] * n if masks is None else _one_each(masks, n, "masks")
     if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
-        raise InvalidInputError(f"masks: image {masks.index(None)} has neither mask nor box; register it separately")
+        raise InvalidInputError(
+            f"masks: image {masks.index(None)} has neither mask nor box; register it separately"
+        )
     priors = [prior] * n if prior is None or isinstance(prior, PosePrior) else list(prior)
     if len(priors) != n or not all(p is None or isinstance(p, PosePrior) for p in priors):
-        raise InvalidInputError(f"prior: expected a PosePrior, or a list of {n} with None where there is none")
+        raise InvalidInputError(
+            f"prior: expected a PosePrior, or a list of {n} with None where there is none"
+        )
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
@@ -160,26 +190,38 @@ def image_items(
                 if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
                     raise InvalidInputError(FRACTIONS)
                 small = min(item.size) < MIN_BOX_SIDE
-                where = "the photograph has" if small else "the part of the photograph in the box has"
-                message = f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are needed; use a larger picture"
+                where = (
+                    "the photograph has" if small else "the part of the photograph in the box has"
+                )
+                message = (
+                    f"{side:.1f} px on its shorter side, at least {MIN_BOX_SIDE} are "
+                    f"needed; use "
+                    f"a larger picture"
+                )
                 raise InvalidInputError(f"{where} {message}")
             return item
         except CurviregError as error:
-            return error.with_subject(": ".join([f"image {i}", *([error.subject] if error.subject else [])]))
+            return error.with_subject(
+                ": ".join([f"image {i}", *([error.subject] if error.subject else [])])
+            )
 
     return OnDemand(item, n)
 
 
 def check_cameras(images: Any, camera_matrices: Any | None, what: str) -> None:
     """Refuse photographs without a camera and without a file, whose EXIF data may have one."""
-    if camera_matrices is None and not all(isinstance(image, str | PathLike | Picture) for image in images):
+    if camera_matrices is None and not all(
+        isinstance(image, str | PathLike | Picture) for image in images
+    ):
         raise InvalidInputError(f"{what}: needs the camera matrix of each photograph")
 
 
 def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
     values = list(values)
     if len(values) != count:
-        raise InvalidInputError(f"{name}: expected {count}, one for each image or None, got {len(values)}")
+        raise InvalidInputError(
+            f"{name}: expected {count}, one for each image or None, got {len(values)}"
+        )
     return values
 
 
@@ -189,8 +231,9 @@ def is_missing(box: Any) -> bool:
 
 
 def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
-    """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the photograph: a pose
-    that is not rigid and finite, or that of another photograph by the same camera which shows something else."""
+    """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the
+    photograph: a pose that is not rigid and finite, or that of another photograph by the same
+    camera which shows something else."""
     T = as_numbers(poses, "T_cam_from_world", dtype=torch.float64).detach().cpu().double()
     check_tensor(T, "T_cam_from_world", (len(items), 4, 4))
     for i, pose in enumerate(T):
@@ -200,10 +243,16 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
             raise error.with_subject(f"image {i}") from None
         same = (T[:i] - pose).flatten(1).abs().amax(dim=1) <= 1e-9 * float(pose.abs().max())
         for j in same.nonzero()[:1, 0].tolist():
-            one, other = items[j], items[i]
-            if isinstance(one, ImageItem) and isinstance(other, ImageItem) and _contradict(one, other):
+            one = items[j]
+            other = items[i]
+            if (
+                isinstance(one, ImageItem)
+                and isinstance(other, ImageItem)
+                and _contradict(one, other)
+            ):
                 raise InvalidInputError(
-                    f"T_cam_from_world: the same as of image {j}, which shows something else; give each photograph "
+                    f"T_cam_from_world: the same as of image {j}, which shows something else; "
+                    f"give each photograph "
                     "the pose of its own camera",
                     subject=f"image {i}",
                 )
@@ -211,15 +260,16 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
 
 
 def copies_of(T: Tensor, items: "Sequence[ImageItem | CurviregError]") -> dict[int, int]:
-    """Photographs of a rig that show what an earlier one does, by their index, and that one: those that the same camera
-    took from the same place ``T`` (V, 4, 4). They are no further evidence."""
+    """Photographs of a rig that show what an earlier one does, by their index, and that one: those
+    that the same camera took from the same place ``T`` (V, 4, 4). They are no further evidence."""
     found: dict[int, int] = {}
     size = T[:, :3, 3].abs().amax(dim=1).clamp(min=1e-300)
     for i, pose in enumerate(T):
         turned = (T[:i, :3, :3] - pose[:3, :3]).flatten(1).abs().amax(dim=1) <= SAME_PLACE
         near = (T[:i, :3, 3] - pose[:3, 3]).abs().amax(dim=1) <= SAME_PLACE * size[i]
         for j in (turned & near).nonzero()[:, 0].tolist():
-            one, other = items[j], items[i]
+            one = items[j]
+            other = items[i]
             if i not in found and j not in found and _by_same_camera(one, other):
                 found[i] = j
     return found
@@ -244,11 +294,17 @@ def _cameras(given: Any, count: int) -> Sequence[Tensor | Camera | None]:
     """A camera or camera matrix for all, or one for each."""
     if given is None or isinstance(given, Camera):
         return [given] * count
-    if not (isinstance(given, list | tuple) and any(isinstance(camera, Camera) for camera in given)):
+    if not (
+        isinstance(given, list | tuple) and any(isinstance(camera, Camera) for camera in given)
+    ):
         return list(as_camera_matrices(given, count).detach().cpu())
     if len(given) != count:
-        raise InvalidInputError(f"camera_matrices: expected {count}, one for each image, got {len(given)}")
-    return [c if isinstance(c, Camera) else as_camera_matrices(c, 1)[0].detach().cpu() for c in given]
+        raise InvalidInputError(
+            f"camera_matrices: expected {count}, one for each image, got {len(given)}"
+        )
+    return [
+        c if isinstance(c, Camera) else as_camera_matrices(c, 1)[0].detach().cpu() for c in given
+    ]
 
 
 def image_item(
@@ -258,7 +314,8 @@ def image_item(
     prior: PosePrior | None = None,
     mask: Any | None = None,
 ) -> ImageItem:
-    """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image), however small."""
+    """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image),
+    however small."""
     (pixels, recorded), notes = _pixels(image), []
     camera = recorded if camera is None else camera
     box = None if box is None else box.detach().float().cpu()
@@ -267,7 +324,10 @@ def image_item(
         white = mask >= 0.5
         border = torch.cat([white[0], white[-1], white[:, 0], white[:, -1]])
         if min(float(border.float().mean()), float(white.float().mean())) > 0.5:
-            notes.append("the mask covers most of the photograph and its border; the object must be white, not black")
+            notes.append(
+                "the mask covers most of the photograph and its border; the object must be white, "
+                "not black"
+            )
     missing = torch.zeros(pixels.shape[-2:], dtype=torch.bool)
     deviation = 0.0
     source = "given"
@@ -281,7 +341,9 @@ def image_item(
         white = mask >= 0.5
         if not bool((white if box is None else _inside(white, box)).any()):
             where = "" if box is None else " in the box"
-            raise InvalidInputError(f"mask: no white pixel{where}; expected the object white, all else black")
+            raise InvalidInputError(
+                f"mask: no white pixel{where}; expected the object white, all else black"
+            )
         y, x = white.nonzero().unbind(1)
         around = torch.stack([x.min() - 0.5, y.min() - 0.5, x.max() + 0.5, y.max() + 0.5])
         box = around if box is None else box
@@ -290,7 +352,9 @@ def image_item(
     # Of an object that the border cuts, only the visible part is known.
     item = replace(item, box=clipped(box, item.size))
     if (share := float(_inside(missing, box).float().mean())) > MISSING_SHARE:
-        notes.append(f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing")
+        notes.append(
+            f"{100 * share:.0f} % of the box lie where the distorted photograph shows nothing"
+        )
     return replace(item, notes=tuple(notes), focal_deviation=deviation, camera_source=source)
 
 
@@ -300,15 +364,21 @@ def _object_mask(mask: Any, image: Tensor) -> Tensor:
         mask = read_mask(mask)
     x = torch.as_tensor(mask) if isinstance(mask, np.ndarray | Tensor) else None
     if x is None or not (x.dtype in (torch.bool, torch.uint8) or x.is_floating_point()):
-        raise InvalidInputError(f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}")
+        raise InvalidInputError(
+            f"mask: expected bool, uint8 or floating (H, W), or a path, got {type_and_shape(mask)}"
+        )
     if x.shape != image.shape[-2:]:
         (H, W), shape = image.shape[-2:], tuple(x.shape)
-        raise InvalidInputError(f"mask: expected shape ({H}, {W}), that of the photograph, got {shape}")
+        raise InvalidInputError(
+            f"mask: expected shape ({H}, {W}), that of the photograph, got {shape}"
+        )
     x = x.detach().cpu()
     x = torch.from_numpy(mask_of_values(x.numpy(), 255)) if x.dtype == torch.uint8 else x.float()
     check_finite(x, "mask")
     if float(x.min()) < 0 or float(x.max()) > 1:
-        raise InvalidInputError("mask: expected values from 0 to 1, the object white; divide by the largest")
+        raise InvalidInputError(
+            "mask: expected values from 0 to 1, the object white; divide by the largest"
+        )
     return x
 
 
@@ -322,7 +392,8 @@ class OnDemand(Sequence[ImageItem | CurviregError]):
     """``item(0)`` to ``item(count - 1)``, computed at each access, one at a time."""
 
     def __init__(self, item: Callable[[int], ImageItem | CurviregError], count: int) -> None:
-        self._item, self._indices = item, range(count)
+        self._item = item
+        self._indices = range(count)
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -343,9 +414,13 @@ def _pixels(image: Any) -> tuple[Tensor, Camera | None]:
         if not (np.issubdtype(image.dtype, np.number) or image.dtype == bool):
             raise InvalidInputError(f"photograph: expected an array of numbers, got {image.dtype}")
         image = torch.from_numpy(np.ascontiguousarray(image))
-        image = image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image
+        image = (
+            image[None] if image.ndim == 2 else image.movedim(-1, 0) if image.ndim == 3 else image
+        )
     if not isinstance(image, Tensor):
-        raise InvalidInputError(f"expected a tensor, an array or a path, got {type(image).__name__}")
+        raise InvalidInputError(
+            f"expected a tensor, an array or a path, got {type(image).__name__}"
+        )
     check_photograph(image, "photograph")
     return image, None
 
@@ -354,9 +429,16 @@ def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> 
     """(C, h, w) float32 in about [0, 1] of a photograph (C, H, W), floating in [0, 1] or uint8."""
     if tuple(image.shape[-2:]) == size and image.is_floating_point():
         return image.float()
-    options: dict[str, Any] = {"size": size, "mode": mode, "antialias": True, "align_corners": False}
+    options: dict[str, Any] = {
+        "size": size,
+        "mode": mode,
+        "antialias": True,
+        "align_corners": False,
+    }
     # One channel at a time to save memory: photographs are large.
-    small = torch.cat([F.interpolate(channel[None, None].float(), **options)[0] for channel in image])
+    small = torch.cat(
+        [F.interpolate(channel[None, None].float(), **options)[0] for channel in image]
+    )
     return small / 255.0 if image.dtype == torch.uint8 else small
 
 
@@ -381,16 +463,28 @@ def camera_warnings(K: Tensor, size: tuple[int, int]) -> list[str]:
         if is_inside(fx, fy) and are_nearly_equal(cx, cy):
             advice = "FX FY and CX CY seem to be swapped"
         elif cx >= W - 1 and cy >= H - 1:
-            w, h = 2 * cx + 1, 2 * cy + 1
-            advice = f"this camera seems to belong to a picture of about {w:.0f} x {h:.0f} px; scale it"
-        found.append(f"the principal point ({cx:g}, {cy:g}) lies outside the photograph of {W} x {H} px; {advice}")
+            w = 2 * cx + 1
+            h = 2 * cy + 1
+            advice = (
+                f"this camera seems to belong to a picture of about {w:.0f} x {h:.0f} px; scale it"
+            )
+        found.append(
+            f"the principal point ({cx:g}, {cy:g}) lies outside the photograph of {W} x {H} px; "
+            f"{advice}"
+        )
     low, high = FOCAL_RANGE
-    focal, side = min(fx, fy), max(W, H)
+    focal = min(fx, fy)
+    side = max(W, H)
     if not low * side <= focal <= high * side:
         degrees = 2 * math.degrees(math.atan(W / 2 / fx))
-        advice = "it is in px of this photograph, not in mm" if focal < side else "scale it with the photograph"
+        advice = (
+            "it is in px of this photograph, not in mm"
+            if focal < side
+            else "scale it with the photograph"
+        )
         found.append(
-            f"the focal length of {focal:g} px gives the photograph of {W} x {H} px a field of view of {degrees:.2g} "
+            f"the focal length of {focal:g} px gives the photograph of {W} x {H} px a field of "
+            f"view of {degrees:.2g} "
             f"degrees; {advice}"
         )
     return found

@@ -1,4 +1,5 @@
-"""Judgement of the fitted poses of one photograph: their order, their probabilities, and what is questionable."""
+"""Judgement of the fitted poses of one photograph: their order, their probabilities, and what is
+questionable."""
 
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -31,15 +32,18 @@ if TYPE_CHECKING:
     from .registrar import Registrar
 
 OUTSIDE_MARGIN = 1.0
-"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or edge support."""
+"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or
+edge support."""
 
-FLAT_EXTENT = 1e-3  # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
+# Thickness of a mesh, as a fraction of its radius, below which it counts as flat
+FLAT_EXTENT = 1e-3
 
 
 @dataclass(frozen=True)
 class Work:
-    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's, ``crops`` for contour
-    fits, and ``landmarks`` in the box, if there are any; ``starts`` with several cameras if the camera is unknown."""
+    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's,
+    ``crops`` for contour fits, and ``landmarks`` in the box, if there are any; ``starts`` with
+    several cameras if the camera is unknown."""
 
     item: ImageItem
     query: QueryFeatures
@@ -54,7 +58,12 @@ class Work:
 
 
 def judged(
-    registrar: "Registrar", work: Work, poses: Poses, features: Tensor, distinct: Tensor, outside: Tensor
+    registrar: "Registrar",
+    work: Work,
+    poses: Poses,
+    features: Tensor,
+    distinct: Tensor,
+    outside: Tensor,
 ) -> Registration:
     """Hypotheses, best first, those that merged last, and their probabilities.
 
@@ -63,7 +72,8 @@ def judged(
         work: the photograph.
         poses: H of them.
         features: (H, F) :data:`.POSE_FEATURES`.
-        distinct: (H,) bool, False of poses that merged with a better one and returned to their views.
+        distinct: (H,) bool, False of poses that merged with a better one and returned to their
+            views.
         outside: (H,) bool, those that lie outside the limits and are not reported.
     """
     scores = pose_scores(features, exact=work.exact)
@@ -85,7 +95,8 @@ def judged(
         focal=work.item.focal_deviation,
     )
     gain = _gain_outside(features, best, order[outside[order]])
-    if gain is not None and len(rivals) == 1:  # limits that leave no rival do not make a pose uncertain
+    # limits that leave no rival do not make a pose uncertain
+    if gain is not None and len(rivals) == 1:
         share = measured["concentration"] or 1.0
         measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
     probabilities: tuple[float, ...] = ()
@@ -95,7 +106,10 @@ def judged(
         probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
     item = work.item
     with_camera = item.camera_matrix is not None
-    hypotheses = [hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera) for h in reported]
+    hypotheses = [
+        hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera)
+        for h in reported
+    ]
     return Registration(
         tuple(hypotheses),
         probabilities,
@@ -115,14 +129,17 @@ def _outside_fraction(registrar: "Registrar", work: Work, best: Poses) -> float:
 
 
 def _gain_outside(features: Tensor, best: Tensor, outside: Tensor) -> float | None:
-    """Score of the pose outside the limits, minus that of the best one; without the rank, which it does not have."""
+    """Score of the pose outside the limits, minus that of the best one; without the rank, which it
+    does not have."""
     if not len(outside):
         return None
     weights = torch.tensor(SCORE_WEIGHTS[1:]).to(features)
     return float((features[outside, 1:] - features[best, 1:]) @ weights)
 
 
-def _contradiction(registrar: "Registrar", work: Work, best: Poses, gain: float | None) -> str | None:
+def _contradiction(
+    registrar: "Registrar", work: Work, best: Poses, gain: float | None
+) -> str | None:
     """See :attr:`.Registration.prior_contradiction`."""
     if work.limits is None:
         return None
@@ -136,7 +153,9 @@ def _contradiction(registrar: "Registrar", work: Work, best: Poses, gain: float 
 def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
     """What makes every pose of a flat mesh questionable, in words."""
     vertices = torch.from_numpy(mesh.vertices.copy()).double()
-    thickness = float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+    thickness = (
+        float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+    )
     if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
         return ()
     return ("the mesh is flat and has no colours: front and back look alike",)
@@ -145,7 +164,8 @@ def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
 def better_of(
     one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
 ) -> Registration | FailedRegistration:
-    """The registration with more confidence, or with a higher score where there is none; ``model`` is the rival's."""
+    """The registration with more confidence, or with a higher score where there is none; ``model``
+    is the rival's."""
     if not isinstance(rival, Registration):
         return one
     if not isinstance(one, Registration):

@@ -1,7 +1,8 @@
-"""Landmarks: local features of a mesh's print, found again in photographs; where enough agree, they give a pose.
+"""Landmarks: local features of a mesh's print, found again in photographs; where enough agree, they
+give a pose.
 
-The ranking compares whole views; print that is seen at a slant, small or half hidden still shows some landmarks. They
-need colours, and the camera of the photograph.
+The ranking compares whole views; print that is seen at a slant, small or half hidden still shows
+some landmarks. They need colours, and the camera of the photograph.
 """
 
 import math
@@ -20,25 +21,39 @@ from .confidence import MIN_LANDMARKS
 from .inputs import resized
 from .least_squares import nearest_rigid
 
-VIEWS, VIEW_SIZE = 48, 192  # Number of views that landmarks are taken from, and their side in px
+# Number of views that landmarks are taken from, and their side in px
+VIEWS = 48
+VIEW_SIZE = 192
 VIEW_DISTANCE = 4.0  # of the camera from the object's centre in these views, in object radii
-SILHOUETTE_BORDER = 4  # Width in px of the rim of the silhouette, where the background has a part in the features
-MIN_CONTRAST = 0.02  # of features, SIFT's threshold: prints are fainter in photographs than in views
-# px in x and y by which features lie too far right and down, since OpenCV halves the coordinates of a picture that it
-# has doubled. Its option enable_precise_upscale avoids that, but an eighth fewer features find their landmark.
+# Width in px of the rim of the silhouette, where the background has a part in the features
+SILHOUETTE_BORDER = 4
+# of features, SIFT's threshold: prints are fainter in photographs than in views
+MIN_CONTRAST = 0.02
+# px in x and y by which features lie too far right and down, since OpenCV halves the coordinates of
+# a picture that it has doubled. Its option enable_precise_upscale avoids that, but an eighth fewer
+# features find their landmark.
 UPSCALING_SHIFT = 0.25
-# Quantiles of grey that become black and white in a crop, which the object fills, and in a whole photograph, where it
-# may be brighter than all else; and the least distance of the two
-TONES, ALL_TONES, MIN_TONES = (0.01, 0.99), (0.0, 1.0), 0.05
-CROP_SIDE, MAX_SIDE = 400, 1920  # Longer side in px to which crops are resized, and of the largest whole photograph
+# Quantiles of grey that become black and white in a crop, which the object fills, and in a whole
+# photograph, where it may be brighter than all else; and the least distance of the two
+TONES = (0.01, 0.99)
+ALL_TONES = (0.0, 1.0)
+MIN_TONES = 0.05
+# Longer side in px to which crops are resized, and of the largest whole photograph
+CROP_SIDE = 400
+MAX_SIDE = 1920
 CROP_MARGIN = 0.05  # Space around a given box, as a fraction of its longer side
 SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look alike
-NEIGHBOURS, MAX_DISTANCE_RATIO = 8, 0.8  # Nearest landmarks of a feature, and Lowe's ratio of those at two places
-# Distance in object radii, and factor between sizes, within which two matches predict the same object
-CLUSTER_DISTANCE, CLUSTER_FACTOR = 0.4, 1.5
+# Nearest landmarks of a feature, and Lowe's ratio of those at two places
+NEIGHBOURS = 8
+MAX_DISTANCE_RATIO = 0.8
+# Distance in object radii, and factor between sizes, within which two matches predict the same
+# object
+CLUSTER_DISTANCE = 0.4
+CLUSTER_FACTOR = 1.5
 MAX_MATCHES = 2000  # Clearest matches of a photograph that are compared with one another
 MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
-REPROJECTION_ERROR = 0.03  # Distance in the photograph at which they count, as a fraction of the object's radius there
+# Distance in the photograph at which they count, as a fraction of the object's radius there
+REPROJECTION_ERROR = 0.03
 AGREEMENT = 0.06  # The same of poses that were fitted to edges as well
 RANSAC_ROUNDS = 500
 FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks
@@ -46,8 +61,8 @@ FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmark
 
 @dataclass(frozen=True)
 class _Features:
-    """F features of a picture: ``uv`` (F, 2) in px, ``size`` (F,) in px, ``angle`` (F,) in rad, and unit ``vectors``
-    (F, 128)."""
+    """F features of a picture: ``uv`` (F, 2) in px, ``size`` (F,) in px, ``angle`` (F,) in rad, and
+    unit ``vectors`` (F, 128)."""
 
     uv: np.ndarray
     size: np.ndarray
@@ -55,19 +70,31 @@ class _Features:
     vectors: np.ndarray
 
     @staticmethod
-    def of(picture: Tensor, mask: np.ndarray | None = None, tones: tuple[float, float] = TONES) -> "_Features":
-        """RootSIFT features of a picture (C, H, W) in [0, 1]; a place has one for each of its main orientations."""
+    def of(
+        picture: Tensor, mask: np.ndarray | None = None, tones: tuple[float, float] = TONES
+    ) -> "_Features":
+        """RootSIFT features of a picture (C, H, W) in [0, 1]; a place has one for each of its main
+        orientations."""
         grey = picture.mean(dim=0).cpu().numpy()
         # SIFT's threshold is one of contrast, of which a dark photograph has little.
         low, high = np.quantile(grey, tones)
-        grey = (255.0 * (grey - low) / max(high - low, MIN_TONES)).round().clip(0.0, 255.0).astype(np.uint8)
+        grey = (
+            (255.0 * (grey - low) / max(high - low, MIN_TONES))
+            .round()
+            .clip(0.0, 255.0)
+            .astype(np.uint8)
+        )
         sift = cv2.SIFT.create(contrastThreshold=MIN_CONTRAST, enable_precise_upscale=False)
         points, vectors = sift.detectAndCompute(grey, mask)
         if vectors is None or not len(points):
-            return _Features(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.float32))
+            return _Features(
+                np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.float32)
+            )
         vectors = np.sqrt(vectors / np.maximum(vectors.sum(axis=1, keepdims=True), 1e-9))
         values = np.array([(*p.pt, p.size, math.radians(p.angle)) for p in points])
-        return _Features(values[:, :2] - UPSCALING_SHIFT, values[:, 2], values[:, 3], vectors.astype(np.float32))
+        return _Features(
+            values[:, :2] - UPSCALING_SHIFT, values[:, 2], values[:, 3], vectors.astype(np.float32)
+        )
 
     def __getitem__(self, index: np.ndarray) -> "_Features":
         return _Features(*(getattr(self, f.name)[index] for f in fields(_Features)))
@@ -83,9 +110,10 @@ class LandmarkPose:
 
 @dataclass(frozen=True)
 class LandmarkMatches:
-    """Features of a photograph that resemble landmarks of a mesh with a ``centre`` (3,) and a ``radius``: pixels ``uv``
-    (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has the object: ``centres`` (M,) in px, x + iy, and
-    ``radii`` (M,) in px. ``K`` (3, 3) is the camera."""
+    """Features of a photograph that resemble landmarks of a mesh with a ``centre`` (3,) and a
+    ``radius``: pixels ``uv`` (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has
+    the object: ``centres`` (M,) in px, x + iy, and ``radii`` (M,) in px. ``K`` (3, 3) is the
+    camera."""
 
     uv: np.ndarray
     points: np.ndarray
@@ -101,24 +129,35 @@ class LandmarkMatches:
             self.radii[:, None] * self.radii
         )
         near &= np.abs(np.log(self.radii[:, None] / self.radii)) < math.log(CLUSTER_FACTOR)
-        poses, left = [], np.ones(len(self.uv), dtype=bool)
+        poses = []
+        left = np.ones(len(self.uv), dtype=bool)
         for _ in range(MAX_CLUSTERS):
             votes = (near & left).sum(axis=1) * left
             if not len(votes) or votes.max() < MIN_LANDMARKS:
                 break
             cluster = near[votes.argmax()] & left
             size = float(np.median(self.radii[cluster]))
-            pose = _pose(self.points[cluster] - self.centre, self.uv[cluster], self.K, REPROJECTION_ERROR * size)
+            pose = _pose(
+                self.points[cluster] - self.centre,
+                self.uv[cluster],
+                self.K,
+                REPROJECTION_ERROR * size,
+            )
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
-                R, position = pose.T[:3, :3], pose.T[:3, 3]
-                poses.append(LandmarkPose(transform(R, position - R @ torch.from_numpy(self.centre)), pose.count))
+                R = pose.T[:3, :3]
+                position = pose.T[:3, 3]
+                poses.append(
+                    LandmarkPose(
+                        transform(R, position - R @ torch.from_numpy(self.centre)), pose.count
+                    )
+                )
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
     def agreeing(self, T: Tensor, cameras: Tensor | None = None) -> Tensor:
-        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4); ``cameras`` (N, 3, 3) if they have
-        other ones."""
+        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4); ``cameras`` (N,
+        3, 3) if they have other ones."""
         counts = []
         matrices = [self.K] * len(T) if cameras is None else cameras.double().cpu().numpy()
         for pose, K in zip(T.double().cpu().numpy(), matrices, strict=True):
@@ -134,22 +173,31 @@ class Landmarks:
     """Features of the views of a mesh with colours, with their places on its surface."""
 
     def __init__(self, describer: ViewDescriber) -> None:
-        self._centre, self._radius = describer.centre.numpy(), describer.radius
+        self._centre = describer.centre.numpy()
+        self._radius = describer.radius
         R = uniform_views(VIEWS).rotations.double()
         position = torch.tensor([0.0, 0.0, VIEW_DISTANCE * self._radius], dtype=torch.float64)
         T = transform(R, position - R @ describer.centre)
-        focal = 0.5 * VIEW_SIZE * math.sqrt(VIEW_DISTANCE**2 - 1.0)  # the bounding sphere fills the picture
+        # the bounding sphere fills the picture
+        focal = 0.5 * VIEW_SIZE * math.sqrt(VIEW_DISTANCE**2 - 1.0)
         middle = 0.5 * (VIEW_SIZE - 1)
-        K = torch.tensor([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        K = torch.tensor(
+            [[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]], dtype=torch.float64
+        )
 
         def features(k: int) -> tuple[_Features, np.ndarray]:
-            view, size = T[k : k + 1], (VIEW_SIZE, VIEW_SIZE)
+            view = T[k : k + 1]
+            size = (VIEW_SIZE, VIEW_SIZE)
             depth = describer.renderer.render(view, K[None], size)[0, 0].cpu().double().numpy()
             rim = np.ones((2 * SILHOUETTE_BORDER + 1,) * 2, np.uint8)
-            found = _Features.of(describer.draw(view, K[None], size)[0], cv2.erode((depth > 0).astype(np.uint8), rim))
+            found = _Features.of(
+                describer.draw(view, K[None], size)[0], cv2.erode((depth > 0).astype(np.uint8), rim)
+            )
             column, row = found.uv.round().astype(int).clip(0, VIEW_SIZE - 1).T
             z = depth[row, column]
-            rays = (np.column_stack([found.uv, np.ones(len(z))]) @ np.linalg.inv(K.numpy()).T) * z[:, None]
+            rays = (np.column_stack([found.uv, np.ones(len(z))]) @ np.linalg.inv(K.numpy()).T) * z[
+                :, None
+            ]
             return found[z > 0], ((rays - T[k, :3, 3].numpy()) @ T[k, :3, :3].numpy())[z > 0]
 
         found = map_on_threads(features, range(VIEWS))
@@ -157,50 +205,68 @@ class Landmarks:
             *(np.concatenate([getattr(one, f.name) for one, _ in found]) for f in fields(_Features))
         )
         self._points = np.concatenate([points for _, points in found])
-        # Of a feature of size 1 that is upright: the way to the object's centre, and the object's radius, both in px.
+        # Of a feature of size 1 that is upright: the way to the object's centre, and the object's
+        # radius, both in px.
         turn = np.exp(-1j * self._features.angle) / self._features.size
         self._to_centre = (middle * (1 + 1j) - self._features.uv @ [1, 1j]) * turn
         self._radii = focal / VIEW_DISTANCE / self._features.size
 
     def matches(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> LandmarkMatches:
-        """Compare a photograph (C, H, W), floating in [0, 1] or uint8, with camera ``K`` (3, 3), or a box (4,) of it,
-        with the landmarks."""
+        """Compare a photograph (C, H, W), floating in [0, 1] or uint8, with camera ``K`` (3, 3), or
+        a box (4,) of it, with the landmarks."""
         found = self._photograph_features(image, box)
         landmark, ratio = self._nearest(found)
         clear = np.argsort(ratio, kind="stable")[:MAX_MATCHES]
         clear = clear[ratio[clear] < MAX_DISTANCE_RATIO]
-        found, landmark = found[clear], landmark[clear]
-        centres = found.uv @ [1, 1j] + self._to_centre[landmark] * found.size * np.exp(1j * found.angle)
+        found = found[clear]
+        landmark = landmark[clear]
+        centres = found.uv @ [1, 1j] + self._to_centre[landmark] * found.size * np.exp(
+            1j * found.angle
+        )
         radii = self._radii[landmark] * found.size
         camera = K.double().cpu().numpy()
-        return LandmarkMatches(found.uv, self._points[landmark], centres, radii, camera, self._centre, self._radius)
+        return LandmarkMatches(
+            found.uv, self._points[landmark], centres, radii, camera, self._centre, self._radius
+        )
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:
         """Features in px of the photograph."""
         H, W = image.shape[-2:]
-        x0, y0, x1, y1 = 0, 0, W, H
+        x0 = 0
+        y0 = 0
+        x1 = W
+        y1 = H
         if box is not None:
             margin = CROP_MARGIN * float((box[2:] - box[:2]).max())
-            low, high = (box[:2] - margin).floor().int().tolist(), (box[2:] + margin).ceil().int().tolist()
-            x0, y0, x1, y1 = max(low[0], 0), max(low[1], 0), min(high[0] + 1, W), min(high[1] + 1, H)
+            low = (box[:2] - margin).floor().int().tolist()
+            high = (box[2:] + margin).ceil().int().tolist()
+            x0 = max(low[0], 0)
+            y0 = max(low[1], 0)
+            x1 = min(high[0] + 1, W)
+            y1 = min(high[1] + 1, H)
         crop = image[:, y0:y1, x0:x1].detach().cpu()
         longer = max(crop.shape[-2:])
         scale = min(MAX_SIDE / longer, 1.0) if box is None else CROP_SIDE / longer
         h, w = (max(1, round(scale * side)) for side in crop.shape[-2:])
         scale = max(h, w) / longer
-        small = resized(crop, (h, w), mode="bicubic")  # keeps a quarter more features of small crops than bilinear
-        found = _Features.of(small.nan_to_num(0.0, 0.0, 0.0), tones=ALL_TONES if box is None else TONES)
+        # keeps a quarter more features of small crops than bilinear
+        small = resized(crop, (h, w), mode="bicubic")
+        found = _Features.of(
+            small.nan_to_num(0.0, 0.0, 0.0), tones=ALL_TONES if box is None else TONES
+        )
         uv = (found.uv + 0.5) / scale - 0.5 + [x0, y0]
         return _Features(uv, found.size / scale, found.angle, found.vectors)
 
     def _nearest(self, found: _Features) -> tuple[np.ndarray, np.ndarray]:
-        """(F,) the most similar landmark of each feature, and its distance as a fraction of that to the most similar
-        one at another place."""
-        known, points = torch.from_numpy(self._features.vectors), torch.from_numpy(self._points)
+        """(F,) the most similar landmark of each feature, and its distance as a fraction of that to
+        the most similar one at another place."""
+        known = torch.from_numpy(self._features.vectors)
+        points = torch.from_numpy(self._points)
         count = min(NEIGHBOURS, len(points))
         if count < 2 or not len(found.uv):
             return np.zeros(len(found.uv), dtype=int), np.ones(len(found.uv))
-        landmark, ratio = [], []
+        landmark = []
+        ratio = []
         for vectors in torch.from_numpy(found.vectors).split(FEATURES_AT_A_TIME):
             similarity, index = (vectors @ known.T).topk(count, dim=1)
             distance = (2.0 - 2.0 * similarity).clamp(min=0.0)
@@ -213,10 +279,17 @@ class Landmarks:
 
 
 def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> LandmarkPose | None:
-    """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px; None if few do."""
+    """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px;
+    None if few do."""
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points, uv, K, None, iterationsCount=RANSAC_ROUNDS, reprojectionError=error, flags=cv2.SOLVEPNP_SQPNP
+            points,
+            uv,
+            K,
+            None,
+            iterationsCount=RANSAC_ROUNDS,
+            reprojectionError=error,
+            flags=cv2.SOLVEPNP_SQPNP,
         )
     except cv2.error:  # points in one place
         return None

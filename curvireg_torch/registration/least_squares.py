@@ -1,4 +1,5 @@
-"""Robust least squares over rigid poses: projection, its derivative, and the measurements that pull on a pose."""
+"""Robust least squares over rigid poses: projection, its derivative, and the measurements that pull
+on a pose."""
 
 import math
 from collections.abc import Sequence
@@ -13,16 +14,19 @@ from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
 from .confidence import COVARIANCE_SCALE
 
-MAX_ROTATION, MAX_TRANSLATION = 0.2, 0.1  # Longest step: radians, and fraction of the object's distance
+# Longest step: radians, and fraction of the object's distance
+MAX_ROTATION = 0.2
+MAX_TRANSLATION = 0.1
 INLIER_SCALE = 2.0  # Distance in px at which a point match counts a quarter
 MIN_MATCHES = 8  # Point matches that a pose needs
-POINT_DAMPING = 1e-5  # Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J
+# Levenberg-Marquardt damping of a fit to points alone, a fraction of the diagonal of J^T W J
+POINT_DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """What N poses are fitted to: derivatives ``J`` (N, P, 6) of distances in px by rotation about the object's centre
-    (rad) and translation, these distances and their weights, (N, P, 1)."""
+    """What N poses are fitted to: derivatives ``J`` (N, P, 6) of distances in px by rotation about
+    the object's centre (rad) and translation, these distances and their weights, (N, P, 1)."""
 
     J: Tensor
     distance: Tensor
@@ -40,13 +44,15 @@ class Measurements:
     @staticmethod
     def cat(parts: Sequence["Measurements"]) -> "Measurements":
         """All measurements of the same poses together."""
-        return Measurements(*(torch.cat([getattr(p, f.name) for p in parts], dim=1) for f in fields(Measurements)))
+        return Measurements(
+            *(torch.cat([getattr(p, f.name) for p in parts], dim=1) for f in fields(Measurements))
+        )
 
 
 @dataclass(frozen=True)
 class PointMatches:
-    """Points of a mesh ``model`` (1, C, 3) that were found at ``uv`` (1, C, 2) px with ``weight`` (1, C) in [0, 1]; 0
-    marks a point that was not found."""
+    """Points of a mesh ``model`` (1, C, 3) that were found at ``uv`` (1, C, 2) px with ``weight``
+    (1, C) in [0, 1]; 0 marks a point that was not found."""
 
     model: Tensor
     uv: Tensor
@@ -60,14 +66,17 @@ class PointMatches:
         weight = (self.weight * _geman_mcclure(residual, scale)).repeat_interleave(2, dim=1)
         return Measurements(J, residual.flatten(1)[..., None], weight[..., None])
 
-    def inlier_ratio(self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE) -> float:
-        """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter of it counts at
-        ``scale`` px."""
+    def inlier_ratio(
+        self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE
+    ) -> float:
+        """Mean weight, in [0, 1], of the points that were found where the pose has them: a quarter
+        of it counts at ``scale`` px."""
         near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
         return float((near * self.weight).sum()) / max(self.weight.shape[1], 1)
 
     def moved(self, before: Tensor, after: Tensor) -> "PointMatches":
-        """The same in another crop of the photograph: ``before`` and ``after`` are the crops' cameras (1, 3, 3)."""
+        """The same in another crop of the photograph: ``before`` and ``after`` are the crops'
+        cameras (1, 3, 3)."""
         A = (after @ torch.linalg.inv(before))[0]
         return PointMatches(self.model, self.uv @ A[:2, :2].mT + A[:2, 2], self.weight)
 
@@ -77,9 +86,12 @@ def _geman_mcclure(residual: Tensor, scale: float) -> Tensor:
     return (1.0 + residual.square().sum(dim=-1) / scale**2) ** -2
 
 
-def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scales: Sequence[float]) -> Tensor:
-    """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4); ``T`` if there are few.
-    ``scales`` of the robust weights in px are one a step: at first all matches count, in the end those that agree."""
+def fit_points(
+    matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scales: Sequence[float]
+) -> Tensor:
+    """(1, 4, 4) pose that most matches agree on, by robust least squares from ``T`` (1, 4, 4);
+    ``T`` if there are few. ``scales`` of the robust weights in px are one a step: at first all
+    matches count, in the end those that agree."""
     if int((matches.weight > 0).sum()) < MIN_MATCHES:
         return T
     for scale in scales:
@@ -89,7 +101,8 @@ def fit_points(matches: PointMatches, T: Tensor, K: Tensor, centre: Tensor, scal
 
 
 def least_squares_step(A: Tensor, b: Tensor, T: Tensor, centre: Tensor, damping: float) -> Tensor:
-    """(N, 6) Levenberg-Marquardt steps of poses ``T`` (N, 4, 4) from normal equations, of bounded length."""
+    """(N, 6) Levenberg-Marquardt steps of poses ``T`` (N, 4, 4) from normal equations, of bounded
+    length."""
     step = damped_solution(A, b, damping)
     return step * step_fraction(step, T, centre)[:, None]
 
@@ -102,17 +115,21 @@ def step_fraction(step: Tensor, T: Tensor, centre: Tensor) -> Tensor:
 
 
 def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
-    """(N, 6) solutions of (A + damping diag A) x = b, for (N, 6, 6) and (N, 6, 1); 0 without measurements."""
+    """(N, 6) solutions of (A + damping diag A) x = b, for (N, 6, 6) and (N, 6, 1); 0 without
+    measurements."""
     damped = A.clone()
     diagonal = damped.diagonal(dim1=-2, dim2=-1)
     diagonal += damping * diagonal + (1e-12 * damping * diagonal.amax(dim=-1, keepdim=True) + 1e-12)
-    solution: Tensor = torch.linalg.solve_ex(damped, b).result[..., 0]  # without the check, which takes as long
+    # without the check, which takes as long
+    solution: Tensor = torch.linalg.solve_ex(damped, b).result[..., 0]
     return solution
 
 
-def project(points: Tensor, normals: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels (N, P, 2) of model points, and the derivative (N, P, 6) of their shift along unit vectors ``normals``
-    (N, P, 2) by rotation about and translation of the centre."""
+def project(
+    points: Tensor, normals: Tensor, T: Tensor, K: Tensor, centre: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of model points, and the derivative (N, P, 6) of their shift along unit
+    vectors ``normals`` (N, P, 2) by rotation about and translation of the centre."""
     R = T[:, :3, :3]
     arms = (points - centre) @ R.mT
     cam = arms + (R @ centre + T[:, :3, 3])[:, None]
@@ -131,7 +148,8 @@ def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
 
 
 def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
-    """(N, 4, 4) poses, rotated by ``step[:, :3]`` rad about the centre, which is then translated by ``step[:, 3:]``."""
+    """(N, 4, 4) poses, rotated by ``step[:, :3]`` rad about the centre, which is then translated by
+    ``step[:, 3:]``."""
     before = T[:, :3, :3]
     R = rotation_from_axis_angle(step[:, :3]) @ before
     position = before @ centre + T[:, :3, 3] + step[:, 3:]
@@ -139,18 +157,24 @@ def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
 
 
 def nearest_rigid(T: Tensor) -> Tensor:
-    """The poses (N, 4, 4) with the nearest rotations: products of many rotations lose their orthogonality."""
+    """The poses (N, 4, 4) with the nearest rotations: products of many rotations lose their
+    orthogonality."""
     U, _, V = torch.linalg.svd(T[:, :3, :3])
     return transform(U @ V, T[:, :3, 3])
 
 
-# Side in px of the square cells within which errors of contour points are correlated, and cells per side
-CELL_SIDE, CELLS_PER_SIDE = 32.0, 16
-# Errors of contour points: of the normals in rad, and along the line of sight in object radii (at an occluding contour
-# the surface turns away)
-NORMAL_ERROR, SIGHT_ERROR = 0.05, 0.05
-# Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points have in common
-POINT_ERROR, SHARED_ERROR = 0.6, 6.0
+# Side in px of the square cells within which errors of contour points are correlated, and cells per
+# side
+CELL_SIDE = 32.0
+CELLS_PER_SIDE = 16
+# Errors of contour points: of the normals in rad, and along the line of sight in object radii (at
+# an occluding contour the surface turns away)
+NORMAL_ERROR = 0.05
+SIGHT_ERROR = 0.05
+# Variance of each distance: (0.6 px)^2, plus six times the mean squared residual for what points
+# have in common
+POINT_ERROR = 0.6
+SHARED_ERROR = 6.0
 # A direction counts as known if this fraction of its information does not come from such errors
 OBSERVABLE_FRACTION = 0.75
 # Standard deviation in rad of an unknown rotation; that of an unknown translation is the distance
@@ -159,8 +183,8 @@ MIN_TOTAL_WEIGHT = 6.0  # Sum of weights that a covariance needs
 
 
 def summed_by_cells(uv: Tensor, values: Tensor) -> Tensor:
-    """(N, C, D) sums of values (N, P, D) of points (N, P, 2) over the cells of crops within which errors are
-    correlated."""
+    """(N, C, D) sums of values (N, P, D) of points (N, P, 2) over the cells of crops within which
+    errors are correlated."""
     cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
     cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
     sums = values.new_zeros(len(values), CELLS_PER_SIDE**2, values.shape[-1])
@@ -175,44 +199,59 @@ def residual_variance(measured: Measurements) -> Tensor:
 
 
 def pose_covariance(
-    measured: Measurements, points: ContourPoints, T: Tensor, K: Tensor, centre: Tensor, *, radius: float
+    measured: Measurements,
+    points: ContourPoints,
+    T: Tensor,
+    K: Tensor,
+    centre: Tensor,
+    *,
+    radius: float,
 ) -> tuple[Tensor, Tensor]:
-    """Covariance of poses by least squares over contour points, and the number of directions that they determine.
+    """Covariance of poses by least squares over contour points, and the number of directions that
+    they determine.
 
     With J the derivatives, W the weights, A = J^T W J and r the residuals, the covariance is
     ``COVARIANCE_SCALE`` A^-1 B A^-1 with
 
         B = sum_c g_c g_c^T + (0.36 px^2 + 6 s^2) J^T W^2 J,
 
-    where g_c is the sum of r_i w_i J_i over a cell of 32 px, whose points have correlated errors, and s^2 the mean of
-    r_i^2.
+    where g_c is the sum of r_i w_i J_i over a cell of 32 px, whose points have correlated errors,
+    and s^2 the mean of r_i^2.
 
-    Errors produce information as well: normals that are off by 0.05 rad and points that are off by 0.05 radii along the
-    line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x count as unknown, such as the rotation of a
-    cylinder about its axis. Their standard deviation is pi (rotation) or the distance.
+    Errors produce information as well: normals that are off by 0.05 rad and points that are off by
+    0.05 radii along the line of sight produce E. Directions x with x^T A x < 0.75 x^T (A + E) x
+    count as unknown, such as the rotation of a cylinder about its axis. Their standard deviation is
+    pi (rotation) or the distance.
 
     Args:
-        measured: edges near the contour ``points`` of N poses ``T`` (N, 4, 4) in crops with cameras ``K`` (N, 3, 3).
+        measured: edges near the contour ``points`` of N poses ``T`` (N, 4, 4) in crops with cameras
+            ``K`` (N, 3, 3).
         centre, radius: of the object, (3,) and model units.
 
     Returns:
-        (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were matched; (N,) number
-        of known directions, 0 to 6.
+        (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were
+        matched; (N,) number of known directions, 0 to 6.
     """
-    n, W = points.normals, measured.weight
+    n = points.normals
+    W = measured.weight
     uv, along = project(points.model, torch.stack([-n[..., 1], n[..., 0]], dim=-1), T, K, centre)
     cam = (points.model - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
     ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
     sight = torch.zeros_like(along)
     sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
     A = measured.J.mT @ (W * measured.J)
-    E = NORMAL_ERROR**2 * along.mT @ (W * along) + (SIGHT_ERROR * radius) ** 2 * sight.mT @ (W * sight)
-    # Basis of directions in which A + E is the identity and A is diagonal; first normalise the units.
+    E = NORMAL_ERROR**2 * along.mT @ (W * along) + (SIGHT_ERROR * radius) ** 2 * sight.mT @ (
+        W * sight
+    )
+    # Basis of directions in which A + E is the identity and A is diagonal; first normalise the
+    # units.
     unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
     lower = torch.linalg.cholesky(total)
     half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
-    fraction, vectors = torch.linalg.eigh(torch.linalg.solve_triangular(lower, half.mT, upper=False))
+    fraction, vectors = torch.linalg.eigh(
+        torch.linalg.solve_triangular(lower, half.mT, upper=False)
+    )
     basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
     known = fraction > OBSERVABLE_FRACTION
 
@@ -222,7 +261,9 @@ def pose_covariance(
     inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
     C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
     position = T[:, :3, :3] @ centre + T[:, :3, 3]
-    rotation, translation = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1))
+    rotation, translation = (
+        torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1)
+    )
     distance = torch.linalg.vector_norm(position, dim=1)[:, None]
     size = torch.minimum(UNKNOWN_ROTATION / rotation, distance / translation)
     unknown = basis * (~known * size)[:, None]
@@ -232,4 +273,6 @@ def pose_covariance(
     lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
     C = lever @ C @ lever.mT
     enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT
-    return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(dim=1) * enough
+    return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(
+        dim=1
+    ) * enough

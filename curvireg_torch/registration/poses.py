@@ -1,4 +1,5 @@
-"""Candidate poses under work: the best distinct views of rankings, put into boxes, fitted and judged."""
+"""Candidate poses under work: the best distinct views of rankings, put into boxes, fitted and
+judged."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -51,29 +52,35 @@ SAME_POSE_ANGLE = 15.0
 """Degrees within which two fitted hypotheses count as one."""
 
 SCREENING_WEIGHT = 20.0
-"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views that are fitted."""
+"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views
+that are fitted."""
 
 FINISHED_FITS = 2
 """Hypotheses of a photograph whose contours are fitted at full size."""
 
-CLOSE_SCORE, CLOSE_RIVALS = 2.5, 2
-"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of them are fitted as
-thoroughly."""
+CLOSE_SCORE = 2.5
+CLOSE_RIVALS = 2
+"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of
+them are fitted as thoroughly."""
 
 POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks", "details")
-"""Features of a pose: log S of the view it started from, minus that of the best view; normalised correlation of the
-pose's view with the photograph; edge support (0 without the contour fit); log appearance score of the pose (0 without
-that term); log (1 + n) with the number n of landmarks that agree with it, beyond ``CHANCE_LANDMARKS`` (0 without
-colours, camera or contour fit, with a similar mesh, and where a given pose is refined); by how much the contours that
-only this pose or only the best one predicts speak for it, see :func:`.compare_details` (0 for poses that score far less
-than the best)."""
+"""Features of a pose: log S of the view it started from, minus that of the best view; normalised
+correlation of the pose's view with the photograph; edge support (0 without the contour fit); log
+appearance score of the pose (0 without that term); log (1 + n) with the number n of landmarks that
+agree with it, beyond ``CHANCE_LANDMARKS`` (0 without colours, camera or contour fit, with a similar
+mesh, and where a given pose is refined); by how much the contours that only this pose or only the
+best one predicts speak for it, see :func:`.compare_details` (0 for poses that score far less than
+the best)."""
 
 CHANCE_LANDMARKS = 2
-"""Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses have no more."""
+"""Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses
+have no more."""
 
-SCORE_WEIGHTS, RANK_ALONE = (0.0, 10.0, 10.0, 2.5, 6.0, 1.0), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Weights of the features in the score of a pose, with an exact mesh and with a similar one (docs/experiments.md). The
-rank does not count where poses are fitted: how near a view of the bank was to one is a matter of sampling."""
+SCORE_WEIGHTS = (0.0, 10.0, 10.0, 2.5, 6.0, 1.0)
+RANK_ALONE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Weights of the features in the score of a pose, with an exact mesh and with a similar one
+(docs/experiments.md). The rank does not count where poses are fitted: how near a view of the bank
+was to one is a matter of sampling."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +117,15 @@ class Poses:
     @staticmethod
     def at(T: Tensor, cameras: Tensor, centre: Tensor, view: Tensor, rank: Tensor) -> "Poses":
         """Poses ``T`` of an object with this centre (3,), which are not fitted, in the same box."""
-        nan, none = torch.full((len(T),), torch.nan, dtype=torch.float64), torch.zeros_like(view)
-        unknown, quick = nan[:, None, None].repeat(1, 6, 6), torch.full_like(T, torch.nan)
-        return placed(Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none, quick), T, centre)
+        nan = torch.full((len(T),), torch.nan, dtype=torch.float64)
+        none = torch.zeros_like(view)
+        unknown = nan[:, None, None].repeat(1, 6, 6)
+        quick = torch.full_like(T, torch.nan)
+        return placed(
+            Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none, quick),
+            T,
+            centre,
+        )
 
     @staticmethod
     def in_box(
@@ -151,16 +164,25 @@ class Poses:
 
     def replaced(self, index: Tensor, others: "Poses") -> "Poses":
         """Return these poses with ``others`` in the places ``index``."""
-        return Poses(*(getattr(self, f.name).index_copy(0, index, getattr(others, f.name)) for f in fields(Poses)))
+        return Poses(
+            *(
+                getattr(self, f.name).index_copy(0, index, getattr(others, f.name))
+                for f in fields(Poses)
+            )
+        )
 
     @property
     def fit(self) -> ContourFit:
         """The poses as a fit."""
-        return ContourFit(self.T, self.covariance, self.edge_support, self.start_support, self.observable)
+        return ContourFit(
+            self.T, self.covariance, self.edge_support, self.start_support, self.observable
+        )
 
     def with_fit(self, fit: ContourFit, centre: Tensor) -> "Poses":
         """Return the poses of a fit, for an object with this centre (3,)."""
-        measured = {f.name: getattr(fit, f.name) for f in fields(ContourFit) if f.name != "transform"}
+        measured = {
+            f.name: getattr(fit, f.name) for f in fields(ContourFit) if f.name != "transform"
+        }
         return placed(replace(self, **measured), fit.transform, centre)
 
 
@@ -168,13 +190,16 @@ def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
     """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match."""
     position = T[:, :3, :3] @ centre + T[:, :3, 3]
     rotation = rotation_towards(position).mT @ T[:, :3, :3]
-    return replace(poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1))
+    return replace(
+        poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1)
+    )
 
 
 def best_views(
     ranking: Ranking, bank: ViewBank, *, count: int, symmetries: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """At most ``count`` best distinct allowed views of the ranking of a photograph, and their ranks, each (H,)."""
+    """At most ``count`` best distinct allowed views of the ranking of a photograph, and their
+    ranks, each (H,)."""
     order = ranking.order[0]
     if ranking.allowed is not None:
         order = order[ranking.allowed[0][order]]
@@ -186,24 +211,34 @@ def best_views(
 def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
     given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
-    return poses.with_fit(fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre)
+    return poses.with_fit(
+        fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
+    )
 
 
-def with_quick_fit(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> tuple[Poses, Tensor]:
-    """Return the poses with their short fits, and the edge supports (H,) that these reach, see :func:`quick_fit`."""
+def with_quick_fit(
+    describer: ViewDescriber, crops: EdgeCrops, poses: Poses
+) -> tuple[Poses, Tensor]:
+    """Return the poses with their short fits, and the edge supports (H,) that these reach, see
+    :func:`quick_fit`."""
     T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
     return replace(poses, quick=T), support
 
 
-def fit_texture_of(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, h: int) -> Poses | None:
-    """Pose ``h``, fitted to the colours of its mesh too, see :func:`fit_texture`; None without colours or fit."""
+def fit_texture_of(
+    describer: ViewDescriber, crops: EdgeCrops, poses: Poses, h: int
+) -> Poses | None:
+    """Pose ``h``, fitted to the colours of its mesh too, see :func:`fit_texture`; None without
+    colours or fit."""
     if not describer.draws_colours:
         return None
     one = poses[torch.tensor([h])]
     problem = ContourProblem.of(describer.contours, crops, one.cameras, one.crop_index)
     photograph = crops.crops[int(one.crop_index)]
     starts = turned(one.fit, describer.centre)
-    fit = fit_texture(describer.draw, describer.renderer, replace(problem, mask=None), photograph, starts)
+    fit = fit_texture(
+        describer.draw, describer.renderer, replace(problem, mask=None), photograph, starts
+    )
     return None if fit is None else one.with_fit(fit, describer.centre)
 
 
@@ -214,7 +249,8 @@ def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) 
 
 
 def similarities(views: Tensor, descriptors: Tensor) -> Tensor:
-    """(H,) normalised correlations of descriptors (H, D) of views with those (H, D) or (1, D) of photographs."""
+    """(H,) normalised correlations of descriptors (H, D) of views with those (H, D) or (1, D) of
+    photographs."""
     return (F.normalize(views, dim=1) * F.normalize(descriptors, dim=1)).sum(dim=1).double().cpu()
 
 
@@ -226,29 +262,43 @@ def compare_with_photograph(
     rotation: Tensor,
     distance: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Similarities (H,) of poses, allocentric rotations (H, 3, 3) and distances (H,), with a photograph that is
-    described as ``query`` and, on a grid twice as fine as the bank's, by ``descriptor`` (1, D); and their appearance
-    scores (H,), 0 where its ``ranking`` lacks that term."""
+    """Similarities (H,) of poses, allocentric rotations (H, 3, 3) and distances (H,), with a
+    photograph that is described as ``query`` and, on a grid twice as fine as the bank's, by
+    ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that
+    term."""
     if Appearance.name not in ranking.terms:
         similarity = similarities(registrar.describer.descriptors(rotation, distance), descriptor)
         return similarity, torch.zeros_like(similarity)
     views, pictures = registrar.describer.described(rotation, distance)
-    return similarities(views, descriptor), registrar.matcher.appearance_score(query, ranking, pictures)
+    return similarities(views, descriptor), registrar.matcher.appearance_score(
+        query, ranking, pictures
+    )
 
 
 def pose_features(
-    poses: Poses, similarity: Tensor, appearance: Tensor | None = None, landmarks: Tensor | None = None
+    poses: Poses,
+    similarity: Tensor,
+    appearance: Tensor | None = None,
+    landmarks: Tensor | None = None,
 ) -> Tensor:
-    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance`` (H,) where the
-    pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has any."""
-    appearance, landmarks = (torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks))
+    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance``
+    (H,) where the pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has
+    any."""
+    appearance, landmarks = (
+        torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks)
+    )
     support = poses.edge_support.nan_to_num(0.0)
     details = torch.zeros_like(similarity)
     return torch.stack([poses.rank, similarity, support, appearance, landmarks, details], dim=1)
 
 
 def with_details(
-    describer: ViewDescriber, crops: EdgeCrops, poses: Poses, features: Tensor, best: int, rivals: Tensor
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    best: int,
+    rivals: Tensor,
 ) -> Tensor:
     """Features (H, F) in which ``rivals`` (R,) are compared in detail with the ``best`` pose."""
     index = torch.cat([torch.tensor([best]), rivals])
@@ -266,26 +316,33 @@ def landmark_evidence(count: Tensor) -> Tensor:
 
 
 def pose_scores(features: Tensor, *, exact: bool) -> Tensor:
-    """(H,) scores that order poses: of all features with an exact mesh, the order of the ranking with a similar one."""
+    """(H,) scores that order poses: of all features with an exact mesh, the order of the ranking
+    with a similar one."""
     return features @ torch.tensor(SCORE_WEIGHTS if exact else RANK_ALONE, dtype=features.dtype)
 
 
 def common_score(hypothesis: Hypothesis) -> float:
-    """The part of the score that results in different boxes have in common: similarity and landmarks, weighted."""
+    """The part of the score that results in different boxes have in common: similarity and
+    landmarks, weighted."""
     weights = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True))
     return sum(weights[name] * hypothesis.evidence[name] for name in ("similarity", "landmarks"))
 
 
 def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher ``score`` (H,)."""
+    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher
+    ``score`` (H,)."""
     order = score.argsort(descending=True, stable=True)
-    R, best_first = poses.rotation[order].float(), torch.arange(len(order))
-    chosen = distinct_views(best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries)
+    R = poses.rotation[order].float()
+    best_first = torch.arange(len(order))
+    chosen = distinct_views(
+        best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries
+    )
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
 def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best first."""
+    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best
+    first."""
     best = int(scores.argmax())
     same = are_near(poses.rotation, poses.rotation[best], symmetries)
     close = ~same & (scores > scores[best] - CLOSE_SCORE)
@@ -300,10 +357,17 @@ def projected_box(describer: ViewDescriber, projection: tuple[Tensor, Tensor]) -
 
 
 def hypothesis_of(
-    poses: Poses, h: int, evidence: Mapping[str, float], *, score: str = "similarity", with_camera: bool = True
+    poses: Poses,
+    h: int,
+    evidence: Mapping[str, float],
+    *,
+    score: str = "similarity",
+    with_camera: bool = True,
 ) -> Hypothesis:
     """Pose ``h`` with its ``evidence``, one of which is its ``score``, as it is reported."""
-    T, support, covariance = poses.T[h], float(poses.edge_support[h]), poses.covariance[h]
+    T = poses.T[h]
+    support = float(poses.edge_support[h])
+    covariance = poses.covariance[h]
     return Hypothesis(
         rotation=T[:3, :3].clone() if with_camera else poses.rotation[h].clone(),
         translation=T[:3, 3].clone() if with_camera else None,
@@ -314,7 +378,9 @@ def hypothesis_of(
         projection=(T.clone(), poses.cameras[h].clone()),
         view=int(poses.view[h]),
         edge_support=None if math.isnan(support) else support,
-        covariance=covariance.clone() if with_camera and bool(covariance.isfinite().all()) else None,
+        covariance=covariance.clone()
+        if with_camera and bool(covariance.isfinite().all())
+        else None,
     )
 
 

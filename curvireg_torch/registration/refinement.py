@@ -1,4 +1,5 @@
-"""Refinement of known poses: contours are fitted around starts, without boxes; a registration checks them."""
+"""Refinement of known poses: contours are fitted around starts, without boxes; a registration
+checks them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,10 +33,13 @@ from .tracker import OUTSIDE, boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-# Degrees by which given starts are rotated away, to fit from there too: they may be worse than views of a bank
+# Degrees by which given starts are rotated away, to fit from there too: they may be worse than
+# views of a bank
 WIDE_ANGLES = (14.0, 22.0)
-COMPARED = 5  # Hypotheses of the registration that checks a refined pose, even if fewer are reported
-LOST_CONFIDENCE = 0.35  # Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
+# Hypotheses of the registration that checks a refined pose, even if fewer are reported
+COMPARED = 5
+# Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
+LOST_CONFIDENCE = 0.35
 
 
 @torch.no_grad()
@@ -49,29 +53,31 @@ def refine(
 ) -> list[Registration | FailedRegistration]:
     """Refine poses of a mesh in photographs, without boxes.
 
-    Contours are fitted around each start that shows the mesh in the photograph. A start should lie within about 15
-    degrees and 15 % of the distance of the truth. A fit from a wrong start may look as good as one from a good start,
-    so the photograph is also registered in the box of the refined pose: the confidence is the smaller one of that of
-    the fit and of the probability that the registration gives the pose, and never more than that of the start.
+    Contours are fitted around each start that shows the mesh in the photograph. A start should lie
+    within about 15 degrees and 15 % of the distance of the truth. A fit from a wrong start may look
+    as good as one from a good start, so the photograph is also registered in the box of the refined
+    pose: the confidence is the smaller one of that of the fit and of the probability that the
+    registration gives the pose, and never more than that of the start.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
-        images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that have its focal
-            length.
+        images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that
+            have its focal length.
         poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
-        start_confidences: probabilities in [0, 1] of the starts of each photograph, if they are known, as those of
-            earlier results are.
+        start_confidences: probabilities in [0, 1] of the starts of each photograph, if they are
+            known, as those of earlier results are.
 
     Returns:
-        For each photograph its refined poses, best first. A :class:`FailedRegistration` with :class:`LostObjectError`
-        where the object is not near any start.
+        For each photograph its refined poses, best first. A :class:`FailedRegistration` with
+        :class:`LostObjectError` where the object is not near any start.
 
     Raises:
-        InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid and finite, or a
-            confidence that is no probability.
+        InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid
+            and finite, or a confidence that is no probability.
     """
     check_cameras(images, camera_matrices, "refine")
-    items, starts = image_items(images, None, camera_matrices), []
+    items = image_items(images, None, camera_matrices)
+    starts = []
     for one in poses:
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()
         starts.append(T[None] if T.ndim == 2 else T)
@@ -79,27 +85,38 @@ def refine(
     limits = [None] * len(items) if start_confidences is None else list(start_confidences)
     limits = [None if c is None else check_probability(c, "start_confidences") for c in limits]
     if len(starts) != len(items) or len(limits) != len(items):
-        raise InvalidInputError(f"refine: expected starts of {len(items)} photographs, got {len(starts)}")
-    return registrar.map_items(items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i]))
+        raise InvalidInputError(
+            f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
+        )
+    return registrar.map_items(
+        items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i])
+    )
 
 
-def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None) -> Registration:
-    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most ``limit``. Raises
-    :class:`LostObjectError` where the object is not near any start."""
-    describer, K = registrar.describer, item.K
+def refine_item(
+    registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None
+) -> Registration:
+    """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most
+    ``limit``. Raises :class:`LostObjectError` where the object is not near any start."""
+    describer = registrar.describer
+    K = item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
         raise LostObjectError(why_outside(describer.hull, T[0], K, item.size))
-    T, boxes = T[visible], boxes[visible]
+    T = T[visible]
+    boxes = boxes[visible]
     if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
         problem = why_outside(describer.hull, T[0], K, item.size)
         tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
         raise LostObjectError(tiny if problem == OUTSIDE else problem)
-    images, each = [item.image] * len(T), torch.arange(len(T))
+    images = [item.image] * len(T)
+    each = torch.arange(len(T))
     query = registrar.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
-    poses = Poses.at(T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64))
+    poses = Poses.at(
+        T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64)
+    )
     views = torch.tensor([nearest_view(registrar, R) for R in poses.rotation])
     poses = replace(poses, crop_index=each, view=views)
     mask = registrar.object_mask(query, [item] * len(T))
@@ -127,24 +144,36 @@ def refine_item(registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: fl
     confidence = refinement_confidence(features)
     if confidence < LOST_CONFIDENCE:
         raise LostObjectError(
-            f"the object is not near the start (edge support {features['edge_support']:.2f}, similarity "
+            f"the object is not near the start (edge support {features['edge_support']:.2f}, "
+            f"similarity "
             f"{features['similarity']:.2f}); give another start, or register it again"
         )
     probabilities: tuple[float, ...] = ()
     if is_calibrated(registrar.pipeline):
-        confidence = min(confidence, _registered_probability(registrar, item, poses[torch.tensor(order[:1])]))
-        probabilities = (confidence if limit is None else min(confidence, limit), *[0.0] * (len(hypotheses) - 1))
+        confidence = min(
+            confidence, _registered_probability(registrar, item, poses[torch.tensor(order[:1])])
+        )
+        probabilities = (
+            confidence if limit is None else min(confidence, limit),
+            *[0.0] * (len(hypotheses) - 1),
+        )
     warnings = item.warnings + registrar.mesh_warnings
     notes = registrar.mesh_notes
     ranking = Ranking.none()
     return Registration(
-        hypotheses, probabilities, ranking, dict(features), warnings=warnings, notes=notes, camera=item.camera
+        hypotheses,
+        probabilities,
+        ranking,
+        dict(features),
+        warnings=warnings,
+        notes=notes,
+        camera=item.camera,
     )
 
 
 def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:
-    """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of the box that it
-    projects to, which its rotation does not influence."""
+    """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of
+    the box that it projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
     query = registrar.matcher.query([item.image], boxes.float())
     found = registrar.with_hypotheses(COMPARED).register(replace(item, box=boxes[0].float()), query)

@@ -19,10 +19,15 @@ def best_inside(features: Tensor, outside: Tensor) -> Tensor:
 
 
 def fitted_again(
-    registrar: "Registrar", work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    registrar: "Registrar",
+    work: Work,
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    outside: Tensor,
 ) -> tuple[Poses, Tensor]:
-    """Fit the best pose again from where it is, then its close rivals: fits that differ in effort cannot be compared.
-    Results with a higher score are kept."""
+    """Fit the best pose again from where it is, then its close rivals: fits that differ in effort
+    cannot be compared. Results with a higher score are kept."""
     best = best_inside(features, outside)
     poses, features = _refitted(registrar, work, crops, poses, features, best)
     scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
@@ -30,12 +35,19 @@ def fitted_again(
     if not len(rivals):
         return poses, features
     different = distinct_poses(poses[rivals], scores[rivals], work.symmetries)
-    poses, features = _refitted(registrar, work, crops, poses, features, rivals[different][:CLOSE_RIVALS])
+    poses, features = _refitted(
+        registrar, work, crops, poses, features, rivals[different][:CLOSE_RIVALS]
+    )
     return poses, with_details(registrar.describer, crops, poses, features, int(best), rivals)
 
 
 def _refitted(
-    registrar: "Registrar", work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, index: Tensor
+    registrar: "Registrar",
+    work: Work,
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    index: Tensor,
 ) -> tuple[Poses, Tensor]:
     """Fit poses again, and keep the results that have a higher score."""
     fitted = registrar.fitted(work, crops, poses[index], again=True)
@@ -46,5 +58,7 @@ def _refitted(
     better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
     for k in better.nonzero()[:, 0].tolist():
         one = torch.tensor([k])
-        poses, features = registrar.replaced(work, poses, features, index[one], fitted[one], new[one])
+        poses, features = registrar.replaced(
+            work, poses, features, index[one], fitted[one], new[one]
+        )
     return poses, features

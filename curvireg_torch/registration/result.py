@@ -1,4 +1,5 @@
-"""The results of a registration: poses with their probabilities, as values, as JSON documents, and in words."""
+"""The results of a registration: poses with their probabilities, as values, as JSON documents, and
+in words."""
 
 import html
 import math
@@ -28,22 +29,31 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 
-UNKNOWN_ROTATION = 1.0  # Radians of standard deviation from which the rotation about an axis counts as unknown
-RIVAL_FRACTION = 0.5  # Fraction of the first pose's probability from which another one makes the answer ambiguous
+# Radians of standard deviation from which the rotation about an axis counts as unknown
+UNKNOWN_ROTATION = 1.0
+# Fraction of the first pose's probability from which another one makes the answer ambiguous
+RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
-MIRROR_ANGLE = 30.0  # Degrees within which two directions of view count as mirror images of each other
+# Degrees within which two directions of view count as mirror images of each other
+MIRROR_ANGLE = 30.0
 STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
-WEAK_PERSPECTIVE = 0.15  # Deviation of an estimated focal length, as a fraction, from which it is hardly measured
-SCHEMA = 3  # Version of the keys of result.json; raised when a key is removed or changes its meaning
+# Deviation of an estimated focal length, as a fraction, from which it is hardly measured
+WEAK_PERSPECTIVE = 0.15
+# Version of the keys of result.json; raised when a key is removed or changes its meaning
+SCHEMA = 3
 CONVENTIONS = {  # docs/results.md describes all keys
-    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of the mesh file",
+    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of "
+    "the mesh file",
     "translation": "in the mesh file's unit; null with a similar mesh and no camera",
     "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
-    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF orientation applied)",
+    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF "
+    "orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose is a guess",
-    "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: R_true = exp([w]x) R, "
+    "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose "
+    f"is a guess",
+    "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: "
+    "R_true = exp([w]x) R, "
     "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
 }
 
@@ -55,18 +65,23 @@ class Hypothesis:
     Attributes:
         rotation: (3, 3) float64, ``x_cam = R x_model + t``, OpenCV camera.
         translation: (3,) float64 in model units, None without a camera matrix.
-        score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose, how clearly and how
-            near to its outline the object's colours end.
-        evidence: the features that the hypotheses are ordered by; of a tracked pose, those of its confidence.
-        allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the object.
+        score: normalised correlation of photograph and rendered view in [0, 1]; of a tracked pose,
+            how clearly and how near to its outline the object's colours end.
+        evidence: the features that the hypotheses are ordered by; of a tracked pose, those of its
+            confidence.
+        allocentric_rotation: (3, 3) float64, relative to a camera that looks straight at the
+            object.
         distance: of the object's centre in model units.
-        projection: (4, 4) and (3, 3) float64 pose and camera matrix in px, which project the mesh onto the photograph;
-            without a camera matrix, those of a camera that looks straight at the object.
+        projection: (4, 4) and (3, 3) float64 pose and camera matrix in px, which project the mesh
+            onto the photograph; without a camera matrix, those of a camera that looks straight at
+            the object.
         view: index of the bank's view that the hypothesis started from.
-        edge_support: strength of the image edges under the projected contours, in [0, 1]; None without contour fit.
-        covariance: (6, 6) float64 of rotation (rad) about the camera's axes and translation (model units) along them,
-            ``R_true = exp([w]x) R``, ``t_true = t + e``, if pose and camera matrix are right; None without a camera
-            matrix, without contour fit, and where too few edges were found.
+        edge_support: strength of the image edges under the projected contours, in [0, 1]; None
+            without contour fit.
+        covariance: (6, 6) float64 of rotation (rad) about the camera's axes and translation (model
+            units) along them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if pose and camera
+            matrix are right; None without a camera matrix, without contour fit, and where too few
+            edges were found.
     """
 
     rotation: Tensor
@@ -88,8 +103,9 @@ class Hypothesis:
 
     @property
     def standard_deviations(self) -> tuple[Tensor, Tensor] | None:
-        """(3,) degrees about and (3,) model units along the camera's axes; None without a covariance. ``inf`` marks
-        what the contours do not determine: deviations from a radian, or from half the distance."""
+        """(3,) degrees about and (3,) model units along the camera's axes; None without a
+        covariance. ``inf`` marks what the contours do not determine: deviations from a radian, or
+        from half the distance."""
         if self.covariance is None:
             return None
         rotation, translation = self.covariance.diagonal().sqrt().split(3)
@@ -118,7 +134,8 @@ class Detection:
         box: (4,) float64 x0, y0, x1, y1 in px, around the projected mesh.
         score: probability that the photograph shows the object there.
         response: of the proposal that led here, see :class:`.Proposals`.
-        boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``responses`` (P,).
+        boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``responses``
+            (P,).
     """
 
     box: Tensor
@@ -134,10 +151,11 @@ class PhotographPose:
 
     Attributes:
         T_cam_from_model: (4, 4) float64.
-        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it was not read.
+        box: (4,) float64 x0, y0, x1, y1 in px, in which the photograph was compared; None where it
+            was not read.
         edge_support, similarity: of the pose in this photograph; None where it was not compared.
-        contribution: score by which the photograph prefers the pose to its best rival, of 5 points if there
-            is none; 0 if the photograph does not count.
+        contribution: score by which the photograph prefers the pose to its best rival, of 5 points
+            if there is none; 0 if the photograph does not count.
         failure: why the photograph does not count, in words; None if it does.
     """
 
@@ -171,27 +189,36 @@ class _OfBest(Generic[Value]):
 
 @dataclass(frozen=True)
 class Registration:
-    """Poses of one object in one photograph. The attributes of the best :class:`Hypothesis` are attributes of the
-    registration too; ``covariance`` and ``standard_deviations`` are None where it is not reliable.
+    """Poses of one object in one photograph. The attributes of the best :class:`Hypothesis` are
+    attributes of the registration too; ``covariance`` and ``standard_deviations`` are None where it
+    is not reliable.
 
     Attributes:
-        hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen from behind.
-        probabilities: of each hypothesis to be within 30 degrees of the truth, times ``detection.score`` for an
-            object without a box; empty for a pipeline that was not calibrated.
+        hypotheses: distinct poses, best first; all but the first are rivals, such as the pose seen
+            from behind.
+        probabilities: of each hypothesis to be within 30 degrees of the truth, times
+            ``detection.score`` for an object without a box; empty for a pipeline that was not
+            calibrated.
         ranking: scores of the bank's views for this photograph (B = 1).
-        confidence_features: what the confidence is computed from, see :func:`.confidence.confidence_features`.
+        confidence_features: what the confidence is computed from, see
+            :func:`.confidence.confidence_features`.
         detection: where the object was found; None if its box was given.
-        corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose; else None.
+        corrected_box: (4,) float64, the box that replaced a given one that did not fit the pose;
+            else None.
         prior: the limits on the pose that were given.
-        prior_contradiction: "better outside": a pose outside the limits fits better, or the box asks for a distance
-            outside; "at the limit": the pose lies within a degree, or 1 % of the distance, of a limit. None otherwise.
-        warnings: what is questionable about box, camera and mesh, in words; a result with one is not reliable.
-        notes: what the mesh lacks, as its textures, or what was left out of it, in words; reliable all the same.
+        prior_contradiction: "better outside": a pose outside the limits fits better, or the box
+            asks for a distance outside; "at the limit": the pose lies within a degree, or 1 % of
+            the distance, of a limit. None otherwise.
+        warnings: what is questionable about box, camera and mesh, in words; a result with one is
+            not reliable.
+        notes: what the mesh lacks, as its textures, or what was left out of it, in words; reliable
+            all the same.
         model: number of the mesh, of several.
-        camera: of the photograph without its distortion; its ``source`` tells whether it was given, and
-            ``focal_deviation`` how well its focal length is known. None without a camera, and of several photographs.
-        views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and covariance are then
-            ``T_world_from_model``, along the world's axes.
+        camera: of the photograph without its distortion; its ``source`` tells whether it was given,
+            and ``focal_deviation`` how well its focal length is known. None without a camera, and
+            of several photographs.
+        views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and
+            covariance are then ``T_world_from_model``, along the world's axes.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -223,7 +250,8 @@ class Registration:
 
     @property
     def confidence(self) -> float | None:
-        """Probability of the best pose, the first of ``probabilities``; None for pipelines without calibration."""
+        """Probability of the best pose, the first of ``probabilities``; None for pipelines without
+        calibration."""
         return self.probabilities[0] if self.probabilities else None
 
     @property
@@ -233,15 +261,21 @@ class Registration:
 
     @property
     def ambiguous(self) -> str | None:
-        """How poses differ that are nearly as probable as the first: "half turn", "mirror" or "several"; else None."""
+        """How poses differ that are nearly as probable as the first: "half turn", "mirror" or
+        "several"; else None."""
         likely = [p >= RIVAL_FRACTION * self.probabilities[0] for p in self.probabilities]
-        near = [h.allocentric_rotation for h, is_near in zip(self.hypotheses, likely, strict=False) if is_near]
+        near = [
+            h.allocentric_rotation
+            for h, is_near in zip(self.hypotheses, likely, strict=False)
+            if is_near
+        ]
         return ambiguity(torch.stack(near)) if near else None
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``, without ``warnings`` or a better pose outside the prior, and
-        the contours determine at least one axis of rotation; if False, the pose is a guess."""
+        """Whether the confidence is at least ``RELIABLE``, without ``warnings`` or a better pose
+        outside the prior, and the contours determine at least one axis of rotation; if False, the
+        pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
         if self.confidence is None or not self.confidence >= RELIABLE or doubtful:
@@ -259,23 +293,34 @@ class Registration:
 
     @property
     def T_cam_from_model(self) -> Tensor | None:  # noqa: N802
-        """(4, 4) float64, None without a camera matrix, and for several photographs, whose ``views`` have it."""
+        """(4, 4) float64, None without a camera matrix, and for several photographs, whose
+        ``views`` have it."""
         return None if self.views else self.transform
 
     def __repr__(self) -> str:
         """At most ten lines."""
         confidence = "not calibrated" if self.confidence is None else two_decimals(self.confidence)
         rows = [", ".join(f"{v:8.4f}" for v in row) for row in self.rotation.tolist()]
-        t = None if self.translation is None else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
+        t = (
+            None
+            if self.translation is None
+            else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
+        )
         lines = [
-            f"Registration: {verdict(self.confidence, self.none, self.reliable)}, confidence {confidence}",
+            f"Registration: {verdict(self.confidence, self.none, self.reliable)}, confidence "
+            f"{confidence}",
             f"rotation    [[{rows[0]}],",
             *(f"             [{row}]{end}" for row, end in zip(rows[1:], (",", "]"), strict=True)),
             f"translation {'unknown without a camera' if t is None else f'[{t}]'}",
-            "viewpoint   azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*self.viewpoint),
-            f"hypotheses  {len(self.hypotheses)}" + (f", {self.ambiguous}" if self.ambiguous else ""),
+            "viewpoint   azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(
+                *self.viewpoint
+            ),
+            f"hypotheses  {len(self.hypotheses)}"
+            + (f", {self.ambiguous}" if self.ambiguous else ""),
         ]
-        return "\n".join([*lines, *(f"warning     {text}" for text in (self.warnings + self.notes)[:2])])
+        return "\n".join(
+            [*lines, *(f"warning     {text}" for text in (self.warnings + self.notes)[:2])]
+        )
 
     def _repr_html_(self) -> str:
         """For notebooks."""
@@ -290,7 +335,8 @@ class Registration:
         return self.hypotheses[0].standard_deviations if self.reliable else None
 
     def to_dict(self) -> dict[str, Any]:
-        """Pose, scores and uncertainty as JSON values, under the keys of ``result.json`` (docs/results.md)."""
+        """Pose, scores and uncertainty as JSON values, under the keys of ``result.json``
+        (docs/results.md)."""
         deviations = self.standard_deviations
         document = {
             **self.hypotheses[0].pose_dict(),
@@ -316,7 +362,12 @@ class Registration:
         for one in self.hypotheses:
             terms = {name: float(raw[0, one.view]) for name, raw in self.ranking.terms.items()}
             terms = {name: value for name, value in terms.items() if math.isfinite(value)}
-            more = {"score": one.score, "evidence": dict(one.evidence), "view": one.view, "terms": terms}
+            more = {
+                "score": one.score,
+                "evidence": dict(one.evidence),
+                "view": one.view,
+                "terms": terms,
+            }
             document["top"].append({**one.pose_dict(), **more})
         if self.prior is not None:
             document["prior"] = {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
@@ -336,7 +387,8 @@ def _finite(deviations: Tensor) -> list[float | None]:
 
 @dataclass(frozen=True)
 class FailedRegistration:
-    """A photograph that could not be registered because of its ``error``, which access to a pose raises."""
+    """A photograph that could not be registered because of its ``error``, which access to a pose
+    raises."""
 
     error: CurviregError
 
@@ -349,9 +401,9 @@ class FailedRegistration:
 
 
 def ambiguity(rotations: Tensor) -> str | None:
-    """How poses (K, 3, 3) differ, in words; None for a single one. "half turn": by a rotation of nearly 180 degrees;
-    "mirror": they are seen from directions that are mirror images at a coordinate plane of the mesh; "several":
-    anything else, or more than two."""
+    """How poses (K, 3, 3) differ, in words; None for a single one. "half turn": by a rotation of
+    nearly 180 degrees; "mirror": they are seen from directions that are mirror images at a
+    coordinate plane of the mesh; "several": anything else, or more than two."""
     if len(rotations) < 2:
         return None
     if len(rotations) > 2:
@@ -359,13 +411,17 @@ def ambiguity(rotations: Tensor) -> str | None:
     first, second = rotations.double()
     if float(rotation_error(first, second)) >= HALF_TURN:
         return "half turn"
-    mirrored = first[2] * (1.0 - 2.0 * torch.eye(3, dtype=torch.float64))  # the optical axis at the three planes
+    # the optical axis at the three planes
+    mirrored = first[2] * (1.0 - 2.0 * torch.eye(3, dtype=torch.float64))
     angles = torch.rad2deg((mirrored @ second[2]).clamp(-1.0, 1.0).acos())
     return "mirror" if float(angles.min()) <= MIRROR_ANGLE else "several"
 
 
-def result_document(result: Registration, registrar: "Registrar", seconds: Mapping[str, float]) -> dict[str, Any]:
-    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank`` and ``register``."""
+def result_document(
+    result: Registration, registrar: "Registrar", seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank``
+    and ``register``."""
     registrar = registrar.of_model(result.model)
     bank = registrar.bank
     symmetries = registrar.symmetries_of(exact=registrar.is_exact)
@@ -392,7 +448,12 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
     """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
     found = [(result, result.detection) for result in results if result.detection is not None]
     instances = [
-        {"box": at.box.tolist(), "score": at.score, "confidence": result.confidence, **result.hypotheses[0].pose_dict()}
+        {
+            "box": at.box.tolist(),
+            "score": at.score,
+            "confidence": result.confidence,
+            **result.hypotheses[0].pose_dict(),
+        }
         for result, at in found
     ]
     return {**places_document(found[0][1]), "instances": instances}
@@ -401,7 +462,10 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
 def places_document(detection: Detection) -> dict[str, Any]:
     """Where the object may be: the first place's score, and all proposals."""
     pairs = zip(detection.boxes, detection.responses, strict=True)
-    return {"score": detection.score, "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs]}
+    return {
+        "score": detection.score,
+        "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs],
+    }
 
 
 def two_decimals(probability: float) -> str:
@@ -420,8 +484,10 @@ def corners(box: Sequence[float]) -> str:
 
 
 def remarks(document: Mapping[str, Any]) -> list[str]:
-    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a symmetric mesh."""
-    box, contradiction = document["corrected_box"], document.get("prior", {}).get("contradiction")
+    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a
+    symmetric mesh."""
+    box = document["corrected_box"]
+    contradiction = document.get("prior", {}).get("contradiction")
     lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
     if contradiction == "better outside":
         lines.append("the photograph fits much better outside the limits on the pose; check them")
@@ -433,7 +499,8 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
 
 
 def camera_in_words(document: Mapping[str, Any]) -> list[str]:
-    """A line about a camera that was not given exactly: where it is from, and how well its focal length is known."""
+    """A line about a camera that was not given exactly: where it is from, and how well its focal
+    length is known."""
     camera = document["camera"]
     if camera is None or not camera["focal_deviation"]:
         return []
@@ -445,32 +512,48 @@ def camera_in_words(document: Mapping[str, Any]) -> list[str]:
     known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
     if camera["source"] == "given":
         return [f"camera: field of view given, focal length {known}"]
-    weak = ", as perspective is too weak to measure it" if camera["focal_deviation"] > WEAK_PERSPECTIVE else ""
+    weak = (
+        ", as perspective is too weak to measure it"
+        if camera["focal_deviation"] > WEAK_PERSPECTIVE
+        else ""
+    )
     return [f"camera: focal length estimated, {known}{weak}"]
 
 
 def view_in_words(view: Mapping[str, Any]) -> str:
-    """Why a photograph of several, one of a document's ``views``, does not count, or how much it does; empty if its
-    pose was set by hand, so that nobody has compared it."""
+    """Why a photograph of several, one of a document's ``views``, does not count, or how much it
+    does; empty if its pose was set by hand, so that nobody has compared it."""
     counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"
     return view["failure"] or counts
 
 
 def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
-    """Return "likely" for a reliable answer, "no match" if none of them is more probable than it, else "unsure"."""
+    """Return "likely" for a reliable answer, "no match" if none of them is more probable than it,
+    else "unsure"."""
     if reliable:
         return "likely"
-    return "no match" if probability is not None and none is not None and none > probability else "unsure"
+    return (
+        "no match"
+        if probability is not None and none is not None and none > probability
+        else "unsure"
+    )
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left (azimuth 310°), 20°
-    above the horizon"; ``up`` and ``front`` are axes of the mesh, see :func:`.object_frame`."""
+    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left
+    (azimuth 310°), 20° above the horizon"; ``up`` and ``front`` are axes of the mesh, see
+    :func:`.object_frame`."""
     R = rotation.detach().cpu().double()
-    azimuth, elevation, theta = (round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT))
+    azimuth, elevation, theta = (
+        round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT)
+    )
     side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"
     if abs(elevation) > STEEP_ELEVATION:
         side = "above" if elevation > 0 else "below"
-    height = f"{abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon" if elevation else "level"
+    height = (
+        f"{abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
+        if elevation
+        else "level"
+    )
     tilt = f", tilted by {abs(theta)}° to the {'left' if theta > 0 else 'right'}" if theta else ""
     return f"seen from {side} (azimuth {azimuth % 360}°), {height}{tilt}"

@@ -1,4 +1,5 @@
-"""Photographs of one object by cameras with known poses: world poses are fitted and compared in all of them."""
+"""Photographs of one object by cameras with known poses: world poses are fitted and compared in all
+of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,13 +18,25 @@ from ..geometry.crops import box_iou
 from ..rendering.contours import ContourPoints
 from ..terms import QueryFeatures, crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
-from .contour_fit import FIRST_RADII, FULL_SIZE_RADII, QUARTER_SIZE_RADII, ContourProblem, ContourState
+from .contour_fit import (
+    FIRST_RADII,
+    FULL_SIZE_RADII,
+    QUARTER_SIZE_RADII,
+    ContourProblem,
+    ContourState,
+)
 from .details import compare_details
 from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
 from .landmarks import LandmarkMatches
 from .least_squares import Measurements, pose_covariance
-from .poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS, compare_with_photograph, landmark_evidence
+from .poses import (
+    POSE_FEATURES,
+    RANK_ALONE,
+    SCORE_WEIGHTS,
+    compare_with_photograph,
+    landmark_evidence,
+)
 from .refinement import LOST_CONFIDENCE, nearest_view
 from .result import Hypothesis, Registration
 from .tracker import boxes_at
@@ -31,30 +44,39 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-# World poses that are fitted in all photographs, those whose evidence is compared, and those fitted at full size
-FITTED_CANDIDATES, JUDGED_CANDIDATES, FINISHED_CANDIDATES = 6, 4, 2
-# Degrees, and shift in object radii, within which two candidates count as one; the best view of the bank so near to a
-# pose stands for it
-SAME_ANGLE, SAME_SHIFT = 15.0, 0.5
-# Standard deviations of an object's place from one photograph: along its ray and across it, as fractions of the
-# distance, and across it in object radii
-DEPTH_ERROR, RIG_ERROR, CENTRE_ERROR = 0.08, 0.01, 0.1
-MAX_PLACE_DISTANCE = 16.0  # Squared Mahalanobis distance up to which two photographs see the object in the same place
+# World poses that are fitted in all photographs, those whose evidence is compared, and those fitted
+# at full size
+FITTED_CANDIDATES = 6
+JUDGED_CANDIDATES = 4
+FINISHED_CANDIDATES = 2
+# Degrees, and shift in object radii, within which two candidates count as one; the best view of the
+# bank so near to a pose stands for it
+SAME_ANGLE = 15.0
+SAME_SHIFT = 0.5
+# Standard deviations of an object's place from one photograph: along its ray and across it, as
+# fractions of the distance, and across it in object radii
+DEPTH_ERROR = 0.08
+RIG_ERROR = 0.01
+CENTRE_ERROR = 0.1
+# Squared Mahalanobis distance up to which two photographs see the object in the same place
+MAX_PLACE_DISTANCE = 16.0
 MIN_OVERLAP = 0.3  # Overlap (IoU) with the box of a photograph below which a pose lies elsewhere
 # Degrees within which two photographs show partly the same; the weights of equal ones add up to one
 SAME_DIRECTION = 30.0
-# Root mean square sine of the angles between rays from which they tell a distance, and the factor between that and the
-# distance from the object's size that is a mistake in the unit
-MIN_PARALLAX, MAX_UNIT_FACTOR = 0.03, 30.0
+# Root mean square sine of the angles between rays from which they tell a distance, and the factor
+# between that and the distance from the object's size that is a mistake in the unit
+MIN_PARALLAX = 0.03
+MAX_UNIT_FACTOR = 30.0
 ELSEWHERE = "where the other photographs have the object, it lies outside this one or its box"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigProblem(ContourProblem):
-    """Poses of several photographs: those with the same number in ``group`` (N,) are one pose in the world, seen by
-    cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera: the result does not depend on those of
-    the world. Each photograph alone found ``alone`` (N, 4, 4), with a precision whose root is ``root`` (N, 6, 6): it
-    may know more than its contours tell, such as the rotation of a can by its label."""
+    """Poses of several photographs: those with the same number in ``group`` (N,) are one pose in
+    the world, seen by cameras with ``axes`` (N, 3, 3), rotations from the axes of the first camera:
+    the result does not depend on those of the world. Each photograph alone found ``alone`` (N, 4,
+    4), with a precision whose root is ``root`` (N, 6, 6): it may know more than its contours tell,
+    such as the rotation of a can by its label."""
 
     axes: Tensor
     group: Tensor
@@ -65,13 +87,17 @@ class RigProblem(ContourProblem):
         names = ("image_index", "K", "axes", "group", "alone", "root")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
-    def step(self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()) -> Tensor:
-        scale, distance = self.size / CROP_SIZE, self.gaps(T)
+    def step(
+        self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()
+    ) -> Tensor:
+        scale = self.size / CROP_SIZE
+        distance = self.gaps(T)
         known = Measurements(scale * self.root, scale * distance, torch.ones_like(distance))
         return super().step(points, T, radius, [*others, known])
 
     def gaps(self, T: Tensor) -> Tensor:
-        """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of these."""
+        """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of
+        these."""
         turn = axis_angle_from_rotation(self.alone[:, :3, :3] @ T[:, :3, :3].mT)
         shift = (self.alone - T)[:, :3, :3] @ self.centre + (self.alone - T)[:, :3, 3]
         return self.root @ torch.cat([turn, shift], dim=1)[..., None]
@@ -83,7 +109,9 @@ class RigProblem(ContourProblem):
 
     def step_fraction(self, step: Tensor, T: Tensor) -> Tensor:
         least = T.new_ones(int(self.group.max()) + 1)
-        return least.scatter_reduce(0, self.group, super().step_fraction(step, T), "amin")[self.group]
+        return least.scatter_reduce(0, self.group, super().step_fraction(step, T), "amin")[
+            self.group
+        ]
 
     def summed(self, x: Tensor) -> Tensor:
         """(G, ...) sums of (N, ...) over the photographs of each pose."""
@@ -97,8 +125,9 @@ def in_frames(axes: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class RigPhotograph:
-    """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and ``size``; the ``box``
-    (4,) in which poses are compared, the crops of it, its landmarks, and the registration of it alone."""
+    """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and
+    ``size``; the ``box`` (4,) in which poses are compared, the crops of it, its landmarks, and the
+    registration of it alone."""
 
     index: int
     camera: Tensor
@@ -116,8 +145,12 @@ class RigPhotograph:
         registrar: "Registrar", item: ImageItem, result: Registration, index: int, camera: Tensor
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
-        settings, boxes, image = registrar.bank.settings, box.float()[None], item.image.expand(3, -1, -1)
-        crop = crop_regions([image], boxes[:, None], size=settings.image_size, margin=settings.margin)[:, 0].float()
+        settings = registrar.bank.settings
+        boxes = box.float()[None]
+        image = item.image.expand(3, -1, -1)
+        crop = crop_regions(
+            [image], boxes[:, None], size=settings.image_size, margin=settings.margin
+        )[:, 0].float()
         query = registrar.matcher.features(crop.to(registrar.bank.device))
         mask = registrar.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
@@ -136,7 +169,9 @@ class RigPhotograph:
     @property
     def poses(self) -> Tensor:
         """(H, 4, 4) ``T_world_from_model`` of its hypotheses."""
-        poses: Tensor = torch.linalg.inv(self.camera) @ torch.stack([h.projection[0] for h in self.result.hypotheses])
+        poses: Tensor = torch.linalg.inv(self.camera) @ torch.stack(
+            [h.projection[0] for h in self.result.hypotheses]
+        )
         return poses
 
     def sees(self, hull: Tensor, T: Tensor) -> Tensor:
@@ -145,13 +180,14 @@ class RigPhotograph:
         return visible & (box_iou(boxes, self.box[None].to(boxes))[:, 0] >= MIN_OVERLAP)
 
 
-Found = dict[int, RigPhotograph | CurviregError]  # Photographs of a rig by their index, or why they failed
+# Photographs of a rig by their index, or why they failed
+Found = dict[int, RigPhotograph | CurviregError]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """M candidate poses in the world, best first, with evidence (V, M, F) and scores (V, M) in V photographs, and
-    covariances (M, 6, 6), NaN where unfinished."""
+    """M candidate poses in the world, best first, with evidence (V, M, F) and scores (V, M) in V
+    photographs, and covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
     evidence: Tensor
@@ -163,10 +199,14 @@ class Rig:
     """Photographs of one object, whose poses are compared in all of them."""
 
     def __init__(self, registrar: "Registrar", photographs: Sequence[RigPhotograph]) -> None:
-        self.registrar, self.describer, self.photographs = registrar, registrar.describer, photographs
+        self.registrar = registrar
+        self.describer = registrar.describer
+        self.photographs = photographs
         self.exact = registrar.is_exact
         symmetries = registrar.symmetries_of(exact=self.exact)
-        self.symmetries = torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
+        self.symmetries = (
+            torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
+        )
         self.cameras = torch.stack([p.camera for p in photographs])
         self.eyes = -(self.cameras[:, :3, :3].mT @ self.cameras[:, :3, 3:])[..., 0]
 
@@ -175,25 +215,33 @@ class Rig:
         """The photographs that were registered, if there are any, in the unit of the mesh."""
         usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
         if not usable:
-            reasons = [f"image {i}: {one.message}" for i, one in found.items() if isinstance(one, CurviregError)]
+            reasons = [
+                f"image {i}: {one.message}"
+                for i, one in found.items()
+                if isinstance(one, CurviregError)
+            ]
             raise InvalidInputError(f"no photograph can be registered: {'; '.join(reasons)}")
         rig = Rig(registrar, usable)
         rig.check_unit()
         return rig
 
     def check_unit(self) -> None:
-        """Refuse cameras whose rays meet much nearer or farther than the size of the object says."""
+        """Refuse cameras whose rays meet much nearer or farther than the size of the object
+        says."""
         rays = self.places[0] - self.eyes
         distance = torch.linalg.vector_norm(rays, dim=1)
         rays = rays / distance[:, None]
         across = torch.eye(3).double() - rays[:, :, None] * rays[:, None]
         if float(torch.linalg.eigvalsh(across.mean(dim=0))[0]) < MIN_PARALLAX**2:
             return
-        meeting = torch.linalg.solve(across.sum(dim=0), (across @ self.eyes[..., None]).sum(dim=0))[:, 0]
+        meeting = torch.linalg.solve(across.sum(dim=0), (across @ self.eyes[..., None]).sum(dim=0))[
+            :, 0
+        ]
         factor = ((meeting - self.eyes) * rays).sum(dim=1).abs() / distance
         if float(factor.min()) > MAX_UNIT_FACTOR or float(factor.max()) < 1.0 / MAX_UNIT_FACTOR:
             raise InvalidInputError(
-                f"T_cam_from_world: by its size the object is {float(distance[0]):.3g} away, by the cameras' rays "
+                f"T_cam_from_world: by its size the object is {float(distance[0]):.3g} away, by "
+                f"the cameras' rays "
                 f"{float(factor[0] * distance[0]):.3g}; give translations in the mesh's unit",
                 subject=f"image {self.photographs[0].index}",
             )
@@ -205,24 +253,30 @@ class Rig:
 
     @cached_property
     def places(self) -> tuple[Tensor, Tensor]:
-        """The object's centre (V, 3) from each photograph alone, and its precision, see :meth:`precision`."""
+        """The object's centre (V, 3) from each photograph alone, and its precision, see
+        :meth:`precision`."""
         place = self.centres(torch.stack([p.poses[0] for p in self.photographs]))
         return place, self.precision(place, torch.arange(len(place)))
 
     def precision(self, place: Tensor, source: Tensor) -> Tensor:
-        """(N, 3, 3) inverse covariances of centres (N, 3) that photographs ``source`` (N,) alone tell."""
+        """(N, 3, 3) inverse covariances of centres (N, 3) that photographs ``source`` (N,) alone
+        tell."""
         ray = place - self.eyes[source]
         distance = torch.linalg.vector_norm(ray, dim=1)[:, None, None]
         along = (ray[:, :, None] * ray[:, None]) / distance**2
         across = (CENTRE_ERROR * self.describer.radius) ** 2 + (RIG_ERROR * distance) ** 2
-        precision: Tensor = (torch.eye(3).double() - along) / across + along / (DEPTH_ERROR * distance) ** 2
+        precision: Tensor = (torch.eye(3).double() - along) / across + along / (
+            DEPTH_ERROR * distance
+        ) ** 2
         return precision
 
     def candidates(self) -> Tensor:
-        """(M, 4, 4) distinct world poses of all hypotheses, moved to where the photographs agree that the object is,
-        most promising first."""
+        """(M, 4, 4) distinct world poses of all hypotheses, moved to where the photographs agree
+        that the object is, most promising first."""
         T = torch.cat([p.poses for p in self.photographs])
-        source = torch.tensor([v for v, p in enumerate(self.photographs) for _ in p.result.hypotheses])
+        source = torch.tensor(
+            [v for v, p in enumerate(self.photographs) for _ in p.result.hypotheses]
+        )
         place, (others, theirs) = self.centres(T), self.places
         own = self.precision(place, source)
         gap = (place[:, None] - others)[..., None]
@@ -236,7 +290,8 @@ class Rig:
         return T[self.distinct(T, _bounded(self.ranks(T)).sum(dim=0))[:FITTED_CANDIDATES]]
 
     def distinct(self, T: Tensor, score: Tensor) -> Tensor:
-        """Indices of world poses, best first, without those that are nearly equal to a better one."""
+        """Indices of world poses, best first, without those that are nearly equal to a better
+        one."""
         kept: list[int] = []
         place = self.centres(T)
         for k in score.argsort(descending=True, stable=True).tolist():
@@ -247,14 +302,18 @@ class Rig:
         return torch.tensor(kept)
 
     def angles(self, R: Tensor, others: Tensor) -> Tensor:
-        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to symmetries."""
-        R, others = R[:, :3, :3], others[:, :3, :3]
+        """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to
+        symmetries."""
+        R = R[:, :3, :3]
+        others = others[:, :3, :3]
         traces = ((R[:, None] @ self.symmetries).flatten(2) @ others.flatten(1).T).amax(dim=1)
         return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
 
     def ranks(self, T: Tensor) -> Tensor:
-        """(V, M) log S of the best view of the bank near world poses, minus that of the best view of all."""
-        ranks, views = [], self.registrar.bank.rotations.cpu().double()
+        """(V, M) log S of the best view of the bank near world poses, minus that of the best view
+        of all."""
+        ranks = []
+        views = self.registrar.bank.rotations.cpu().double()
         for photograph in self.photographs:
             scores = photograph.result.ranking.scores[0].cpu().double()
             log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
@@ -264,7 +323,8 @@ class Rig:
         return torch.stack(ranks)
 
     def allocentric(self, photograph: RigPhotograph, T: Tensor) -> tuple[Tensor, Tensor]:
-        """Rotations (M, 3, 3) as seen by a camera that looks straight at the object, and its distances (M,)."""
+        """Rotations (M, 3, 3) as seen by a camera that looks straight at the object, and its
+        distances (M,)."""
         position = self.centres(photograph.camera @ T)
         R = rotation_towards(position).mT @ photograph.camera[:3, :3] @ T[:, :3, :3]
         return R, torch.linalg.vector_norm(position, dim=1)
@@ -273,13 +333,20 @@ class Rig:
     def problems(self) -> list[ContourProblem]:
         """A pose in each photograph: at full size, half of it, and a quarter."""
         crops = EdgeCrops.cat([p.crops for p in self.photographs])
-        K, index = torch.stack([p.K for p in self.photographs]), torch.arange(len(self.photographs))
-        return [ContourProblem.of(self.describer.contours, crops, K, index, factor=factor) for factor in (1, 2, 4)]
+        K = torch.stack([p.K for p in self.photographs])
+        index = torch.arange(len(self.photographs))
+        return [
+            ContourProblem.of(self.describer.contours, crops, K, index, factor=factor)
+            for factor in (1, 2, 4)
+        ]
 
     def tied(self, problem: ContourProblem, T: Tensor) -> tuple[RigProblem, Tensor]:
-        """The problem of M world poses in all photographs, and their poses (M V, 4, 4) in the cameras."""
-        M, V = len(T), len(self.photographs)
-        every, pose = torch.arange(V).repeat(M), torch.arange(M).repeat_interleave(V)
+        """The problem of M world poses in all photographs, and their poses (M V, 4, 4) in the
+        cameras."""
+        M = len(T)
+        V = len(self.photographs)
+        every = torch.arange(V).repeat(M)
+        pose = torch.arange(M).repeat_interleave(V)
         cams = self.cameras[every] @ T[pose]
         alone, covariance = self.found_alone(cams, every)
         # From errors of the model's origin to those of the object's centre.
@@ -288,22 +355,31 @@ class Rig:
         values, vectors = torch.linalg.eigh(lever.mT @ _inverse(covariance) @ lever)
         root = (vectors * values.clamp(min=0.0).sqrt()[:, None]).mT
         axes = (self.cameras[:, :3, :3] @ self.cameras[0, :3, :3].mT)[every]
-        return RigProblem(**vars(problem[every]), axes=axes, group=pose, alone=alone, root=root), cams
+        return RigProblem(
+            **vars(problem[every]), axes=axes, group=pose, alone=alone, root=root
+        ), cams
 
     def found_alone(self, cams: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        """The poses (N, 4, 4) nearest to given ones that photographs ``source`` (N,) alone found, and their covariances
-        (N, 6, 6): NaN where there is none within ``SAME_ANGLE``."""
-        T, C = cams.clone(), torch.full((len(cams), 6, 6), torch.nan, dtype=torch.float64)
+        """The poses (N, 4, 4) nearest to given ones that photographs ``source`` (N,) alone found,
+        and their covariances (N, 6, 6): NaN where there is none within ``SAME_ANGLE``."""
+        T = cams.clone()
+        C = torch.full((len(cams), 6, 6), torch.nan, dtype=torch.float64)
         for n, (pose, v) in enumerate(zip(cams, source.tolist(), strict=True)):
             for hypothesis in self.photographs[v].result.hypotheses:
-                near = float(rotation_error(hypothesis.projection[0][:3, :3], pose[:3, :3])) <= SAME_ANGLE
+                near = (
+                    float(rotation_error(hypothesis.projection[0][:3, :3], pose[:3, :3]))
+                    <= SAME_ANGLE
+                )
                 if near and hypothesis.covariance is not None and bool(C[n].isnan().all()):
                     T[n], C[n] = hypothesis.projection[0], hypothesis.covariance
         return T, C
 
-    def fitted(self, problem: ContourProblem, T: Tensor, radii: Sequence[float]) -> tuple[Tensor, Tensor, ContourState]:
-        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If the fit does not
-        improve the support of all photographs together, the initial pose is kept."""
+    def fitted(
+        self, problem: ContourProblem, T: Tensor, radii: Sequence[float]
+    ) -> tuple[Tensor, Tensor, ContourState]:
+        """World poses (M, 4, 4) after a joint fit, their edge supports (V, M), and their state. If
+        the fit does not improve the support of all photographs together, the initial pose is
+        kept."""
         (each, cams), V = self.tied(problem, T), len(self.photographs)
         start = each.state(cams)
         found = each.descend(start, radii)
@@ -314,16 +390,19 @@ class Rig:
         return torch.linalg.inv(self.cameras[0]) @ state.T[::V], support, state
 
     def answer(self) -> Answer:
-        """Candidates, fitted in all photographs and ordered by the sum of their scores; the hypotheses of one."""
+        """Candidates, fitted in all photographs and ordered by the sum of their scores; the
+        hypotheses of one."""
         if len(self.photographs) == 1:
             return self.hypotheses_of_one()
         full, half, quarter = self.problems
         T = self.candidates()
-        moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)  # for those that are far off; the others lose by it
+        # for those that are far off; the others lose by it
+        moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)
         T, support, _ = self.fitted(half, torch.cat([T, moved]), FIRST_RADII)
         promising = (SCORE_WEIGHTS[2] * support + _bounded(self.ranks(T))).sum(dim=0)
         chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
-        T, support = T[chosen], support[:, chosen]
+        T = T[chosen]
+        support = support[:, chosen]
         best = min(FINISHED_CANDIDATES, len(T))
         T[:best], support[:, :best], state = self.fitted(full, T[:best], FULL_SIZE_RADII)
         covariance = torch.full((len(T), 6, 6), torch.nan, dtype=torch.float64)
@@ -337,38 +416,48 @@ class Rig:
     def hypotheses_of_one(self) -> Answer:
         (photograph,) = self.photographs
         found = photograph.result.hypotheses
-        evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in found]).double()[None]
-        P, unknown = in_frames(self.cameras[:, :3, :3]), torch.full((6, 6), torch.nan).double()
+        evidence = torch.tensor(
+            [[h.evidence[name] for name in POSE_FEATURES] for h in found]
+        ).double()[None]
+        P = in_frames(self.cameras[:, :3, :3])
+        unknown = torch.full((6, 6), torch.nan).double()
         C = torch.stack([unknown if h.covariance is None else h.covariance for h in found])
         return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
-        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that found alone. They
-        are larger where the photographs alone contradict the joint pose, by the mean of their squared gaps: the
-        cameras' poses have errors."""
+        """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that
+        found alone. They are larger where the photographs alone contradict the joint pose, by the
+        mean of their squared gaps: the cameras' poses have errors."""
         each, cams = self.tied(self.problems[0], T)
-        measured, radius = each.measured_edges(state, FULL_SIZE_RADII[-1]), self.describer.radius
-        seen, _ = pose_covariance(measured, state.points, state.T, each.K, each.centre, radius=radius)
+        measured = each.measured_edges(state, FULL_SIZE_RADII[-1])
+        radius = self.describer.radius
+        seen, _ = pose_covariance(
+            measured, state.points, state.T, each.K, each.centre, radius=radius
+        )
         every = torch.arange(len(self.photographs)).repeat(len(T))
         _, alone = self.found_alone(cams, every)
         known = alone.isfinite().all(dim=-1).all(dim=-1)
         better = ~(alone.logdet() >= seen.logdet()) & known
         precision = _inverse(torch.where(better[:, None, None], alone, seen))
-        weights, P = torch.cat([self.weights(one) for one in T]), in_frames(self.cameras[every, :3, :3])
-        covariance: Tensor = torch.linalg.inv(each.summed(weights[:, None, None] * (P.mT @ precision @ P)))
+        weights = torch.cat([self.weights(one) for one in T])
+        P = in_frames(self.cameras[every, :3, :3])
+        covariance: Tensor = torch.linalg.inv(
+            each.summed(weights[:, None, None] * (P.mT @ precision @ P))
+        )
         freedom = 6.0 * each.summed(known.double()) - 6.0
         misfit = each.summed(each.gaps(state.T).square().sum(dim=(1, 2))) / freedom.clamp(min=6.0)
         return covariance * misfit.clamp(min=1.0)[:, None, None]
 
     def weights(self, T: Tensor) -> Tensor:
-        """(V,) in (0, 1] weights of photographs: those from nearly the same side of a world pose (4, 4) share one."""
+        """(V,) in (0, 1] weights of photographs: those from nearly the same side of a world pose
+        (4, 4) share one."""
         side = F.normalize(self.eyes - self.centres(T[None]), dim=1)
         angle = torch.rad2deg((side @ side.T).clamp(-1.0, 1.0).acos())
         return 1.0 / (1.0 - angle / SAME_DIRECTION).clamp(min=0.0).fill_diagonal_(1.0).sum(dim=1)
 
     def evidence(self, T: Tensor, support: Tensor) -> Tensor:
-        """(V, M, F) :data:`POSE_FEATURES` of world poses with edge supports (V, M); details in comparison with the
-        first."""
+        """(V, M, F) :data:`POSE_FEATURES` of world poses with edge supports (V, M); details in
+        comparison with the first."""
         parts = []
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
@@ -377,20 +466,29 @@ class Rig:
             landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
-            parts.append(torch.stack([similarity, appearance, landmarks, self.details(photograph, T)]))
+            parts.append(
+                torch.stack([similarity, appearance, landmarks, self.details(photograph, T)])
+            )
         similarity, appearance, landmarks, details = torch.stack(parts, dim=1)
-        return torch.stack([self.ranks(T), similarity, support, appearance, landmarks, details], dim=-1)
+        return torch.stack(
+            [self.ranks(T), similarity, support, appearance, landmarks, details], dim=-1
+        )
 
     def details(self, photograph: RigPhotograph, T: Tensor) -> Tensor:
-        """(M,) how much the details of world poses (M, 4, 4) are better than those of the first in a photograph."""
+        """(M,) how much the details of world poses (M, 4, 4) are better than those of the first in
+        a photograph."""
         K = photograph.K.expand(len(T), 3, 3)
         index = torch.zeros(len(T), dtype=torch.long)
-        scores, _ = compare_details(self.describer.contours, photograph.crops, K, photograph.camera @ T, index)
+        scores, _ = compare_details(
+            self.describer.contours, photograph.crops, K, photograph.camera @ T, index
+        )
         return scores[:, 0]
 
     def scores(self, evidence: Tensor) -> Tensor:
         """(V, M) of (V, M, F)."""
-        return evidence @ torch.tensor(SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64)
+        return evidence @ torch.tensor(
+            SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64
+        )
 
     def lost(self, answer: Answer) -> dict[int, str]:
         """Why photographs do not show the best pose, by their index; {} if none shows it."""
@@ -398,7 +496,9 @@ class Rig:
         pairs = answer.evidence[:, 0, 1:3].tolist()
         sees = [bool(p.sees(self.describer.hull, answer.T[:1])) for p in self.photographs]
         found = [
-            refinement_confidence({"similarity": similarity, "edge_support": support}) if seen else 0.0
+            refinement_confidence({"similarity": similarity, "edge_support": support})
+            if seen
+            else 0.0
             for (similarity, support), seen in zip(pairs, sees, strict=True)
         ]
         for v, photograph in enumerate(self.photographs):
@@ -406,12 +506,16 @@ class Rig:
                 reasons[photograph.index] = ELSEWHERE
             elif found[v] < LOST_CONFIDENCE * max(found):
                 numbers = "similarity {:.2f}, edge support {:.2f}".format(*pairs[v])
-                reasons[photograph.index] = f"the object is not seen where the other photographs have it ({numbers})"
+                reasons[photograph.index] = (
+                    f"the object is not seen where the other photographs have it ({numbers})"
+                )
         return reasons if len(reasons) < len(self.photographs) else {}
 
     def hypothesis(self, answer: Answer, m: int, evidence: Tensor) -> Hypothesis:
         """World pose ``m`` with its mean evidence, as it is reported."""
-        first, T, C = self.photographs[0], answer.T[m], answer.covariance[m]
+        first = self.photographs[0]
+        T = answer.T[m]
+        C = answer.covariance[m]
         (R,), (distance,) = self.allocentric(first, T[None])
         features = dict(zip(POSE_FEATURES, evidence.tolist(), strict=True))
         return Hypothesis(
@@ -432,7 +536,9 @@ def _inverse(covariance: Tensor) -> Tensor:
     """(N, 6, 6) precisions of covariances, nearly 0 where they are unknown (NaN)."""
     known = covariance.isfinite().all(dim=-1).all(dim=-1)[:, None, None]
     none = 1e-12 * torch.eye(6, dtype=torch.float64)
-    return torch.where(known, torch.linalg.inv(torch.where(known, covariance, torch.eye(6).double())), none)
+    return torch.where(
+        known, torch.linalg.inv(torch.where(known, covariance, torch.eye(6).double())), none
+    )
 
 
 def _bounded(scores: Tensor) -> Tensor:

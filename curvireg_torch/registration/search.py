@@ -11,18 +11,20 @@ from ..mesh import mesh_radius
 from ..terms import QueryFeatures
 
 BEST_VIEWS = 3  # "at least the highest three correspondences"
-STOP_MOTION = 0.05  # |T_i^-1 T_(i+1) - Id|_F at which the search stops, translation in object radii (METHOD 6)
+# |T_i^-1 T_(i+1) - Id|_F at which the search stops, translation in object radii (METHOD 6)
+STOP_MOTION = 0.05
 ANGLE_STEP = 5.0  # Degrees, of elevation, azimuth and in-plane rotation in the first round
 DISTANCE_STEP = 0.05 / PAPER_RADIUS  # 5 cm, in object radii
-# Steps of azimuth, elevation and in-plane rotation in degrees within which two views of the paper's grid are
-# neighbours. Elevations run around the whole circle: 50 degrees apart, the last and the first of them 60
+# Steps of azimuth, elevation and in-plane rotation in degrees within which two views of the paper's
+# grid are neighbours. Elevations run around the whole circle: 50 degrees apart, the last and the
+# first of them 60
 NEIGHBOUR_STEPS = (20.0, 60.0, 20.0)
 MAX_ROUNDS = 8
 
 
 def angles_near(angles: Tensor, reference: Tensor) -> Tensor:
-    """(N, 3) azimuth, elevation, theta in degrees of the same views as ``angles`` (N, 3), as near ``reference`` (3,) as
-    they can be: past a pole the elevation runs on."""
+    """(N, 3) azimuth, elevation, theta in degrees of the same views as ``angles`` (N, 3), as near
+    ``reference`` (3,) as they can be: past a pole the elevation runs on."""
     turn = torch.tensor([180.0, 180.0, 180.0], dtype=angles.dtype)
     over = turn + angles * torch.tensor([1.0, -1.0, 1.0], dtype=angles.dtype)
     both = torch.stack([angles, over])
@@ -57,8 +59,8 @@ def divided(low: float, high: float, step: float) -> Tensor:
 
 
 def motion(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float:
-    """E = |T^-1 T' - Id|_F of two poses with rotations (3, 3) and the object's centre at distances () in radii on the
-    optical axis."""
+    """E = |T^-1 T' - Id|_F of two poses with rotations (3, 3) and the object's centre at distances
+    () in radii on the optical axis."""
     R, distance = first
     S, other = second
     turned = R.T @ S - torch.eye(3, dtype=torch.float64)
@@ -68,13 +70,15 @@ def motion(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> float
 
 @torch.no_grad()
 def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tuple[Tensor, Tensor]:
-    """Return the rotation (3, 3) and the distance () in model units, float64, of the view that matches one photograph
-    best, between the least and the greatest angles and distances of the coherent ones of its three best views.
+    """Return the rotation (3, 3) and the distance () in model units, float64, of the view that
+    matches one photograph best, between the least and the greatest angles and distances of the
+    coherent ones of its three best views.
 
-    Every round compares all views of a grid, :data:`ANGLE_STEP` and :data:`DISTANCE_STEP` wide at first and half as
-    wide in each further round (the paper does not say how they go on), between the coherent views of the round before.
-    The search ends where the best pose moves by :data:`STOP_MOTION` or less. An orthographic camera does not see the
-    distance: views that differ in nothing else count as one, and that of the best view stays.
+    Every round compares all views of a grid, :data:`ANGLE_STEP` and :data:`DISTANCE_STEP` wide at
+    first and half as wide in each further round (the paper does not say how they go on), between
+    the coherent views of the round before. The search ends where the best pose moves by
+    :data:`STOP_MOTION` or less. An orthographic camera does not see the distance: views that differ
+    in nothing else count as one, and that of the best view stays.
     """
     bank = matcher.bank
     frame = view_frame(bank.mesh, bank.pipeline.views)
@@ -85,16 +89,22 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
     rotations = bank.rotations.cpu().double() @ frame.T
     distances = bank.views.distance.cpu().double()
     angles = torch.stack(viewpoint_from_rotation(rotations), dim=1)
-    steps, width, farther = NEIGHBOUR_STEPS, ANGLE_STEP, DISTANCE_STEP
+    steps = NEIGHBOUR_STEPS
+    width = ANGLE_STEP
+    farther = DISTANCE_STEP
     pose = rotations[order[0]], distances[order[0]]
     for _ in range(MAX_ROUNDS):
         best = order[:BEST_VIEWS] if perspective else different_views(rotations, order, BEST_VIEWS)
         near = angles_near(angles[best], angles[best[0]])
         coherent = coherent_views(near, steps)
-        chosen, away = near[coherent], distances[best[coherent]]
-        low, high = chosen.amin(dim=0).tolist(), chosen.amax(dim=0).tolist()
+        chosen = near[coherent]
+        away = distances[best[coherent]]
+        low = chosen.amin(dim=0).tolist()
+        high = chosen.amax(dim=0).tolist()
         axes = [divided(a, b, width) for a, b in zip(low, high, strict=True)]
-        axes.append(divided(float(away.min()), float(away.max()), farther) if perspective else pose[1][None])
+        axes.append(
+            divided(float(away.min()), float(away.max()), farther) if perspective else pose[1][None]
+        )
         *columns, distances = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
         angles = torch.stack(columns, dim=1)
         rotations = rotation_from_viewpoint(*columns)
@@ -107,12 +117,14 @@ def search(matcher: ViewMatcher, query: QueryFeatures, ranking: Ranking) -> tupl
         if moved <= STOP_MOTION:
             break
         steps = (width, width, width)
-        width, farther = width / 2.0, farther / 2.0
+        width = width / 2.0
+        farther = farther / 2.0
     return pose[0] @ frame, pose[1] * mesh_radius(bank.mesh)
 
 
 def different_views(rotations: Tensor, order: Tensor, count: int) -> Tensor:
-    """(K,) the first ``count`` views of ``order`` (N,) whose rotations (N, 3, 3) differ; fewer if there are no more."""
+    """(K,) the first ``count`` views of ``order`` (N,) whose rotations (N, 3, 3) differ; fewer if
+    there are no more."""
     chosen: list[int] = []
     for view in order.tolist():
         if all(float((rotations[view] - rotations[other]).abs().max()) > 1e-4 for other in chosen):

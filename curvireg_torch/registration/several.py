@@ -1,4 +1,5 @@
-"""One pose from several photographs: each is registered alone, then candidates are compared in all of them."""
+"""One pose from several photographs: each is registered alone, then candidates are compared in all
+of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +20,15 @@ from .confidence import (
 )
 from .detection import detect
 from .framing import border_sides, outside_fraction
-from .inputs import ImageItem, OnDemand, check_cameras, copies_of, image_items, is_missing, rig_cameras
+from .inputs import (
+    ImageItem,
+    OnDemand,
+    check_cameras,
+    copies_of,
+    image_items,
+    is_missing,
+    rig_cameras,
+)
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
 from .tracker import boxes_at
@@ -27,44 +36,52 @@ from .tracker import boxes_at
 if TYPE_CHECKING:
     from .registrar import Registrar
 
-JOINT_HYPOTHESES = 5  # Hypotheses of each photograph that are compared in all, even if fewer are reported
+# Hypotheses of each photograph that are compared in all, even if fewer are reported
+JOINT_HYPOTHESES = 5
 
 
 @torch.no_grad()
 def register_views(
-    registrar: "Registrar", images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+    registrar: "Registrar",
+    images: Sequence[Any],
+    boxes: Any,
+    camera_matrices: Any,
+    T_cam_from_world: Any,
 ) -> Registration:
     """Register several photographs of one object together: one pose in the world.
 
-    Each photograph is registered alone. The hypotheses of all become poses in the world, which are moved to where the
-    photographs agree that the object is, fitted to the contours in all photographs at once, and ordered by the sum of
-    their scores. One photograph lowers a pose by at most five points, and those from nearly the same side share one
-    vote; a copy, from the same place, counts for nothing. A photograph that does not show the best pose is left out,
-    and the others decide again.
+    Each photograph is registered alone. The hypotheses of all become poses in the world, which are
+    moved to where the photographs agree that the object is, fitted to the contours in all
+    photographs at once, and ordered by the sum of their scores. One photograph lowers a pose by at
+    most five points, and those from nearly the same side share one vote; a copy, from the same
+    place, counts for nothing. A photograph that does not show the best pose is left out, and the
+    others decide again.
 
     Args:
         registrar: :class:`Registrar` of the mesh.
         images: V photographs, see :class:`Registrar`.
-        boxes: (V, 4), or a list with None where the poses of the others say where the object is. None: the object is
-            searched for in each photograph.
+        boxes: (V, 4), or a list with None where the poses of the others say where the object is.
+            None: the object is searched for in each photograph.
         camera_matrices: see :class:`Registrar`; needed, or EXIF data that have the focal length.
         T_cam_from_world: (V, 4, 4) rigid poses of the cameras, with lengths in the mesh's unit.
 
     Returns:
-        A registration whose poses are ``T_world_from_model``, whose covariance is along the world's axes, and whose
-        ``views`` have the pose in each photograph. ``projection`` and ``ranking`` are those of the first photograph
-        that counts. The covariance does not know the errors of the cameras; it grows where photographs contradict
-        each other.
+        A registration whose poses are ``T_world_from_model``, whose covariance is along the world's
+        axes, and whose ``views`` have the pose in each photograph. ``projection`` and ``ranking``
+        are those of the first photograph that counts. The covariance does not know the errors of
+        the cameras; it grows where photographs contradict each other.
 
     Raises:
-        InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two photographs that differ
-            come from the same place; or lengths of the cameras and of the mesh have different units.
+        InvalidInputError: no photograph can be registered; a camera's pose is not rigid; two
+            photographs that differ come from the same place; or lengths of the cameras and of the
+            mesh have different units.
 
     Example:
         >>> import curvireg_torch as cr
         >>> scene = cr.synthetic.demo_scene()
         >>> views = cr.sample_views(azimuth_step=20, elevations=[10, 30])
-        >>> registrar = cr.Registrar(cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False))
+        >>> registrar = cr.Registrar(cr.ViewBank.build(scene.mesh, views, image_size=64,
+        ...     progress=False))
         >>> rig = torch.eye(4).double()[None]
         >>> result = registrar.register_views([scene.image], [scene.box], scene.camera_matrix, rig)
         >>> result.transform.shape, len(result.views)
@@ -76,7 +93,11 @@ def register_views(
     items = image_items(images, boxes, camera_matrices)
     cameras = rig_cameras(T_cam_from_world, items)
     copies = copies_of(cameras, items)
-    given = [] if boxes is None else [i for i, box in enumerate(boxes) if not is_missing(box) and i not in copies]
+    given = (
+        []
+        if boxes is None
+        else [i for i, box in enumerate(boxes) if not is_missing(box) and i not in copies]
+    )
     found: Found = {}
     if given:
         found = _registered(registrar, items, cameras, given)
@@ -90,9 +111,12 @@ def register_views(
             elif isinstance(item, ImageItem) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
                 found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
-        if any(isinstance(one, RigPhotograph) for one in found.values()):  # they tell where it is in the others
+        # they tell where it is in the others
+        if any(isinstance(one, RigPhotograph) for one in found.values()):
             found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
-    found |= {i: InvalidInputError(f"a copy of image {j}, which counts once") for i, j in copies.items()}
+    found |= {
+        i: InvalidInputError(f"a copy of image {j}, which counts once") for i, j in copies.items()
+    }
     if missing := [i for i in range(len(items)) if i not in found]:
         where = Rig.of(registrar, found).answer().T[:1]
         found |= _registered(registrar, items, cameras, missing, where)
@@ -106,7 +130,8 @@ def _registered(
     chosen: Sequence[int],
     T: Tensor | None = None,
 ) -> Found:
-    """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1, 4, 4)."""
+    """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1,
+    4, 4)."""
 
     def register(item: ImageItem, k: int) -> RigPhotograph:
         camera = cameras[chosen[k]]
@@ -118,11 +143,17 @@ def _registered(
         return RigPhotograph.of(registrar, item, registrar.register_item(item), chosen[k], camera)
 
     found = registrar.map_items(OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
-    return {i: r.error if isinstance(r, FailedRegistration) else r for i, r in zip(chosen, found, strict=True)}
+    return {
+        i: r.error if isinstance(r, FailedRegistration) else r
+        for i, r in zip(chosen, found, strict=True)
+    }
 
 
-def _registration(registrar: "Registrar", found: Found, cameras: Tensor, count: int) -> Registration:
-    """The joint result of photographs, without those that failed or do not show the best pose; ``count`` hypotheses."""
+def _registration(
+    registrar: "Registrar", found: Found, cameras: Tensor, count: int
+) -> Registration:
+    """The joint result of photographs, without those that failed or do not show the best pose;
+    ``count`` hypotheses."""
     reasons = {i: one.message for i, one in found.items() if isinstance(one, CurviregError)}
     rig = every = Rig.of(registrar, found)
     answer = rig.answer()
@@ -131,11 +162,16 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor, count: 
         reasons |= lost
         rig = Rig(registrar, [p for p in rig.photographs if p.index not in lost])
         answer = rig.answer()
-        compared |= dict(zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True))
-    first, weights = rig.photographs[0], rig.weights(answer.T[0])
-    total, mean = weights @ answer.scores, torch.einsum("v,vmk->mk", weights / weights.sum(), answer.evidence)
+        compared |= dict(
+            zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True)
+        )
+    first = rig.photographs[0]
+    weights = rig.weights(answer.T[0])
+    total = weights @ answer.scores
+    mean = torch.einsum("v,vmk->mk", weights / weights.sum(), answer.evidence)
     features = _joint_features(rig, mean, total, weights, answer)
-    if len(total) == 1 and len(rig.photographs) > 1:  # the hypotheses of all photographs led to the same pose
+    # the hypotheses of all photographs led to the same pose
+    if len(total) == 1 and len(rig.photographs) > 1:
         features["margin"] = MAX_MARGIN
     probabilities = first.result.probabilities
     if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
@@ -151,11 +187,15 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor, count: 
                 odds *= min(1.0, (1.0 - other) / max(other, 1e-9))
         factor = odds / (1.0 + odds) / max(probabilities[0], 1e-9)
         probabilities = tuple(factor * probability for probability in probabilities)
-    margins = weights * (answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN)
+    margins = weights * (
+        answer.scores[:, 0] - answer.scores[:, 1] if len(total) > 1 else MAX_MARGIN
+    )
     contributions = dict(zip([p.index for p in rig.photographs], margins.tolist(), strict=True))
     views = []
     for i, camera in enumerate(cameras):
-        view = PhotographPose(camera @ answer.T[0], failure=reasons.get(i), contribution=contributions.get(i, 0.0))
+        view = PhotographPose(
+            camera @ answer.T[0], failure=reasons.get(i), contribution=contributions.get(i, 0.0)
+        )
         if isinstance(one := found[i], RigPhotograph):
             _, similarity, support, *_ = compared[i].tolist()
             view = replace(view, box=one.box, similarity=similarity, edge_support=support)
@@ -165,17 +205,27 @@ def _registration(registrar: "Registrar", found: Found, cameras: Tensor, count: 
         probabilities=probabilities[:count],
         ranking=first.result.ranking,
         confidence_features=features,
-        warnings=tuple(sorted(set.intersection(*(set(p.result.warnings) for p in rig.photographs)))),
+        warnings=tuple(
+            sorted(set.intersection(*(set(p.result.warnings) for p in rig.photographs)))
+        ),
         notes=first.result.notes,
         views=tuple(views),
     )
 
 
-def _joint_features(rig: Rig, mean: Tensor, total: Tensor, weights: Tensor, answer: Answer) -> dict[str, float | None]:
-    """:func:`.confidence_features` of the joint pose: ``mean`` (M, F) evidence, ``total`` (M,) scores."""
+def _joint_features(
+    rig: Rig, mean: Tensor, total: Tensor, weights: Tensor, answer: Answer
+) -> dict[str, float | None]:
+    """:func:`.confidence_features` of the joint pose: ``mean`` (M, F) evidence, ``total`` (M,)
+    scores."""
     measured = [p.result.confidence_features for p in rig.photographs]
-    known = [features["concentration"] for features in measured if features["concentration"] is not None]
-    outside = [outside_fraction(rig.describer.hull, p.camera @ answer.T[0], p.K, p.size) for p in rig.photographs]
+    known = [
+        features["concentration"] for features in measured if features["concentration"] is not None
+    ]
+    outside = [
+        outside_fraction(rig.describer.hull, p.camera @ answer.T[0], p.K, p.size)
+        for p in rig.photographs
+    ]
     border = [float(border_sides(p.box, p.size)) for p in rig.photographs]
     weights = weights / weights.sum()
     return confidence_features(

@@ -1,4 +1,5 @@
-"""Siblings of a pose: what the symmetries of a mesh's shape make of it, compared where small features differ."""
+"""Siblings of a pose: what the symmetries of a mesh's shape make of it, compared where small
+features differ."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from .judging import Work
     from .registrar import Registrar
 
-MAX_SIBLINGS = 12  # Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
+# Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
+MAX_SIBLINGS = 12
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
 
 
@@ -49,10 +51,13 @@ class Siblings:
         crops: EdgeCrops,
         measure: Callable[[Poses], Tensor],
     ) -> "Siblings":
-        """Siblings of one pose by ``symmetries`` (K, 4, 4), the identity first; ``measure`` gives features."""
+        """Siblings of one pose by ``symmetries`` (K, 4, 4), the identity first; ``measure`` gives
+        features."""
         copies = pose[torch.zeros(len(symmetries), dtype=torch.long)]
         poses = placed(copies, copies.T @ symmetries.to(copies.T), describer.centre)
-        details = compare_details(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+        details = compare_details(
+            describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+        )
         return Siblings(poses, measure(poses), *details)
 
     def gain(self, other: int) -> Tensor:
@@ -67,9 +72,9 @@ class Siblings:
         return best if float(gain[best]) > BETTER else 0
 
     def rival(self, best: int, fitted: Tensor) -> tuple[Poses, Tensor] | None:
-        """The sibling with the highest score among those that look different from the ``best`` one, and its features
-        (1, F): those of the best one as it was ``fitted`` (1, F), plus their difference without a fit. None if all look
-        alike: they are one pose of a symmetric mesh."""
+        """The sibling with the highest score among those that look different from the ``best`` one,
+        and its features (1, F): those of the best one as it was ``fitted`` (1, F), plus their
+        difference without a fit. None if all look alike: they are one pose of a symmetric mesh."""
         angle = rotation_error(self.poses.T[:, :3, :3], self.poses.T[best, :3, :3])
         other = self.look_different[best] & (angle > RIVAL_ANGLE)
         if not bool(other.any()):
@@ -81,8 +86,8 @@ class Siblings:
 
 
 def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
-    """(K, 4, 4) those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the identity, which
-    is the first; at most ``MAX_SIBLINGS``, far from each other."""
+    """(K, 4, 4) those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from
+    the identity, which is the first; at most ``MAX_SIBLINGS``, far from each other."""
     chosen = spread(symmetries)
     telling = feature_fractions(mesh, chosen) > FEATURE_FRACTION
     telling[0] = True
@@ -90,7 +95,8 @@ def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
 
 
 def spread(symmetries: Tensor) -> Tensor:
-    """At most ``MAX_SIBLINGS`` of the symmetries (S, 4, 4), the identity first, far from each other."""
+    """At most ``MAX_SIBLINGS`` of the symmetries (S, 4, 4), the identity first, far from each
+    other."""
     R = symmetries[:, :3, :3].double()
     chosen = [0]
     nearest = rotation_error(R, R[0])
@@ -102,10 +108,16 @@ def spread(symmetries: Tensor) -> Tensor:
 
 
 def with_siblings(
-    registrar: "Registrar", work: "Work", crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    registrar: "Registrar",
+    work: "Work",
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    outside: Tensor,
 ) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
-    """Replace the best pose by what a symmetry of the shape makes of it, if small features say so; and return its
-    strongest rival among these, with its features, unless all of them look alike. Given symmetries are trusted."""
+    """Replace the best pose by what a symmetry of the shape makes of it, if small features say so;
+    and return its strongest rival among these, with its features, unless all of them look alike.
+    Given symmetries are trusted."""
     symmetries = registrar.telling_symmetries
     if len(symmetries) == 1:
         return poses, features, None

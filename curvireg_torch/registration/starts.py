@@ -8,16 +8,21 @@ from torch import Tensor
 from .inputs import MIN_BOX_SIDE
 from .tracker import OUTSIDE, boxes_at
 
-FACTORS = {1000.0: "too small, as metres beside a mesh in mm", 0.001: "too large, as mm beside a mesh in metres"}
+FACTORS = {
+    1000.0: "too small, as metres beside a mesh in mm",
+    0.001: "too large, as mm beside a mesh in metres",
+}
 """Factors between translations and the mesh's unit, and what they mean."""
 
 OPENGL = (
-    "at the start the object lies behind the camera: a pose of OpenGL's camera? Then give --start-convention opengl"
+    "at the start the object lies behind the camera: a pose of OpenGL's camera? Then give "
+    "--start-convention opengl"
 )
 
 
 def why_outside(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> str:
-    """What is probably wrong with a pose (4, 4) at which a mesh is not seen: the message of an error.
+    """What is probably wrong with a pose (4, 4) at which a mesh is not seen: the message of an
+    error.
 
     Args:
         hull: (V, 3) points of the mesh.
@@ -39,7 +44,8 @@ def why_outside(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> st
 
 
 def _is_seen(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> bool:
-    """Whether a mesh fills a sensible part of the photograph: its centre is in it, it is neither tiny nor huge."""
+    """Whether a mesh fills a sensible part of the photograph: its centre is in it, it is neither
+    tiny nor huge."""
     boxes, visible = boxes_at(hull, T[None], K[None], size)
     (x0, y0, x1, y1) = boxes[0].tolist()
     side = max(x1 - x0, y1 - y0)

@@ -15,24 +15,39 @@ from torch import Tensor
 from ..rendering import DepthRenderer
 from ..rendering.contours import ContourPoints
 from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem
-from .least_squares import MIN_MATCHES, Measurements, PointMatches, apply_twist, fit_points, pose_covariance
+from .least_squares import (
+    MIN_MATCHES,
+    Measurements,
+    PointMatches,
+    apply_twist,
+    fit_points,
+    pose_covariance,
+)
 
-# Corners of a view: how many at most, how many px apart at least, and the least strength as a fraction of the strongest
-# one's
-MAX_CORNERS, CORNER_SPACING, CORNER_QUALITY = 160, 5, 0.005
+# Corners of a view: how many at most, how many px apart at least, and the least strength as a
+# fraction of the strongest one's
+MAX_CORNERS = 160
+CORNER_SPACING = 5
+CORNER_QUALITY = 0.005
 HALF_PATCH = 7  # Patches around corners are 15 px wide, and lie within the silhouette
-# Least normalised correlation of matching patches, which have weight 0 there and 1 where they are equal
+# Least normalised correlation of matching patches, which have weight 0 there and 1 where they are
+# equal
 MIN_CORRELATION = 0.4
-# A match has less weight if, more than so many px aside, another one correlates nearly as well: a patch slides along an
-# edge
-RIVAL_DISTANCE, CLEAR_MARGIN = 4, 0.1
+# A match has less weight if, more than so many px aside, another one correlates nearly as well: a
+# patch slides along an edge
+RIVAL_DISTANCE = 4
+CLEAR_MARGIN = 0.1
 # Of the two rounds: the search radius in px, and the scales of robust weights in px, one a step
-FAR_ROUND, NEAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0)), (6, (6.0, 4.0, 2.0))
-# Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the first round and after
-# the second: patches seen from another side are found less exactly than those of the next frame, and correlate less
-PATCH_INLIER_SCALE, PROMISING_RATIO, CONVINCING_RATIO = 4.0, 0.03, 0.15
-# Degrees by which poses are turned both ways about an axis that contours do not determine: within them, the search of
-# the first round reaches
+FAR_ROUND = (30, (32.0, 16.0, 8.0, 4.0))
+NEAR_ROUND = (6, (6.0, 4.0, 2.0))
+# Distance in px at which a corner counts a quarter, and inlier ratios that a pose needs after the
+# first round and after the second: patches seen from another side are found less exactly than those
+# of the next frame, and correlate less
+PATCH_INLIER_SCALE = 4.0
+PROMISING_RATIO = 0.03
+CONVINCING_RATIO = 0.15
+# Degrees by which poses are turned both ways about an axis that contours do not determine: within
+# them, the search of the first round reaches
 TURN = 16.0
 JOINT_STEPS = 3  # Steps of the fit to both corners and edges
 MAX_SUPPORT_LOSS = 0.03  # Edge support that a fit may lose
@@ -42,11 +57,14 @@ Draw = Callable[[Tensor, Tensor, tuple[int, int]], Tensor]
 def surface_corners(
     grey: np.ndarray, depth: Tensor, T: Tensor, K: Tensor, *, quality: float, inside: int
 ) -> tuple[np.ndarray, Tensor]:
-    """Corners of ``grey`` (S, S) uint8, (C, 2) whole px in float32, and the points (1, C, 3) of the model there. They
-    lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at a pose ``T`` (1, 4, 4) with camera
-    ``K`` (1, 3, 3), and have at least ``quality`` times the strength of the strongest."""
+    """Corners of ``grey`` (S, S) uint8, (C, 2) whole px in float32, and the points (1, C, 3) of the
+    model there. They lie ``inside`` px or more within the outline of the ``depth`` (1, 1, S, S) at
+    a pose ``T`` (1, 4, 4) with camera ``K`` (1, 3, 3), and have at least ``quality`` times the
+    strength of the strongest."""
     side = 2 * inside + 1
-    mask = cv2.erode((depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0)
+    mask = cv2.erode(
+        (depth[0, 0] > 0).to(torch.uint8).numpy(), np.ones((side, side), np.uint8), borderValue=0
+    )
     found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, quality, CORNER_SPACING, mask=mask)
     uv = np.zeros((0, 2), np.float32) if found is None else found[:, 0]
     pixel = torch.from_numpy(uv).double()
@@ -66,19 +84,23 @@ def fit_texture(
 ) -> ContourFit | None:
     """Fit one pose to the mesh's colours and to contours together.
 
-    The coloured mesh is drawn at the pose, and patches around its corners are searched in the photograph by normalised
-    correlation. Robust least squares move the pose to where most of them are found, then to the edges as well; a second
-    round searches nearer. The fit counts, and is not None, if in the end more corners are in place than at the start,
-    and enough of them, and the edge support is as before.
+    The coloured mesh is drawn at the pose, and patches around its corners are searched in the
+    photograph by normalised correlation. Robust least squares move the pose to where most of them
+    are found, then to the edges as well; a second round searches nearer. The fit counts, and is not
+    None, if in the end more corners are in place than at the start, and enough of them, and the
+    edge support is as before.
 
-    ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a size (H, W).
-    ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S, S) its crop; ``starts``
-    (N, 4, 4) are the pose whose contours are fitted, and :func:`turned` ones.
+    ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a
+    size (H, W). ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S,
+    S) its crop; ``starts`` (N, 4, 4) are the pose whose contours are fitted, and :func:`turned`
+    ones.
     """
     texture = _TextureRounds(draw, renderer, problem, _as_array(photograph))
     support = problem.edge_support(problem.state(starts[:1]))
     rounds = [texture.round(start, *FAR_ROUND) for start in starts.split(1)]
-    coarse = max((one for one in rounds if one is not None), key=lambda one: one.after, default=None)
+    coarse = max(
+        (one for one in rounds if one is not None), key=lambda one: one.after, default=None
+    )
     if coarse is None or coarse.after < PROMISING_RATIO:
         return None
     fine = texture.round(coarse.T, *NEAR_ROUND)
@@ -95,19 +117,24 @@ def fit_texture(
     axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
     points = ContourPoints(fine.matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
     joined = ContourPoints(
-        *(torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1) for f in fields(ContourPoints))
+        *(
+            torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1)
+            for f in fields(ContourPoints)
+        )
     )
     found = fine.matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
     both = Measurements.cat([problem.measured_edges(state, FULL_SIZE_RADII[-1]), found])
     covariance, observable = pose_covariance(
         both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius
     )
-    return ContourFit(fine.T, covariance, edge_support=after, start_support=support, observable=observable)
+    return ContourFit(
+        fine.T, covariance, edge_support=after, start_support=support, observable=observable
+    )
 
 
 def turned(fit: ContourFit, centre: Tensor) -> Tensor:
-    """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours do not determine,
-    if there is one."""
+    """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours
+    do not determine, if there is one."""
     T = fit.transform
     if int(fit.observable) == 6 or not bool(fit.covariance.isfinite().all()):
         return T
@@ -129,7 +156,8 @@ class _Round:
 
 @dataclass(frozen=True)
 class _TextureRounds:
-    """One ``photograph`` (S, S, 3) float32 of a contour problem, and the means to draw the mesh into it."""
+    """One ``photograph`` (S, S, 3) float32 of a contour problem, and the means to draw the mesh
+    into it."""
 
     draw: Draw
     renderer: DepthRenderer
@@ -138,7 +166,8 @@ class _TextureRounds:
 
     def round(self, start: Tensor, radius: int, scales: tuple[float, ...]) -> _Round | None:
         """None where the view has few corners, or the photograph few of them."""
-        K, centre = self.problem.K, self.problem.centre
+        K = self.problem.K
+        centre = self.problem.centre
         matches = self._search(start, radius)
         if matches is None:
             return None
@@ -147,22 +176,30 @@ class _TextureRounds:
         for _ in range(JOINT_STEPS):
             points = matches.measurements(T, K, centre, scales[-1])
             T = self.problem.step(contour_points, T, FULL_SIZE_RADII[0], [points])
-        before, after = (matches.inlier_ratio(at, K, centre, scale=PATCH_INLIER_SCALE) for at in (start, T))
+        before, after = (
+            matches.inlier_ratio(at, K, centre, scale=PATCH_INLIER_SCALE) for at in (start, T)
+        )
         return _Round(T, matches, before, after)
 
     def _search(self, T: Tensor, radius: int) -> PointMatches | None:
-        """Corners of the view at a pose and where they are in the photograph; None if there are few."""
-        problem, size = self.problem, (self.problem.size, self.problem.size)
+        """Corners of the view at a pose and where they are in the photograph; None if there are
+        few."""
+        problem = self.problem
+        size = (self.problem.size, self.problem.size)
         view = _as_array(self.draw(T, problem.K, size)[0])
         depth = self.renderer.render(T, problem.K, size).cpu()
         grey = (255.0 * view.mean(axis=2)).round().astype(np.uint8)
-        corners, model = surface_corners(grey, depth, T, problem.K, quality=CORNER_QUALITY, inside=HALF_PATCH)
+        corners, model = surface_corners(
+            grey, depth, T, problem.K, quality=CORNER_QUALITY, inside=HALF_PATCH
+        )
         if len(corners) < MIN_MATCHES:
             return None
         offset, weight = match_patches(view, self.photograph, corners.astype(int), radius)
         if int((weight > 0).sum()) < MIN_MATCHES:
             return None
-        return PointMatches(model, torch.from_numpy(corners + offset)[None], torch.from_numpy(weight)[None])
+        return PointMatches(
+            model, torch.from_numpy(corners + offset)[None], torch.from_numpy(weight)[None]
+        )
 
 
 def _as_array(picture: Tensor) -> np.ndarray:
@@ -173,15 +210,19 @@ def _as_array(picture: Tensor) -> np.ndarray:
 def match_patches(
     view: np.ndarray, photograph: np.ndarray, corners: np.ndarray, radius: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (C, 2) in px to where patches of a view correlate most within a ``radius`` of the photograph, both (S, S,
-    3) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of these matches."""
+    """Offsets (C, 2) in px to where patches of a view correlate most within a ``radius`` of the
+    photograph, both (S, S, 3) float32, around ``corners`` (C, 2), and weights (C,) in [0, 1] of
+    these matches."""
     border = HALF_PATCH + radius
     padded = cv2.copyMakeBorder(photograph, border, border, border, border, cv2.BORDER_REFLECT)
-    offset, weight = np.zeros((len(corners), 2)), np.zeros(len(corners))
+    offset = np.zeros((len(corners), 2))
+    weight = np.zeros(len(corners))
     for i, (x, y) in enumerate(corners):
         patch = view[y - HALF_PATCH : y + HALF_PATCH + 1, x - HALF_PATCH : x + HALF_PATCH + 1]
         around = padded[y : y + 2 * border + 1, x : x + 2 * border + 1]
-        scores = np.nan_to_num(cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0)
+        scores = np.nan_to_num(
+            cv2.matchTemplate(around, patch, cv2.TM_CCOEFF_NORMED), posinf=0.0, neginf=0.0
+        )
         v, u = np.unravel_index(scores.argmax(), scores.shape)
         best = float(scores[v, u])
         offset[i] = u - radius + _vertex(scores[v], u), v - radius + _vertex(scores[:, u], v)

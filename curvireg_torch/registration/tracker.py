@@ -1,4 +1,5 @@
-"""Tracking: the pose in the next frame, from points that move, colours beside the outline, and edges."""
+"""Tracking: the pose in the next frame, from points that move, colours beside the outline, and
+edges."""
 
 import math
 from collections.abc import Mapping
@@ -35,7 +36,8 @@ from .texture_fit import surface_corners
 COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
 SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
 LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors
-MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3  # Added to probabilities, so that a colour never seen is not proof
+# Added to probabilities, so that a colour never seen is not proof
+MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3
 MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
 LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
 LEARNING_RATE = 0.2  # Weight of a new frame in the histograms
@@ -50,12 +52,14 @@ def colour_bins(colours: Tensor) -> Tensor:
 
 
 def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
-    """Mean (P,) px and variance (P,) px² of where P lines leave the object, from the colours along them.
+    """Mean (P,) px and variance (P,) px² of where P lines leave the object, from the colours along
+    them.
 
-    If a line leaves the object at d, its pixels before d show the object and those behind it the background. With
-    r(l) = log p(colour at l | object) - log p(colour at l | background), the logarithm of the likelihood of d is, but
-    for a constant, the sum of r(l) over l < d. The prior is uniform from -radius to radius px. ``log_ratio`` (P, L) is
-    r at the offsets -h to h px along lines that point out of the object, L = 2 h + 1, h >= ``radius``.
+    If a line leaves the object at d, its pixels before d show the object and those behind it the
+    background. With r(l) = log p(colour at l | object) - log p(colour at l | background), the
+    logarithm of the likelihood of d is, but for a constant, the sum of r(l) over l < d. The prior
+    is uniform from -radius to radius px. ``log_ratio`` (P, L) is r at the offsets -h to h px along
+    lines that point out of the object, L = 2 h + 1, h >= ``radius``.
     """
     half = log_ratio.shape[-1] // 2
     log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
@@ -66,23 +70,27 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
 
 
 class RegionModel:
-    """Colour histograms of the object and of the background, a pair for each direction from the object's centre.
-    Directions are angles in rad of the image's x, y axes; between the middles of two sectors both count."""
+    """Colour histograms of the object and of the background, a pair for each direction from the
+    object's centre. Directions are angles in rad of the image's x, y axes; between the middles of
+    two sectors both count."""
 
     def __init__(self) -> None:
         self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
         self._log_ratio = torch.zeros(SECTORS * COLOUR_LEVELS**3)
 
     def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor) -> None:
-        """Move the histograms towards the colours at ``uv`` (M, 2) px of ``bins`` (S, S), in ``directions`` (M,) rad
-        from the object's centre, ``inside`` (M,) bool the object; empty histograms take all of them."""
+        """Move the histograms towards the colours at ``uv`` (M, 2) px of ``bins`` (S, S), in
+        ``directions`` (M,) rad from the object's centre, ``inside`` (M,) bool the object; empty
+        histograms take all of them."""
         colour, seen = _colours_at(bins, uv)
         colour = colour[seen]
         low, high, fraction = _sectors(directions[seen])
         side = (~inside[seen]).long()
         new = torch.zeros_like(self._histograms)
         for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
-            new.view(-1).index_add_(0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float())
+            new.view(-1).index_add_(
+                0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float()
+            )
         count = new.sum(dim=-1, keepdim=True)
         new = new / count.clamp(min=1e-9)
         step = LEARNING_RATE * count / (count + HALF_RATE_COUNT)
@@ -90,20 +98,25 @@ class RegionModel:
         self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
         cube = self._histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
         for axis in range(3):  # smooth along each colour channel
-            shape, pad = [1, 1, 1], [0] * 6
+            shape = [1, 1, 1]
+            pad = [0] * 6
             shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
             kernel = torch.tensor([0.2, 0.6, 0.2]).view(1, 1, *shape)
             cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel)
         p = cube.view_as(self._histograms)
         p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
-        self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO).view(-1)
+        self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(
+            -MAX_LOG_RATIO, MAX_LOG_RATIO
+        ).view(-1)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
-        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``, at (P, L, 2) px of
-        lines in ``directions`` (P,); 0 outside the window."""
+        """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``,
+        at (P, L, 2) px of lines in ``directions`` (P,); 0 outside the window."""
         colour, seen = _colours_at(bins, uv)
         low, high, fraction = (x[:, None] for x in _sectors(directions))
-        of_low, of_high = (self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high))
+        of_low, of_high = (
+            self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high)
+        )
         return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
 
 
@@ -122,34 +135,47 @@ def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
 
 
-# Added around the object's box, as a fraction of its longer side: room for motion that was not predicted
+# Added around the object's box, as a fraction of its longer side: room for motion that was not
+# predicted
 WINDOW_MARGIN = 0.3
 # Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
-SEARCH_RADII = (6.0, 4.0, 2.5)  # Search radius in px of edges and of the end of the object's colours, one a round
+# Search radius in px of edges and of the end of the object's colours, one a round
+SEARCH_RADII = (6.0, 4.0, 2.5)
 STEPS_PER_ROUND = 2  # Least-squares steps per round
 # Weights, relative to edges, of colours and of points from the last frame and from a keyframe
-REGION_WEIGHT, POINT_WEIGHT, KEYFRAME_WEIGHT = 2.0, 0.3, 0.5
+REGION_WEIGHT = 2.0
+POINT_WEIGHT = 0.3
+KEYFRAME_WEIGHT = 0.5
 REGION_VARIANCE = 0.5  # Variance in px² added to that of the end of the object's colours
-LEARNED_BAND = (2, 24)  # Nearest and farthest distance in px from the outline at which colours are learned
-REGION_FEATURE_RADIUS = 8  # Radius in px of the posterior from which TrackedPose.features are computed
-# Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes another
-MAX_KEYFRAMES, KEYFRAME_ANGLE = 30, 8.0
-# Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are nearly in place
-PYRAMID_LAST, PYRAMID_KEYFRAME = 3, 1
+# Nearest and farthest distance in px from the outline at which colours are learned
+LEARNED_BAND = (2, 24)
+# Radius in px of the posterior from which TrackedPose.features are computed
+REGION_FEATURE_RADIUS = 8
+# Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes
+# another
+MAX_KEYFRAMES = 30
+KEYFRAME_ANGLE = 8.0
+# Levels of the pyramid of optical flow from the last frame, and from a keyframe, whose points are
+# nearly in place
+PYRAMID_LAST = 3
+PYRAMID_KEYFRAME = 1
 FLOW_PATCH = 15  # Side of the patches of the optical flow in px
-MAX_RETURN_ERROR = 1.5  # Largest distance in px between a corner and where the flow back from its match ends
-# Scale of the weights in px in each least-squares step: at first all matches count, in the end those that agree
+# Largest distance in px between a corner and where the flow back from its match ends
+MAX_RETURN_ERROR = 1.5
+# Scale of the weights in px in each least-squares step: at first all matches count, in the end
+# those that agree
 FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
-# Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least distance in px from the
-# outline: nearer to it, patches show the background
-CORNER_QUALITY, CORNER_INSET = 0.01, 3
+# Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least
+# distance in px from the outline: nearer to it, patches show the background
+CORNER_QUALITY = 0.01
+CORNER_INSET = 3
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The part of a frame around the object: its ``crops`` in three channels, their mean ``grey`` (S, S) uint8, and the
-    camera ``K`` (1, 3, 3) of these."""
+    """The part of a frame around the object: its ``crops`` in three channels, their mean ``grey``
+    (S, S) uint8, and the camera ``K`` (1, 3, 3) of these."""
 
     crops: EdgeCrops
     grey: np.ndarray
@@ -169,8 +195,9 @@ class Frame:
 
 
 def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of ``size`` (H, W). And
-    (N,) bool, False where the mesh lies behind the camera, or outside the image: there the box means nothing."""
+    """(N, 4) boxes in px around a mesh with ``hull`` (V, 3) at poses (N, 4, 4), in an image of
+    ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
+    image: there the box means nothing."""
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
     boxes = projected_boxes(hull, T, K)
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
@@ -180,8 +207,8 @@ def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A ``grey`` picture (S, S) uint8 with a known pose ``T`` (1, 4, 4), and corners ``uv`` (P, 2) px, float32, at the
-    points ``model`` (1, P, 3) of the surface."""
+    """A ``grey`` picture (S, S) uint8 with a known pose ``T`` (1, 4, 4), and corners ``uv`` (P, 2)
+    px, float32, at the points ``model`` (1, P, 3) of the surface."""
 
     grey: np.ndarray
     T: Tensor
@@ -189,24 +216,34 @@ class Keyframe:
     model: Tensor
 
 
-def track_points(keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int) -> PointMatches:
-    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them. Matches from which
-    the flow does not lead back to the corner have weight 0. A pyramid of ``levels`` halvings lets the search reach
-    further."""
+def track_points(
+    keyframe: Keyframe, frame: Frame, T: Tensor, centre: Tensor, *, levels: int
+) -> PointMatches:
+    """Corners of a keyframe in a new frame, searched where the pose ``T`` (1, 4, 4) projects them.
+    Matches from which the flow does not lead back to the corner have weight 0. A pyramid of
+    ``levels`` halvings lets the search reach further."""
     if len(keyframe.uv) == 0:
-        return PointMatches(keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double())
+        return PointMatches(
+            keyframe.model, torch.zeros(1, 0, 2).double(), torch.zeros(1, 0).double()
+        )
     guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
     there, found = _optical_flow(keyframe.grey, frame.grey, keyframe.uv, guess, levels)
     back, returned = _optical_flow(frame.grey, keyframe.grey, there, keyframe.uv, levels)
     kept = found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < MAX_RETURN_ERROR)
-    return PointMatches(keyframe.model, torch.from_numpy(there).double()[None], torch.from_numpy(kept).double()[None])
+    return PointMatches(
+        keyframe.model,
+        torch.from_numpy(there).double()[None],
+        torch.from_numpy(kept).double()[None],
+    )
 
 
 def _optical_flow(
     before: np.ndarray, after: np.ndarray, points: np.ndarray, guess: np.ndarray, levels: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where points (P, 2) of one picture are in another, searched at ``guess`` (P, 2); and (P,) whether found."""
-    window, flags = (FLOW_PATCH, FLOW_PATCH), cv2.OPTFLOW_USE_INITIAL_FLOW
+    """Where points (P, 2) of one picture are in another, searched at ``guess`` (P, 2); and (P,)
+    whether found."""
+    window = (FLOW_PATCH, FLOW_PATCH)
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, guess.copy(), winSize=window, maxLevel=levels, flags=flags
     )
@@ -215,10 +252,10 @@ def _optical_flow(
 
 @dataclass(frozen=True)
 class TrackedPose:
-    """A pose (1, 4, 4) in a frame, with its contours, as ``state``. Its ``features``, all in [0, 1]: ``edge_support``
-    as of a contour fit; ``region``, how clearly and how near to the outline the object's colours end; ``flow`` and
-    ``keyframe``, the fraction of the corners of the last frame, and of a keyframe, that are found where the pose has
-    them."""
+    """A pose (1, 4, 4) in a frame, with its contours, as ``state``. Its ``features``, all in [0,
+    1]: ``edge_support`` as of a contour fit; ``region``, how clearly and how near to the outline
+    the object's colours end; ``flow`` and ``keyframe``, the fraction of the corners of the last
+    frame, and of a keyframe, that are found where the pose has them."""
 
     features: Mapping[str, float]
     frame: Frame
@@ -231,44 +268,54 @@ class TrackedPose:
 
 
 class Tracker:
-    """Follows an object from a known pose, by the ``contours`` of its mesh and the points ``hull`` (V, 3) around it.
+    """Follows an object from a known pose, by the ``contours`` of its mesh and the points ``hull``
+    (V, 3) around it.
 
-    Each frame is searched around the pose that a constant velocity predicts, and if that is not convincing, around the
-    last pose. Optical flow of corners on the surface gives a first pose; robust least squares then fits jointly edges
-    near the contours, the end of the object's colours along lines across its silhouette, and the corners of the last
-    frame and of the keyframe that was seen from the most similar direction.
+    Each frame is searched around the pose that a constant velocity predicts, and if that is not
+    convincing, around the last pose. Optical flow of corners on the surface gives a first pose;
+    robust least squares then fits jointly edges near the contours, the end of the object's colours
+    along lines across its silhouette, and the corners of the last frame and of the keyframe that
+    was seen from the most similar direction.
 
-    A pose that is found counts as known, to predict and to learn colours from, only after :meth:`accept`.
+    A pose that is found counts as known, to predict and to learn colours from, only after
+    :meth:`accept`.
     """
 
     def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
-        self.renderer, self.contours, self.hull = renderer, contours, hull.double()
-        self.centre, self.radius = contours.centre, contours.radius
+        self.renderer = renderer
+        self.contours = contours
+        self.hull = hull.double()
+        self.centre = contours.centre
+        self.radius = contours.radius
         self._poses: list[Tensor] = []
         self._keyframes: list[Keyframe] = []
         self._last: Keyframe | None = None
         self._regions = RegionModel()
 
     def start(self, image: Tensor, K: Tensor, T: Tensor) -> None:
-        """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3).
-        Raises :class:`LostObjectError` where the mesh lies behind the camera, or outside the image."""
+        """Begin, or begin again, from the pose ``T`` (4, 4) in an image (C, H, W) with camera
+        matrix ``K`` (3, 3). Raises :class:`LostObjectError` where the mesh lies behind the camera,
+        or outside the image."""
         first = self.measure(image, K, T)
-        self._poses, self._keyframes, self._regions = [], [], RegionModel()
+        self._poses = []
+        self._keyframes = []
+        self._regions = RegionModel()
         self.accept(first)
 
     def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
-        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is; errors as
-        :meth:`start`."""
+        """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is;
+        errors as :meth:`start`."""
         start = T.detach().cpu().double()[None]
         frame = self._frame(image, K, start)
         return self._tracked(frame, frame.problem.state(start), [])
 
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
-        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3); :class:`LostObjectError` if it left the
-        image, or pixels around it are outside [0, 1]."""
+        """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3);
+        :class:`LostObjectError` if it left the image, or pixels around it are outside [0, 1]."""
         found: list[TrackedPose] = []
         for T in self.predictions():
-            with suppress(LostObjectError, ImageError):  # pixels beside a wrong prediction may be unusable
+            # pixels beside a wrong prediction may be unusable
+            with suppress(LostObjectError, ImageError):
                 found.append(self._fit(image, K, T))
                 if found[-1].confidence >= RELIABLE:
                     break
@@ -285,9 +332,12 @@ class Tracker:
 
     def covariance(self, pose: TrackedPose) -> Tensor:
         """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
-        problem, points = pose.frame.problem, pose.state.points
+        problem = pose.frame.problem
+        points = pose.state.points
         measured = problem.measured_edges(pose.state, SEARCH_RADII[-1])
-        return pose_covariance(measured, points, pose.state.T, problem.K, self.centre, radius=self.radius)[0][0]
+        return pose_covariance(
+            measured, points, pose.state.T, problem.K, self.centre, radius=self.radius
+        )[0][0]
 
     @property
     def last_pose(self) -> Tensor:
@@ -295,10 +345,13 @@ class Tracker:
         return self._poses[-1]
 
     def predictions(self) -> list[Tensor]:
-        """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and the last pose."""
+        """Starts (1, 4, 4) for the next frame: the last pose, turned and moved on as before, and
+        the last pose."""
         if len(self._poses) < 2:
             return [self.last_pose]
-        (R0, c0), (R1, c1) = ((T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses)
+        (R0, c0), (R1, c1) = (
+            (T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses
+        )
         R = R1 @ R0.mT @ R1
         return [transform(R, 2.0 * c1 - c0 - R @ self.centre), self.last_pose]
 
@@ -312,7 +365,12 @@ class Tracker:
         flows = [(POINT_WEIGHT, flow.moved(first.K, frame.K))]
         keyframe = self._keyframes[int(self._angles(T).argmin())]
         if keyframe is not self._last:
-            flows.append((KEYFRAME_WEIGHT, track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME)))
+            flows.append(
+                (
+                    KEYFRAME_WEIGHT,
+                    track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME),
+                )
+            )
         state = frame.problem.state(T)
         for radius in SEARCH_RADII:
             for _ in range(STEPS_PER_ROUND):
@@ -322,7 +380,11 @@ class Tracker:
         return self._tracked(frame, state, [flow for _, flow in flows])
 
     def _measurements(
-        self, frame: Frame, state: ContourState, flows: list[tuple[float, PointMatches]], radius: float
+        self,
+        frame: Frame,
+        state: ContourState,
+        flows: list[tuple[float, PointMatches]],
+        radius: float,
     ) -> list[Measurements]:
         """Colours and points, beside the edges."""
         mean, variance = self._ends(frame, state, math.ceil(radius))
@@ -331,17 +393,25 @@ class Tracker:
         model, normals = _silhouette(state)
         _, J = project(model[None], normals[None], state.T, frame.K, self.centre)
         colours = Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
-        points = [flow.measurements(state.T, frame.K, self.centre, INLIER_SCALE).scaled(w) for w, flow in flows]
+        points = [
+            flow.measurements(state.T, frame.K, self.centre, INLIER_SCALE).scaled(w)
+            for w, flow in flows
+        ]
         return [colours, *points]
 
     def _ends(self, frame: Frame, state: ContourState, radius: int) -> tuple[Tensor, Tensor]:
-        """Mean and variance (Q,) of where the object's colours end along the normals of its silhouette."""
-        samples, directions = self._lines(frame, state, torch.arange(-radius, radius + 1, dtype=torch.float64))
-        return line_posterior(self._regions.log_ratio(frame.bins, samples, directions).double(), radius)
+        """Mean and variance (Q,) of where the object's colours end along the normals of its
+        silhouette."""
+        samples, directions = self._lines(
+            frame, state, torch.arange(-radius, radius + 1, dtype=torch.float64)
+        )
+        return line_posterior(
+            self._regions.log_ratio(frame.bins, samples, directions).double(), radius
+        )
 
     def _lines(self, frame: Frame, state: ContourState, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (Q, L, 2) at offsets (L,) px along the normals of the silhouette, and directions (Q,) rad of these
-        lines from the object's centre."""
+        """Pixels (Q, L, 2) at offsets (L,) px along the normals of the silhouette, and directions
+        (Q,) rad of these lines from the object's centre."""
         model, normals = _silhouette(state)
         points = torch.cat([self.centre[None], model])[None]
         middle, uv = pixels(points, state.T, frame.K, self.centre)[0].split([1, len(model)])
@@ -351,7 +421,9 @@ class Tracker:
     def _tracked(self, frame: Frame, state: ContourState, flows: list[PointMatches]) -> TrackedPose:
         """A pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
         mean, variance = self._ends(frame, state, REGION_FEATURE_RADIUS)
-        clear = torch.exp(-0.125 * mean.square()) * (1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2).clamp(min=0.0)
+        clear = torch.exp(-0.125 * mean.square()) * (
+            1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2
+        ).clamp(min=0.0)
         ratios = [flow.inlier_ratio(state.T, frame.K, self.centre) for flow in flows] or [0.0]
         features = {
             "edge_support": float(frame.problem.edge_support(state)),
@@ -362,28 +434,39 @@ class Tracker:
         return TrackedPose(features, frame, state)
 
     def _learn(self, frame: Frame, state: ContourState, depth: Tensor) -> None:
-        """Learn the colours beside the outline; where the mesh hides the background again, they are the object's."""
+        """Learn the colours beside the outline; where the mesh hides the background again, they are
+        the object's."""
         distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
         samples, directions = self._lines(frame, state, torch.cat([-distance, distance]))
         x, y = samples.round().long().clamp(0, CROP_SIZE - 1).unbind(-1)
         inside = depth[0, 0, y, x] > 0
         directions = directions[:, None].expand(inside.shape)
-        self._regions.learn(frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten())
+        self._regions.learn(
+            frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten()
+        )
 
     def _remember(self, frame: Frame, T: Tensor, depth: Tensor) -> None:
-        """Keep the frame as the last one, and if none from a similar direction is kept, as a keyframe."""
-        uv, model = surface_corners(frame.grey, depth, T, frame.K, quality=CORNER_QUALITY, inside=CORNER_INSET)
+        """Keep the frame as the last one, and if none from a similar direction is kept, as a
+        keyframe."""
+        uv, model = surface_corners(
+            frame.grey, depth, T, frame.K, quality=CORNER_QUALITY, inside=CORNER_INSET
+        )
         self._last = Keyframe(frame.grey, T, uv, model)
         if not self._keyframes or float(self._angles(T).min()) > KEYFRAME_ANGLE:
             self._keyframes = [*self._keyframes[1 - MAX_KEYFRAMES :], self._last]
 
     def _angles(self, T: Tensor) -> Tensor:
         """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""
-        return rotation_error(torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3])
+        return rotation_error(
+            torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3]
+        )
 
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
-        """The square around the mesh at ``T`` (1, 4, 4) in an image with camera matrix ``K`` (3, 3)."""
-        boxes, visible = boxes_at(self.hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1])))
+        """The square around the mesh at ``T`` (1, 4, 4) in an image with camera matrix ``K`` (3,
+        3)."""
+        boxes, visible = boxes_at(
+            self.hull, T, K[None], (int(image.shape[-2]), int(image.shape[-1]))
+        )
         if not bool(visible):
             raise LostObjectError(OUTSIDE)
         crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
@@ -392,5 +475,6 @@ class Tracker:
 
 
 def _silhouette(state: ContourState) -> tuple[Tensor, Tensor]:
-    """Contour points (Q, 3) that have the background beside them, and unit normals (Q, 2) that point there."""
+    """Contour points (Q, 3) that have the background beside them, and unit normals (Q, 2) that
+    point there."""
     return state.points.model[state.points.outline], state.points.normals[state.points.outline]

@@ -1,4 +1,5 @@
-"""Photographs whose focal length is not known exactly, within a registration; :mod:`.focal` has the mathematics."""
+"""Photographs whose focal length is not known exactly, within a registration; :mod:`.focal` has the
+mathematics."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -29,35 +30,44 @@ if TYPE_CHECKING:
 
 
 SAME_SCORE = 0.2
-"""Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge support."""
+"""Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge
+support."""
 
 
 def limits_of(registrar: "Registrar", item: ImageItem) -> Limits:
-    """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens them."""
+    """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens
+    them."""
     assert item.prior is not None
     if item.camera_matrix is not None:
         return Limits(item, registrar.bank)
     if not registrar.is_exact:
         if item.prior.distance is not None:
-            raise InvalidInputError("distance: with a similar mesh, needs the camera of the photograph")
+            raise InvalidInputError(
+                "distance: with a similar mesh, needs the camera of the photograph"
+            )
         return Limits(item, registrar.bank)
     usual = replace(item, camera_matrix=usual_camera(item.size))
     return Limits(usual, registrar.bank, off_centre=off_axis_angle(usual))
 
 
 def with_possible_cameras(registrar: "Registrar", work: Work) -> Work:
-    """A photograph whose camera is unknown, with starts of several cameras, the best of which it has."""
+    """A photograph whose camera is unknown, with starts of several cameras, the best of which it
+    has."""
     item = replace(work.item, focal_deviation=USUAL_DEVIATION, camera_source="estimated")
     starts: Poses | None = None
     K = usual_camera(item.size)
     if work.crops is not None:
-        view, rank = best_views(work.ranking, registrar.bank, count=TRIED_VIEWS, symmetries=work.symmetries)
+        view, rank = best_views(
+            work.ranking, registrar.bank, count=TRIED_VIEWS, symmetries=work.symmetries
+        )
         of_cameras = []
         for camera in possible_cameras(item.size):
             seen = replace(work, item=replace(item, camera_matrix=camera))
             poses = registrar.poses_of_views(seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(registrar.describer, work.crops, of_cameras, registrar.least_starts)
+        starts = starts_of_fields(
+            registrar.describer, work.crops, of_cameras, registrar.least_starts
+        )
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, registrar.bank)
@@ -66,10 +76,16 @@ def with_possible_cameras(registrar: "Registrar", work: Work) -> Work:
 
 
 def with_fitted_focal_lengths(
-    registrar: "Registrar", work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    registrar: "Registrar",
+    work: Work,
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    outside: Tensor,
 ) -> tuple[Poses, Tensor]:
-    """The best poses fitted together with their focal lengths, where that does not lower their scores noticeably: where
-    perspective tells nothing, a usual focal length is better than one of those tried."""
+    """The best poses fitted together with their focal lengths, where that does not lower their
+    scores noticeably: where perspective tells nothing, a usual focal length is better than one of
+    those tried."""
     scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
     count = FITTED if work.starts is not None else 1
     best = scores.topk(min(count, int((~outside).sum()))).indices
@@ -82,10 +98,15 @@ def with_fitted_focal_lengths(
 
 
 def with_focal_deviation(
-    registrar: "Registrar", work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
+    registrar: "Registrar",
+    work: Work,
+    crops: EdgeCrops,
+    poses: Poses,
+    features: Tensor,
+    outside: Tensor,
 ) -> tuple[Work, Poses]:
-    """The photograph with the camera of the best pose and what is known of its focal length, and the poses with the
-    covariance that follows; the others have none."""
+    """The photograph with the camera of the best pose and what is known of its focal length, and
+    the poses with the covariance that follows; the others have none."""
     best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
     covariance, deviation = focal_covariance(registrar.describer, crops, poses[best], work.item)
     unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)

@@ -1,4 +1,5 @@
-"""Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered picture."""
+"""Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered
+picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,18 +15,24 @@ from .embree import RayScene, float32
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
 MAX_CREASES = 128  # Points per pose on creases
-OCCLUDING_CANDIDATES = 640  # Places per pose on occluding contours at which visibility is tested; some are hidden
+# Places per pose on occluding contours at which visibility is tested; some are hidden
+OCCLUDING_CANDIDATES = 640
 CREASE_CANDIDATES = 256  # The same on creases
-ASIDE = 1.0  # Distance in px from the contour, on the outer side, at which a ray looks past the object
-# Least step in depth at an occluding contour, in object radii; smaller ones are dents of the surface
+# Distance in px from the contour, on the outer side, at which a ray looks past the object
+ASIDE = 1.0
+# Least step in depth at an occluding contour, in object radii; smaller ones are dents of the
+# surface
 OCCLUSION_JUMP = 0.05
-VISIBLE_TOLERANCE = 0.02  # Depth, in object radii, by which a crease may lie behind the surface that its ray hits
-# Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on both sides
+# Depth, in object radii, by which a crease may lie behind the surface that its ray hits
+VISIBLE_TOLERANCE = 0.02
+# Distance from a crease, as a fraction of the crop's side, at which the surface is looked up on
+# both sides
 CREASE_SCALE = 1.0 / 64.0
-# Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen from the front
+# Least change of the surface's slope across a crease at that distance: a fold of 20 degrees seen
+# from the front
 CREASE_BEND = 0.36
-# Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its surface moves by at most
-# 0.3 px of that crop
+# Side in px of the largest crop for which the mesh is simplified to so many faces; 95 % of its
+# surface moves by at most 0.3 px of that crop
 LEVELS = ((64, 800), (128, 2500), (256, 8000))
 NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 BEHIND = 16  # Bit of a vertex nearer than that
@@ -33,9 +40,10 @@ BEHIND = 16  # Bit of a vertex nearer than that
 
 @dataclass(frozen=True)
 class ContourPoints:
-    """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals`` (N, P, 2) across the
-    contour in the image; False in ``valid`` (N, P) marks padding. ``outline`` (N, P) marks points with the background
-    beside them. Normals of occluding contours point outward, those of creases have either sign."""
+    """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals``
+    (N, P, 2) across the contour in the image; False in ``valid`` (N, P) marks padding. ``outline``
+    (N, P) marks points with the background beside them. Normals of occluding contours point
+    outward, those of creases have either sign."""
 
     model: Tensor
     normals: Tensor
@@ -47,37 +55,49 @@ class ContourPoints:
 
     @staticmethod
     def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
-        return ContourPoints(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints)))
+        return ContourPoints(
+            *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints))
+        )
 
 
 class _Level:
     """A mesh simplified to at most ``max_faces`` faces, relative to its ``centre`` (3,)."""
 
-    def __init__(self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int) -> None:
+    def __init__(
+        self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int
+    ) -> None:
         self.radius = radius
         self.edges = MeshEdges(mesh, centre, max_faces)
         self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
 
     def vertices_in_cameras(self, R: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """(N, V, 3) float32 vertices in the cameras' frames, of poses with rotations (N, 3, 3) and positions (N, 3) of
-        the centre."""
+        """(N, V, 3) float32 vertices in the cameras' frames, of poses with rotations (N, 3, 3) and
+        positions (N, 3) of the centre."""
         vertices: np.ndarray = R @ self._vertices.T + position[..., None]
         return vertices.transpose(0, 2, 1)
 
     def lengths_in_crop(
         self, vertices: np.ndarray, K: np.ndarray, size: int, pose: np.ndarray, edge: np.ndarray
     ) -> np.ndarray:
-        """(M,) float32 lengths in px of edges ``edge`` (M,) in the poses ``pose`` (M,), whose vertices (N, V, 3) are
-        in the cameras' frames; 0 for those outside the crop and behind the camera."""
+        """(M,) float32 lengths in px of edges ``edge`` (M,) in the poses ``pose`` (M,), whose
+        vertices (N, V, 3) are in the cameras' frames; 0 for those outside the crop and behind the
+        camera."""
         x, y, z = vertices.transpose(2, 0, 1)
         nearest = np.float32(NEAR_PLANE * self.radius)
         is_behind = z <= NEAR_PLANE * self.radius
         z = np.maximum(z, nearest)
         u = K[:, 0, 0, None] * x / z + K[:, 0, 2, None]
         v = K[:, 1, 1, None] * y / z + K[:, 1, 2, None]
-        # One bit for each side of the crop beyond which a vertex lies: an edge is outside if its ends share a bit.
-        beyond = (u < -0.5) + 2 * (v < -0.5) + 4 * (u > size - 0.5) + 8 * (v > size - 0.5) + BEHIND * is_behind
+        # One bit for each side of the crop beyond which a vertex lies: an edge is outside if its
+        # ends share a bit.
+        beyond = (
+            (u < -0.5)
+            + 2 * (v < -0.5)
+            + 4 * (u > size - 0.5)
+            + 8 * (v > size - 0.5)
+            + BEHIND * is_behind
+        )
         start, end = pose * u.shape[1] + self.edges.edges[edge].T
         beyond_start = beyond.take(start)
         beyond_end = beyond.take(end)
@@ -87,9 +107,11 @@ class _Level:
         length: np.ndarray = np.sqrt(across**2 + down**2) * (is_outside == 0)
         return length
 
-    def depth_at(self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Depth (N, M) of the mesh at pixels (N, M, 2) that ``wanted`` (N, M) marks; inf elsewhere and beside the
-        mesh."""
+    def depth_at(
+        self, uv: np.ndarray, K: np.ndarray, R: np.ndarray, eye: np.ndarray, wanted: np.ndarray
+    ) -> np.ndarray:
+        """Depth (N, M) of the mesh at pixels (N, M, 2) that ``wanted`` (N, M) marks; inf elsewhere
+        and beside the mesh."""
         focal_lengths = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)
         xy = (uv - K[:, None, :2, 2]) / focal_lengths[:, None]
         rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
@@ -106,10 +128,12 @@ class _Views:
     Attributes:
         level: the mesh, simplified for the size of the crops.
         size: side of the crops in px.
-        R, position, K: (N, 3, 3) rotations, (N, 3) positions of the mesh's centre, (N, 3, 3) camera matrices, float32.
+        R, position, K: (N, 3, 3) rotations, (N, 3) positions of the mesh's centre, (N, 3, 3) camera
+            matrices, float32.
         eye: (N, 3) float32 positions of the cameras, relative to the mesh's centre.
         vertices: (N, V, 3) float32 vertices in the cameras' frames.
-        side: (N, E) bool, on which side of the plane through camera and edge the faces of the edge lie.
+        side: (N, E) bool, on which side of the plane through camera and edge the faces of the edge
+            lie.
     """
 
     level: _Level
@@ -156,16 +180,19 @@ class _Views:
         normal = np.where(agrees[..., None], np.sign(cosine)[..., None] * smooth, places.normal)
         return replace(places, normal=normal)
 
-    def seen_on_occluding_contours(self, places: "_Places", valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(N, M) bool: which of the ``valid`` places are not hidden and lie in front of something farther away, and
-        which of these have the background beside them."""
+    def seen_on_occluding_contours(
+        self, places: "_Places", valid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(N, M) bool: which of the ``valid`` places are not hidden and lie in front of something
+        farther away, and which of these have the background beside them."""
         outside = self.pixels(places.at) + np.float32(ASIDE) * places.normal
         depth = self.depth_at(outside, valid)
         is_seen = valid & (depth - places.at[..., 2] > OCCLUSION_JUMP * self.level.radius)
         return is_seen, is_seen & np.isinf(depth)
 
     def seen_on_creases(self, places: "_Places", valid: np.ndarray) -> np.ndarray:
-        """(N, M) bool: which of the ``valid`` places are not hidden, and fold the surface at the scale of the crop."""
+        """(N, M) bool: which of the ``valid`` places are not hidden, and fold the surface at the
+        scale of the crop."""
         radius = self.level.radius
         z = places.at[..., 2]
         pixel = self.pixels(places.at)
@@ -176,14 +203,16 @@ class _Views:
         with np.errstate(invalid="ignore"):
             bend = np.abs(ahead - 2.0 * z + back) / step * self.K[:, :1, 0] / z
             largest_jump = np.maximum(np.abs(ahead - z), np.abs(back - z))
-        is_fold: np.ndarray = is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP * radius)
+        is_fold: np.ndarray = (
+            is_seen & (bend > CREASE_BEND) & (largest_jump < 2.0 * OCCLUSION_JUMP * radius)
+        )
         return is_fold
 
 
 @dataclass(frozen=True)
 class _Places:
-    """Places (N, M) on edges of N views: the edge, the fraction of its length, the point (N, M, 3) in the camera's
-    frame, and the unit normal (N, M, 2) across the edge in the image."""
+    """Places (N, M) on edges of N views: the edge, the fraction of its length, the point (N, M, 3)
+    in the camera's frame, and the unit normal (N, M, 2) across the edge in the image."""
 
     edge: np.ndarray
     fraction: np.ndarray
@@ -192,18 +221,21 @@ class _Places:
 
 
 class MeshContours:
-    """Occluding contours and creases of a clean mesh (:func:`curvireg_torch.load_mesh`), at any pose.
+    """Occluding contours and creases of a clean mesh (:func:`curvireg_torch.load_mesh`), at any
+    pose.
 
-    An edge of the mesh lies on an occluding contour where all of its faces are on one side of it, seen from the camera;
-    creases are edges between faces that meet at an angle. Points are placed along these edges, evenly in the image. A
-    ray one pixel outside an occluding contour tells the outline (nothing hit), an inner occluding contour (hit far
-    behind) and what is hidden (hit in front); one at each crease tells whether it is seen.
+    An edge of the mesh lies on an occluding contour where all of its faces are on one side of it,
+    seen from the camera; creases are edges between faces that meet at an angle. Points are placed
+    along these edges, evenly in the image. A ray one pixel outside an occluding contour tells the
+    outline (nothing hit), an inner occluding contour (hit far behind) and what is hidden (hit in
+    front); one at each crease tells whether it is seen.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 63.5], [0, 100.0, 63.5], [0, 0, 1]], dtype=torch.float64)
         >>> T = torch.eye(4, dtype=torch.float64)[None]; T[0, 2, 3] = 4.0
         >>> points = MeshContours(trimesh.creation.box((2, 2, 2))).points(T, K[None], 128)
-        >>> points.model[points.outline].abs().amax(dim=0).tolist()      # the outline is that of the face in front
+        >>> # the outline is that of the face in front
+        >>> points.model[points.outline].abs().amax(dim=0).tolist()
         [1.0, 1.0, 1.0]
     """
 
@@ -214,13 +246,15 @@ class MeshContours:
         for size, faces in reversed(LEVELS):  # each is simplified from the next finer one
             level = _Level(mesh, self.centre.numpy(), self.radius, faces)
             self._levels[size] = level
-            mesh = trimesh.Trimesh(level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False)
+            mesh = trimesh.Trimesh(
+                level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False
+            )
 
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
     ) -> ContourPoints:
-        """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3, 3); float64, CPU.
-        ``density`` is a fraction of the usual number of points."""
+        """Contour points of N poses (N, 4, 4) in square crops of ``size`` px with cameras (N, 3,
+        3); float64, CPU. ``density`` is a fraction of the usual number of points."""
         T = T_cam_from_model.numpy()
         K = camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
         level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
@@ -230,15 +264,21 @@ class MeshContours:
         eye = -(position[:, None] @ R)[:, 0]
         on_contour, side = edges.sides(eye)
         vertices = level.vertices_in_cameras(float32(R), float32(position))
-        views = _Views(level, size, float32(R), float32(position), float32(K), float32(eye), vertices, side)
+        views = _Views(
+            level, size, float32(R), float32(position), float32(K), float32(eye), vertices, side
+        )
         pose, edge = np.nonzero(on_contour | edges.is_crease)
         length = level.lengths_in_crop(vertices, views.K, size, pose, edge)
         is_occluding = on_contour[pose, edge]
 
-        def points_on(chosen: np.ndarray, candidates: int, most: int, *, occluding: bool) -> tuple[np.ndarray, ...]:
-            """``most`` points of each pose on the ``chosen`` (M,) edges, of ``candidates`` whose visibility is tested:
-            the fields of :class:`ContourPoints`."""
-            number, fraction, valid = _spread(pose[chosen], length[chosen], len(T), round(density * candidates))
+        def points_on(
+            chosen: np.ndarray, candidates: int, most: int, *, occluding: bool
+        ) -> tuple[np.ndarray, ...]:
+            """``most`` points of each pose on the ``chosen`` (M,) edges, of ``candidates`` whose
+            visibility is tested: the fields of :class:`ContourPoints`."""
+            number, fraction, valid = _spread(
+                pose[chosen], length[chosen], len(T), round(density * candidates)
+            )
             places = views.places(np.append(edge[chosen], 0)[number], fraction)
             if occluding:
                 places = views.smoothed(places)
@@ -267,8 +307,8 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals (N, M, 2 or 3),
-    appear."""
+    """Unit normals (N, M, 2) of the image lines in which planes through the camera, with normals
+    (N, M, 2 or 3), appear."""
     focal_lengths = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)
     normal = plane[..., :2] / focal_lengths[:, None]
     length = np.hypot(normal[..., :1], normal[..., 1:])
@@ -276,9 +316,12 @@ def _across(plane: np.ndarray, K: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _spread(pose: np.ndarray, length: np.ndarray, poses: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose`` (M,) are the edges'
-    poses, ascending. Returns (N, count): the number of the edge, the fraction of its length, whether there is one."""
+def _spread(
+    pose: np.ndarray, length: np.ndarray, poses: int, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose``
+    (M,) are the edges' poses, ascending. Returns (N, count): the number of the edge, the fraction
+    of its length, whether there is one."""
     end = np.concatenate([[0.0], np.nan_to_num(length).cumsum(dtype=np.float64)])
     borders = np.searchsorted(pose, np.arange(poses + 1))
     first = borders[:-1, None]
@@ -293,7 +336,8 @@ def _spread(pose: np.ndarray, length: np.ndarray, poses: int, count: int) -> tup
 
 
 def _evenly(valid: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (N, most) of valid entries (N, M), evenly chosen where there are more, and which are not padding."""
+    """Indices (N, most) of valid entries (N, M), evenly chosen where there are more, and which are
+    not padding."""
     order = np.argsort(~valid, axis=1, kind="stable")
     count = valid.sum(axis=1, keepdims=True)
     place = np.arange(most)[None]

@@ -15,12 +15,14 @@ from .renderer import DepthRenderer
 def make_renderer(
     mesh: trimesh.Trimesh, backend: str | DepthRenderer = "auto", *, many_views: bool = False
 ) -> DepthRenderer:
-    """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be shared by threads:
+    """A renderer of ``mesh``, or ``backend`` if it is none of these names. All agree, and may be
+    shared by threads:
 
-    - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or needed.
+    - ``"auto"`` draws into OpenCV's z-buffer on the CPU, and casts rays where those are faster or
+      needed.
     - ``"embree"`` casts rays on the CPU. Forked processes may share it and "auto".
-    - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process that is forked after
-      its first use cannot use it: start processes by "spawn".
+    - ``"pyrender"`` draws through OpenGL, in perspective, and needs a system with EGL. A process
+      that is forked after its first use cannot use it: start processes by "spawn".
 
     For ``many_views``, "auto" leaves out the back faces of closed surfaces, which halves the time.
 
@@ -35,7 +37,9 @@ def make_renderer(
         return PyrenderRenderer(mesh)
     from .embree import EmbreeRenderer, RasterRenderer
 
-    return EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh, many_views=many_views)
+    return (
+        EmbreeRenderer(mesh) if backend == "embree" else RasterRenderer(mesh, many_views=many_views)
+    )
 
 
 def render_depth(
@@ -52,9 +56,11 @@ def render_depth(
     Args:
         mesh: a mesh, a scene (all its parts, placed by their transforms) or the path of one.
         T_cam_from_model: (N, 4, 4) or (4, 4), rigid, model to OpenCV camera.
-        camera_matrix: (N, 3, 3) or (3, 3) in px, no skew; pixel (0, 0) is the centre of the top-left pixel.
+        camera_matrix: (N, 3, 3) or (3, 3) in px, no skew; pixel (0, 0) is the centre of the
+            top-left pixel.
         size: (H, W).
-        renderer: a name for :func:`make_renderer`, or a renderer of this mesh, which is then not built in every call.
+        renderer: a name for :func:`make_renderer`, or a renderer of this mesh, which is then not
+            built in every call.
         orthographic: parallel projection; fx, fy are then px per model unit.
 
     Returns:

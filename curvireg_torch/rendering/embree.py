@@ -1,4 +1,5 @@
-"""Depth on the CPU, by ray casting with embree and by OpenCV's z-buffer: no GPU, no driver, no display."""
+"""Depth on the CPU, by ray casting with embree and by OpenCV's z-buffer: no GPU, no driver, no
+display."""
 
 import itertools
 import math
@@ -21,32 +22,48 @@ from .renderer import NEAREST, check_render_arguments
 _MISS = 1e30  # embreex returns 1e37 where a ray hits nothing
 _MAX_HULL_VERTICES = 200_000  # above, a convex hull takes more time than it saves
 _MAX_COORDINATE = 16000  # px; OpenCV draws no polygons beyond
-# Space, in object radii, between the object and the planes in front and behind it between which OpenCV draws
+# Space, in object radii, between the object and the planes in front and behind it between which
+# OpenCV draws
 BESIDE = 1e-3
 MAX_CULLED_FACES = 10_000  # Checking larger meshes takes longer than it saves
-DIFFERENT_PIXELS = 1e-3  # Fraction of the object's pixels that may change where back faces are left out
-FARTHEST = 1000.0  # Depth, in object radii, beyond which single precision does not separate object and background
+# Fraction of the object's pixels that may change where back faces are left out
+DIFFERENT_PIXELS = 1e-3
+# Depth, in object radii, beyond which single precision does not separate object and background
+FARTHEST = 1000.0
 
 
 class RayScene:
-    """Triangles for ray casting: (V, 3) vertices and (F, 3) faces; rays have (N, 3) origins and directions."""
+    """Triangles for ray casting: (V, 3) vertices and (F, 3) faces; rays have (N, 3) origins and
+    directions."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._scene = EmbreeScene()
-        TriangleMesh(scene=self._scene, vertices=vertices.astype(np.float32), indices=np.asarray(faces, np.int32))
-        self.distance(np.zeros((1, 3)), np.ones((1, 3)))  # builds embree's tree, which is not thread-safe
+        TriangleMesh(
+            scene=self._scene,
+            vertices=vertices.astype(np.float32),
+            indices=np.asarray(faces, np.int32),
+        )
+        # builds embree's tree, which is not thread-safe
+        self.distance(np.zeros((1, 3)), np.ones((1, 3)))
 
     def distance(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """(N,) float32 distances to the first hit, in units of the directions, which may be (1, 3); inf without one."""
-        distance: np.ndarray = self._scene.run(float32(origins), float32(directions), query="DISTANCE")
+        """(N,) float32 distances to the first hit, in units of the directions, which may be (1, 3);
+        inf without one."""
+        distance: np.ndarray = self._scene.run(
+            float32(origins), float32(directions), query="DISTANCE"
+        )
         distance[distance >= _MISS] = np.inf
         return distance
 
     def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3; the distance."""
-        found = self._scene.run(float32(origins), float32(directions), query="INTERSECT", output=True)
+        """The first triangle hit (N,), -1 for none; barycentric u, v (N,) of its corners 2 and 3;
+        the distance."""
+        found = self._scene.run(
+            float32(origins), float32(directions), query="INTERSECT", output=True
+        )
         missed = found["tfar"] >= _MISS
-        face, distance = np.where(missed, -1, found["primID"]), np.where(missed, np.inf, found["tfar"])
+        face = np.where(missed, -1, found["primID"])
+        distance = np.where(missed, np.inf, found["tfar"])
         return face, found["u"], found["v"], distance
 
 
@@ -55,14 +72,17 @@ def float32(x: np.ndarray) -> np.ndarray:
 
 
 class EmbreeRenderer:
-    """Casts one ray through each pixel's centre inside the outline of the object's hull, views in parallel on threads.
-    Thread-safe, because rays only read the scene, and fork-safe. Cannot be pickled."""
+    """Casts one ray through each pixel's centre inside the outline of the object's hull, views in
+    parallel on threads. Thread-safe, because rays only read the scene, and fork-safe. Cannot be
+    pickled."""
 
     name = "embree"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         # Embree and OpenCV compute in float32, so the object is centred and scaled to radius 1.
-        self._mesh, self._centre, self._radius = mesh, mesh_centre(mesh).numpy(), mesh_radius(mesh)
+        self._mesh = mesh
+        self._centre = mesh_centre(mesh).numpy()
+        self._radius = mesh_radius(mesh)
 
     def _scaled(self, points: Any) -> np.ndarray:
         return np.asarray((np.asarray(points) - self._centre) / self._radius)
@@ -75,15 +95,26 @@ class EmbreeRenderer:
         return RayScene(self._scaled(self._mesh.vertices), self._mesh.faces), self._scaled(outline)
 
     def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> Tensor:
         return self.faces_at(T_cam_from_model, camera_matrix, size, orthographic=orthographic)[3]
 
     def faces_at(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Tensor]:
-        """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their points (1 - u - v) a
-        + u b + v c, with the face's corners a, b, c; and (N, 1, H, W) depth."""
+        """(N, H, W) int32 faces that pixels show, -1 for none; (N, H, W) float32 u and v of their
+        points (1 - u - v) a + u b + v c, with the face's corners a, b, c; and (N, 1, H, W)
+        depth."""
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
         face = np.full((len(T), *size), -1, dtype=np.int32)
         u, v, depth = (np.zeros(face.shape, np.float32) for _ in range(3))
@@ -100,27 +131,41 @@ class EmbreeRenderer:
         return face, u, v, torch.from_numpy(depth)[:, None]
 
     def _rays(
-        self, outline: np.ndarray, T: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
+        self,
+        outline: np.ndarray,
+        T: np.ndarray,
+        K: np.ndarray,
+        size: tuple[int, ...],
+        orthographic: bool,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float] | None:
-        """Pixels (H, W) that may show the object, origins and directions of their rays, and their start depth."""
+        """Pixels (H, W) that may show the object, origins and directions of their rays, and their
+        start depth."""
         R = T[:3, :3]
-        t = (T[:3, 3] + R @ self._centre) / self._radius  # centre of the object in the camera, in radii
+        # centre of the object in the camera, in radii
+        t = (T[:3, 3] + R @ self._centre) / self._radius
         outline = outline @ R.T + t
         nearest = outline[:, 2].min()
         if outline[:, 2].max() <= NEAREST:
             return None  # entirely behind the camera
         mask = self._mask(outline, K, size, orthographic)
-        # Rays start at the plane z = near close to the object, which keeps float32 precise for distant objects.
-        # Rows and columns are computed in float64, pixels in float32.
+        # Rays start at the plane z = near close to the object, which keeps float32 precise for
+        # distant objects. Rows and columns are computed in float64, pixels in float32.
         near = max(nearest - 1e-3, NEAREST)
         reach = 1.0 / self._radius if orthographic else near
         y = (np.arange(size[0]) - K[1, 2]) / K[1, 1]
         x = (np.arange(size[1]) - K[0, 2]) / K[0, 0]
         pixels = np.nonzero(mask)
         starts = _combined(pixels, reach * x - t[0], reach * y - t[1], near - t[2], R)
-        return mask, starts, float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R), near
+        return (
+            mask,
+            starts,
+            float32(R[2:]) if orthographic else _combined(pixels, x, y, 1.0, R),
+            near,
+        )
 
-    def _mask(self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool) -> np.ndarray:
+    def _mask(
+        self, outline: np.ndarray, K: np.ndarray, size: tuple[int, ...], orthographic: bool
+    ) -> np.ndarray:
         """(H, W) bool: pixels inside the outline's projection, dilated by one pixel."""
         full = np.ones(size, dtype=bool)
         if orthographic:
@@ -137,21 +182,27 @@ class EmbreeRenderer:
         return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))).view(bool)
 
 
-def _combined(pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray) -> np.ndarray:
-    """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N rows and columns of pixels."""
+def _combined(
+    pixels: tuple[np.ndarray, ...], x: np.ndarray, y: np.ndarray, z: float, axes: np.ndarray
+) -> np.ndarray:
+    """(N, 3) float32 x(column) axes[0] + y(row) axes[1] + z axes[2] for the N rows and columns of
+    pixels."""
     across = x.astype(np.float32)[:, None] * axes[0].astype(np.float32)
-    down = y.astype(np.float32)[:, None] * axes[1].astype(np.float32) + (z * axes[2]).astype(np.float32)
+    down = y.astype(np.float32)[:, None] * axes[1].astype(np.float32) + (z * axes[2]).astype(
+        np.float32
+    )
     rays: np.ndarray = across.take(pixels[1], axis=0)  # four times as fast as across[pixels[1]]
     rays += down.take(pixels[0], axis=0)
     return rays
 
 
 class RasterRenderer(EmbreeRenderer):
-    """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower or wrong. The time
-    of the z-buffer grows with the faces, that of ray casting with the pixels: it is used for meshes of fewer faces than
-    the image has pixels. It does not clip faces that cross the near plane, is not precise far away, and knows no
-    parallel projection. For ``many_views`` of at most ``MAX_CULLED_FACES`` faces it leaves out back faces, which halves
-    the time, if all surfaces are closed, none is inside out, and pictures from eight sides are the same."""
+    """Draws into OpenCV's z-buffer, views in parallel on threads; casts rays where OpenCV is slower
+    or wrong. The time of the z-buffer grows with the faces, that of ray casting with the pixels: it
+    is used for meshes of fewer faces than the image has pixels. It does not clip faces that cross
+    the near plane, is not precise far away, and knows no parallel projection. For ``many_views`` of
+    at most ``MAX_CULLED_FACES`` faces it leaves out back faces, which halves the time, if all
+    surfaces are closed, none is inside out, and pictures from eight sides are the same."""
 
     name = "auto"
 
@@ -173,7 +224,8 @@ class RasterRenderer(EmbreeRenderer):
 
     def _from_corners(self) -> np.ndarray:
         """(8, 64, 64) depth from the corners of a cube around the object."""
-        K, t = np.array([[110.0, 0.0, 31.5], [0.0, 110.0, 31.5], [0.0, 0.0, 1.0]]), np.array([0.0, 0.0, 4.0])
+        K = np.array([[110.0, 0.0, 31.5], [0.0, 110.0, 31.5], [0.0, 0.0, 1.0]])
+        t = np.array([0.0, 0.0, 4.0])
         pictures = []
         for corner in itertools.product((-1.0, 1.0), repeat=3):
             z = np.array(corner) / math.sqrt(3.0)
@@ -182,37 +234,58 @@ class RasterRenderer(EmbreeRenderer):
         return np.stack(pictures)
 
     def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> Tensor:
         if orthographic or len(self._faces) > size[0] * size[1]:
             return super().render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
         T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
-        position = (T[:, :3, 3] + T[:, :3, :3] @ self._centre) / self._radius  # of the object's centre, in radii
+        # of the object's centre, in radii
+        position = (T[:, :3, 3] + T[:, :3, :3] @ self._centre) / self._radius
         z = position[:, 2:] + T[:, 2, :3] @ self._corners.T
-        near, far = z.min(axis=1) - BESIDE, z.max(axis=1) + BESIDE
+        near = z.min(axis=1) - BESIDE
+        far = z.max(axis=1) + BESIDE
         depth = np.zeros((len(T), 1, *size), np.float32)
         drawn = (near > NEAREST) & (far < FARTHEST)
 
         def draw(i: int) -> None:
             if drawn[i]:
-                depth[i, 0] = self._draw(T[i, :3, :3], position[i], K[i], size, float(near[i]), float(far[i]))
+                depth[i, 0] = self._draw(
+                    T[i, :3, :3], position[i], K[i], size, float(near[i]), float(far[i])
+                )
 
         for_each(len(T), draw)
         if len(rest := np.nonzero(~drawn & (far > NEAREST))[0]):
-            depth[rest] = super().render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
+            depth[rest] = (
+                super().render(torch.from_numpy(T[rest]), torch.from_numpy(K[rest]), size).numpy()
+            )
         return torch.from_numpy(depth)
 
     def _draw(
-        self, R: np.ndarray, t: np.ndarray, K: np.ndarray, size: tuple[int, int], near: float, far: float
+        self,
+        R: np.ndarray,
+        t: np.ndarray,
+        K: np.ndarray,
+        size: tuple[int, int],
+        near: float,
+        far: float,
     ) -> np.ndarray:
         """(H, W) depth of one view."""
         H, W = size
-        # OpenCV's camera: axes of OpenGL, 90 degrees from the top to the bottom of the image, centred, square pixels.
-        x, y = [2.0 * K[0, 0], 0.0, 2.0 * K[0, 2] - (W - 1)], [0.0, -2.0 * K[1, 1], -(2.0 * K[1, 2] - (H - 1))]
+        # OpenCV's camera: axes of OpenGL, 90 degrees from the top to the bottom of the image,
+        # centred, square pixels.
+        x = [2.0 * K[0, 0], 0.0, 2.0 * K[0, 2] - (W - 1)]
+        y = [0.0, -2.0 * K[1, 1], -(2.0 * K[1, 2] - (H - 1))]
         shear = np.array([x, y, [0.0, 0.0, -H]]) / H
         camera = (shear @ np.column_stack([R, t])).astype(np.float32)
         z = np.full(size, far, np.float32)
-        cv2.triangleRasterizeDepth(self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings)
+        cv2.triangleRasterizeDepth(
+            self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings
+        )
         background = z > far - 0.5 * BESIDE
         z *= np.float32(self._radius)
         z[background] = 0.0

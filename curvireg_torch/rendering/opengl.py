@@ -18,16 +18,19 @@ from ..mesh.mesh import box_corners, mesh_centre, mesh_radius
 from .renderer import NEAREST, check_render_arguments
 
 _lock = threading.Lock()
-# The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none survives a fork
+# The process that created the only OffscreenRenderer, and that: under EGL a second one fails, none
+# survives a fork
 _context: tuple[int, Any] | None = None
 
 
 def _offscreen() -> Any:
-    """The OffscreenRenderer, bound to no thread, so that any can bind it; pyrender's make_uncurrent does nothing."""
+    """The OffscreenRenderer, bound to no thread, so that any can bind it; pyrender's make_uncurrent
+    does nothing."""
     global _context
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     with suppress(ImportError):
-        # Mesa and triton (torch.compile) each load an LLVM: if Mesa's is loaded first, the process crashes.
+        # Mesa and triton (torch.compile) each load an LLVM: if Mesa's is loaded first, the process
+        # crashes.
         import_module("triton")
     try:
         import pyrender
@@ -39,10 +42,13 @@ def _offscreen() -> Any:
         display = getattr(_context[1]._platform, "_egl_display", None)
     except Exception as error:  # PyOpenGL raises anything
         reason = f"renderer 'pyrender' needs OpenGL through EGL ({type(error).__name__}: {error})"
-        raise RenderingError(f"{reason}; install the system's libegl1, or use renderer='embree'") from error
+        raise RenderingError(
+            f"{reason}; install the system's libegl1, or use renderer='embree'"
+        ) from error
     if _context[0] != os.getpid():
         raise RenderingError(
-            "renderer 'pyrender' was used before this process was forked, which OpenGL does not survive; start "
+            "renderer 'pyrender' was used before this process was forked, which OpenGL does not "
+            "survive; start "
             "processes by 'spawn', or use renderer='embree'"
         )
     if display is not None:
@@ -59,21 +65,25 @@ def _release() -> None:
 
 
 class PyrenderRenderer:
-    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it thread-safe. It works
-    around a defect of pyrender 0.1.45: the framebuffer takes four samples per pixel and resolves depth to one that is
-    off the centre; segmentation mode avoids that, but always culls back faces, so faces are drawn in both orientations.
-    Depth has 24 bits: for a camera inside the object's box, the far end is less exact than elsewhere."""
+    """Draws perspective views into the process's only EGL context, one at a time; a lock makes it
+    thread-safe. It works around a defect of pyrender 0.1.45: the framebuffer takes four samples per
+    pixel and resolves depth to one that is off the centre; segmentation mode avoids that, but
+    always culls back faces, so faces are drawn in both orientations. Depth has 24 bits: for a
+    camera inside the object's box, the far end is less exact than elsewhere."""
 
     name = "pyrender"
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
-        self._centre, self._radius = mesh_centre(mesh), mesh_radius(mesh)
+        self._centre = mesh_centre(mesh)
+        self._radius = mesh_radius(mesh)
         self._corners = (box_corners(mesh) - self._centre) / self._radius
         with _lock:
             _offscreen()
             import pyrender
 
-            positions = ((np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius).astype(np.float32)
+            positions = ((np.asarray(mesh.vertices) - self._centre.numpy()) / self._radius).astype(
+                np.float32
+            )
             faces = np.asarray(mesh.faces, np.uint32)
             both_sides = np.concatenate([faces, faces[:, ::-1]])
             primitive = pyrender.Primitive(positions=positions, indices=both_sides, mode=4)
@@ -82,7 +92,12 @@ class PyrenderRenderer:
             self._flags = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SEG
 
     def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> Tensor:
         if orthographic:
             raise InvalidInputError("renderer: 'pyrender' knows no parallel projection; use 'auto'")
@@ -106,14 +121,23 @@ class PyrenderRenderer:
         cam_from_model[:3, 3] = (T[:3, 3] + T[:3, :3] @ self._centre) / self._radius
         # A tight clip range spends all 24 bits of depth on the object.
         z = self._corners @ cam_from_model[2, :3] + cam_from_model[2, 3]
-        near, far = max(float(z.min()) - 1e-3, NEAREST), float(z.max()) + 1e-3
+        near = max(float(z.min()) - 1e-3, NEAREST)
+        far = float(z.max()) + 1e-3
         if far - 1e-3 <= near:
             return 0.0  # entirely behind the camera
-        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5  # pixel (0, 0) of OpenGL begins at 0
-        camera = pyrender.IntrinsicsCamera(*(float(x) for x in (fx, fy, cx, cy)), znear=near, zfar=far)
+        # pixel (0, 0) of OpenGL begins at 0
+        fx = K[0, 0]
+        fy = K[1, 1]
+        cx = K[0, 2] + 0.5
+        cy = K[1, 2] + 0.5
+        camera = pyrender.IntrinsicsCamera(
+            *(float(x) for x in (fx, fy, cx, cy)), znear=near, zfar=far
+        )
         pose = torch.linalg.inv(opencv_from_opengl(cam_from_model)).numpy()
         node = self._scene.add(camera, pose=pose)
         try:
-            return offscreen.render(self._scene, flags=self._flags, seg_node_map={self._node: (255, 255, 255)})
+            return offscreen.render(
+                self._scene, flags=self._flags, seg_node_map={self._node: (255, 255, 255)}
+            )
         finally:
             self._scene.remove_node(node)

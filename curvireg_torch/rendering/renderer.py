@@ -8,7 +8,8 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..utils.checks import check_camera_matrix, check_pose, check_tensor
 
-NEAREST = 1e-3  # Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
+# Near plane, in object radii: surface closer to the camera plane, or behind it, is not rendered
+NEAREST = 1e-3
 
 
 class DepthRenderer(Protocol):
@@ -17,9 +18,15 @@ class DepthRenderer(Protocol):
     name: str
 
     def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> Tensor:
-        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32 z-depth."""
+        """Render N views, with the arguments of :func:`render_depth`, into (N, 1, H, W) float32
+        z-depth."""
         ...
 
 
@@ -30,7 +37,9 @@ def check_render_arguments(T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple
         raise InvalidInputError(f"size: expected (H, W) >= 1, got {size}")
     check_camera_matrix(K)
     if K.ndim == 3 and K.shape[0] not in (1, T.shape[0]):
-        raise InvalidInputError(f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}")
+        raise InvalidInputError(
+            f"camera_matrix: expected one or {T.shape[0]} matrices, got {K.shape[0]}"
+        )
     check_pose(T, "T_cam_from_model")
     T = T.detach().to("cpu", torch.float64)
     return T, K.detach().to("cpu", torch.float64).expand(T.shape[0], 3, 3)

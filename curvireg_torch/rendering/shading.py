@@ -29,9 +29,10 @@ def render_colour(
     renderer: str | DepthRenderer = "auto",
     orthographic: bool = False,
 ) -> Tensor:
-    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples per pixel. A mesh
-    without colours is white, and so is every mesh with a renderer that does not report which face a pixel shows; "auto"
-    and "embree" do. Arguments and errors are those of :func:`render_depth`.
+    """Pictures of a mesh in its colours before white: the colour times :func:`shade`, four samples
+    per pixel. A mesh without colours is white, and so is every mesh with a renderer that does not
+    report which face a pixel shows; "auto" and "embree" do. Arguments and errors are those of
+    :func:`render_depth`.
 
     Returns:
         (N, 3, H, W) float32 RGB in [0, 1] on the CPU.
@@ -61,13 +62,16 @@ def render_colour(
         face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
         visible = face >= 0
         albedo[visible] = colours.at(face[visible], u[visible], v[visible])
-    picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(0, 3, 1, 2)
+    picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(
+        0, 3, 1, 2
+    )
     return F.avg_pool2d(picture.contiguous(), SUPERSAMPLING)
 
 
 def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -> Tensor:
-    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1. Normals come from
-    neighbouring pixels, of two along an axis the one nearer in depth, and are exact for planes.
+    """Lambertian shading with a light at the camera: grey 0.3 edge on to 0.9 face on, background 1.
+    Normals come from neighbouring pixels, of two along an axis the one nearer in depth, and are
+    exact for planes.
 
     Args:
         depth: (N, 1, H, W) z-depth, 0 = background; the result has its shape and dtype.
@@ -89,7 +93,8 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
     K = camera_matrix.to(z)[..., None, None]
     fx = K[:, 0, 0, None]
     fy = K[:, 1, 1, None]
-    # Across a plane, inverse depth is linear in pixel coordinates; under parallel projection, depth is.
+    # Across a plane, inverse depth is linear in pixel coordinates; under parallel projection, depth
+    # is.
     height = torch.where(visible, z if orthographic else 1.0 / z, torch.inf)
     slope_u = _slope(height, -1)
     slope_v = _slope(height, -2)
@@ -109,7 +114,8 @@ def shade(depth: Tensor, camera_matrix: Tensor, *, orthographic: bool = False) -
 
 
 def _slope(s: Tensor, dim: int) -> Tensor:
-    """Difference per px along ``dim`` to the neighbour nearer in depth; 0 if neither neighbour is on the surface."""
+    """Difference per px along ``dim`` to the neighbour nearer in depth; 0 if neither neighbour is
+    on the surface."""
     step = s.diff(dim=dim).nan_to_num(torch.inf, torch.inf, torch.inf)  # inf beside the background
     edge = torch.full_like(s.narrow(dim, 0, 1), torch.inf)
     before = torch.cat([edge, step], dim)

@@ -18,19 +18,26 @@ MAX_PIXEL_ASPECT = 1.1  # largest ratio of the focal lengths at which pixels cou
 
 def type_and_shape(value: object) -> str:
     """What was passed instead of the expected tensor, for an error message."""
-    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+    return (
+        f"{value.dtype} of shape {tuple(value.shape)}"
+        if isinstance(value, Tensor)
+        else type(value).__name__
+    )
 
 
 def check_tensor(x: Tensor, name: str, shape: tuple[int | None, ...]) -> None:
     """``x`` is a floating tensor of ``shape``; ``None`` stands for any length."""
     if not isinstance(x, Tensor):
         raise InvalidInputError(f"{name}: expected a torch.Tensor, got {type(x).__name__}")
-    if x.ndim != len(shape) or any(n is not None and n != size for n, size in zip(shape, x.shape, strict=True)):
+    if x.ndim != len(shape) or any(
+        n is not None and n != size for n, size in zip(shape, x.shape, strict=True)
+    ):
         expected = ", ".join("*" if n is None else str(n) for n in shape)
         raise InvalidInputError(f"{name}: expected shape ({expected}), got {tuple(x.shape)}")
     if not x.is_floating_point():
         raise InvalidInputError(
-            f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: divide by 255)"
+            f"{name}: expected a floating dtype, got {x.dtype}; convert with x.float() (images: "
+            f"divide by 255)"
         )
 
 
@@ -55,7 +62,8 @@ def check_colour_image(x: Tensor) -> None:
 
 
 def check_photograph(x: Any, name: str = "images") -> None:
-    """``x`` is a (C, H, W) tensor, C = 1 (grey) or 3 (RGB), with at least one pixel, floating or uint8."""
+    """``x`` is a (C, H, W) tensor, C = 1 (grey) or 3 (RGB), with at least one pixel, floating or
+    uint8."""
     if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[0] not in (1, 3) or 0 in x.shape:
         expected = "1 (grey) or 3 (RGB) channels in shape (C, H, W), arrays (H, W, C)"
         raise InvalidInputError(f"{name}: expected {expected}, got {type_and_shape(x)}")
@@ -64,12 +72,15 @@ def check_photograph(x: Any, name: str = "images") -> None:
 
 
 def check_pixels(x: Tensor, where: str) -> None:
-    """The pixels of floating ``x`` are finite and in [0, 1] within 0.001; ``where`` names them, as "of the box"."""
+    """The pixels of floating ``x`` are finite and in [0, 1] within 0.001; ``where`` names them, as
+    "of the box"."""
     low, high = (float(value) for value in x.aminmax()) if x.numel() else (0.0, 0.0)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise ImageError(f"NaN or inf in the pixels {where}; repair the image, or use another")
     if high > 1.0 + 1e-3 or low < -1e-3:
-        raise ImageError(f"pixels outside [0, 1] {where}; divide floating images by 255, or pass uint8")
+        raise ImageError(
+            f"pixels outside [0, 1] {where}; divide floating images by 255, or pass uint8"
+        )
 
 
 def check_same_device(x: Tensor, like: Tensor, name: str) -> None:
@@ -90,28 +101,37 @@ def check_device(name: torch.device | str, option: str = "device") -> None:
 def check_option(value: str, options: Iterable[str], name: str) -> None:
     """``value`` is one of ``options``."""
     if value not in options:
-        raise InvalidInputError(f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}")
+        raise InvalidInputError(
+            f"{name}: expected one of {', '.join(map(repr, options))}, got {value!r}"
+        )
 
 
 def check_number(value: Any, name: str) -> float:
-    """Return ``value`` if it is a finite number. In a compiled graph it is a constant: one graph per value."""
+    """Return ``value`` if it is a finite number. In a compiled graph it is a constant: one graph
+    per value."""
     try:
         if isinstance(value, bool | str):
             raise TypeError
-        # torch.compile makes a float symbolic at its second value; splitting it forces the value, which kernels need.
+        # torch.compile makes a float symbolic at its second value; splitting it forces the value,
+        # which kernels need.
         number = math.ldexp(*math.frexp(value))
     except (TypeError, ValueError, OverflowError) as error:
-        raise InvalidInputError(f"{name}: expected a number, got {type(value).__name__} {value!r:.40}") from error
+        raise InvalidInputError(
+            f"{name}: expected a number, got {type(value).__name__} {value!r:.40}"
+        ) from error
     if not math.isfinite(number):
         raise InvalidInputError(f"{name}: expected a finite number, got {number}")
     return number
 
 
 def check_positive(value: Any, name: str, *, zero_ok: bool = False) -> float:
-    """Return ``value`` if it is a finite number > 0 (or >= 0); otherwise as :func:`check_number`."""
+    """Return ``value`` if it is a finite number > 0 (or >= 0); otherwise as
+    :func:`check_number`."""
     number = check_number(value, name)
     if number < 0 or (number == 0 and not zero_ok):
-        raise InvalidInputError(f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {number}")
+        raise InvalidInputError(
+            f"{name}: expected a finite number {'>=' if zero_ok else '>'} 0, got {number}"
+        )
     return number
 
 
@@ -133,7 +153,12 @@ def check_probability(value: Any, name: str) -> float:
 
 def check_integer(value: Any, name: str, *, least: int = 1) -> int:
     """Return ``value`` if it is an integer >= ``least``; 2.0 and True are none."""
-    if isinstance(value, bool) or not hasattr(type(value), "__index__") or isinstance(value, Tensor) or value < least:
+    if (
+        isinstance(value, bool)
+        or not hasattr(type(value), "__index__")
+        or isinstance(value, Tensor)
+        or value < least
+    ):
         raise InvalidInputError(f"{name}: expected an integer >= {least}, got {value!r:.40}")
     return int(value)
 
@@ -145,11 +170,14 @@ def check_finite(x: Tensor, name: str) -> None:
 
 
 def check_rotation(R: Tensor, name: str) -> None:
-    """``R`` is floating (..., 3, 3), rotations within ``MAX_ROTATION_DEVIATION`` or not finite (missing estimates)."""
+    """``R`` is floating (..., 3, 3), rotations within ``MAX_ROTATION_DEVIATION`` or not finite
+    (missing estimates)."""
     check_last_axes(R, name, (3, 3))
     bad = int(_is_no_rotation(R).sum())
     if bad:
-        raise InvalidInputError(f"{name}: expected rotations (orthonormal, determinant +1), got {bad} that are not")
+        raise InvalidInputError(
+            f"{name}: expected rotations (orthonormal, determinant +1), got {bad} that are not"
+        )
 
 
 def check_pose(T: Tensor, name: str) -> None:
@@ -161,38 +189,52 @@ def check_pose(T: Tensor, name: str) -> None:
     bad = int((off | _is_no_rotation(T[..., :3, :3])).sum())
     if bad:
         raise InvalidInputError(
-            f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], R orthonormal with determinant +1, "
+            f"{name}: expected rigid transforms [[R, t], [0, 0, 0, 1]], R orthonormal with "
+            f"determinant +1, "
             f"got {bad} that are not; remove scale and reflection"
         )
 
 
 def check_symmetries(symmetries: Tensor) -> None:
-    """``symmetries`` is floating (S, 3, 3) or (S, 4, 4), S >= 1, of finite rotations or rigid transforms."""
-    if getattr(symmetries, "ndim", 0) != 3 or symmetries.shape[1:] not in ((3, 3), (4, 4)) or not len(symmetries):
+    """``symmetries`` is floating (S, 3, 3) or (S, 4, 4), S >= 1, of finite rotations or rigid
+    transforms."""
+    if (
+        getattr(symmetries, "ndim", 0) != 3
+        or symmetries.shape[1:] not in ((3, 3), (4, 4))
+        or not len(symmetries)
+    ):
         raise InvalidInputError(
-            f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got {type_and_shape(symmetries)}"
+            f"symmetries: expected shape (S, 4, 4) or (S, 3, 3) with S >= 1, got "
+            f"{type_and_shape(symmetries)}"
         )
     (check_pose if symmetries.shape[1] == 4 else check_rotation)(symmetries, "symmetries")
     check_finite(symmetries, "symmetries")
 
 
 def _is_no_rotation(R: Tensor) -> Tensor:
-    """(...) bool: whether a (..., 3, 3) matrix is finite and not a rotation within ``MAX_ROTATION_DEVIATION``."""
+    """(...) bool: whether a (..., 3, 3) matrix is finite and not a rotation within
+    ``MAX_ROTATION_DEVIATION``."""
     R = R.detach().to(torch.promote_types(R.dtype, torch.float32))
     a, b, c = R.unbind(-2)
     # Rows a and b of unit length at right angles and c = a x b: orthonormal with determinant +1.
     products = torch.stack([(a * a).sum(-1) - 1.0, (b * b).sum(-1) - 1.0, (a * b).sum(-1)], -1)
-    off = torch.cat([products, c - torch.linalg.cross(a, b)], -1).abs().amax(-1) > MAX_ROTATION_DEVIATION
+    off = (
+        torch.cat([products, c - torch.linalg.cross(a, b)], -1).abs().amax(-1)
+        > MAX_ROTATION_DEVIATION
+    )
     return off & R.isfinite().all(-1).all(-1)
 
 
 def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
-    """``K`` is floating (..., 3, 3): finite [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy > 0."""
+    """``K`` is floating (..., 3, 3): finite [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in px with fx, fy
+    > 0."""
     if not isinstance(K, Tensor) or tuple(K.shape[-2:]) != (3, 3) or not K.is_floating_point():
         raise InvalidInputError(f"{name}: expected floating (..., 3, 3), got {type_and_shape(K)}")
     check_finite(K, name)
     if not bool((K[..., 0, 0] > 0).all() and (K[..., 1, 1] > 0).all()):
-        raise InvalidInputError(f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY")
+        raise InvalidInputError(
+            f"{name}: expected focal lengths FX, FY > 0 (in pixels); check their order FX FY CX CY"
+        )
     last = torch.tensor([0.0, 0.0, 1.0], dtype=K.dtype, device=K.device)
     if not bool((K[..., 2, :] == last).all() and (K[..., 1, 0] == 0).all()):
         raise InvalidInputError(f"{name}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
@@ -201,15 +243,22 @@ def check_camera_matrix(K: Tensor, name: str = "camera matrix") -> None:
 
 
 def check_square_pixels(K: Tensor, name: str = "camera matrix") -> None:
-    """The focal lengths of valid (..., 3, 3) cameras are at most 10 % apart: views are rendered with square pixels."""
+    """The focal lengths of valid (..., 3, 3) cameras are at most 10 % apart: views are rendered
+    with square pixels."""
     for camera in K.reshape(-1, 3, 3).tolist():
-        fx, fy, cx, cy = camera[0][0], camera[1][1], camera[0][2], camera[1][2]
+        fx = camera[0][0]
+        fy = camera[1][1]
+        cx = camera[0][2]
+        cy = camera[1][2]
         if not are_nearly_equal(fx, fy):
             advice = "resize the image's width by FY / FX, and FX, CX and the box with it"
             if are_nearly_equal(cx, cy):
-                advice = f"if the order was CX CY FX FY, swap the halves: {cx:g} {cy:g} {fx:g} {fy:g}"
+                advice = (
+                    f"if the order was CX CY FX FY, swap the halves: {cx:g} {cy:g} {fx:g} {fy:g}"
+                )
             raise InvalidInputError(
-                f"{name}: expected square pixels, FX and FY at most 10 % apart, got {fx:g} and {fy:g}; {advice}"
+                f"{name}: expected square pixels, FX and FY at most 10 % apart, got {fx:g} and "
+                f"{fy:g}; {advice}"
             )
 
 
@@ -222,33 +271,45 @@ def as_numbers(values: Any, name: str, *, dtype: torch.dtype = torch.float32) ->
     """A tensor, an array, or nested lists of these as a floating tensor of at least ``dtype``."""
     try:
         if isinstance(values, list | tuple):
-            plain = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+            plain = all(
+                isinstance(value, int | float) and not isinstance(value, bool) for value in values
+            )
             parts = [] if plain else [as_numbers(value, name, dtype=dtype) for value in values]
             x = torch.tensor(values, dtype=dtype) if plain else torch.stack(parts)
         else:
             x = torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
         reason = str(error).partition("\n")[0]
-        raise InvalidInputError(f"{name}: expected numbers, got {type(values).__name__} ({reason})") from error
+        raise InvalidInputError(
+            f"{name}: expected numbers, got {type(values).__name__} ({reason})"
+        ) from error
     if x.is_complex() or x.dtype == torch.bool:
         raise InvalidInputError(f"{name}: expected numbers, got {x.dtype}")
     return x.to(torch.promote_types(x.dtype, dtype) if x.is_floating_point() else dtype)
 
 
 def check_numbers(values: Any, name: str, count: int | None = None) -> Tensor:
-    """Return ``count`` finite numbers, or at least one, of a list, range, array or tensor as (N,) float64."""
-    numbers = as_numbers(list(values) if isinstance(values, range) else values, name, dtype=torch.float64).flatten()
+    """Return ``count`` finite numbers, or at least one, of a list, range, array or tensor as (N,)
+    float64."""
+    numbers = as_numbers(
+        list(values) if isinstance(values, range) else values, name, dtype=torch.float64
+    ).flatten()
     if len(numbers) != (count or max(1, len(numbers))) or not bool(numbers.isfinite().all()):
-        raise InvalidInputError(f"{name}: expected {count or 'at least one'} finite numbers, got {values!r:.80}")
+        raise InvalidInputError(
+            f"{name}: expected {count or 'at least one'} finite numbers, got {values!r:.80}"
+        )
     return numbers.double()
 
 
 def as_boxes(boxes: Any, count: int) -> Tensor:
-    """A tensor, an array or lists as (count, 4) boxes, at least float32; values are checked with the images."""
+    """A tensor, an array or lists as (count, 4) boxes, at least float32; values are checked with
+    the images."""
     x = as_numbers(boxes, "boxes")
     x = x.view(0, 4) if count == 0 and x.numel() == 0 else x
     if tuple(x.shape) != (count, 4):
-        raise InvalidInputError(f"boxes: expected shape ({count}, 4), one for each image, got {tuple(x.shape)}")
+        raise InvalidInputError(
+            f"boxes: expected shape ({count}, 4), one for each image, got {tuple(x.shape)}"
+        )
     return x
 
 
@@ -256,5 +317,7 @@ def as_camera_matrices(matrices: Any, count: int) -> Tensor:
     """One matrix for all, or one for each, as (count, 3, 3) float64; values are not checked."""
     K = as_numbers(matrices, "camera_matrices", dtype=torch.float64)
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (1,), (count,)):
-        raise InvalidInputError(f"camera_matrices: expected (3, 3) or ({count}, 3, 3), got {tuple(K.shape)}")
+        raise InvalidInputError(
+            f"camera_matrices: expected (3, 3) or ({count}, 3, 3), got {tuple(K.shape)}"
+        )
     return K.expand(count, 3, 3)

@@ -1,4 +1,5 @@
-"""Names that a user may choose from, and files that a user may name, checked before torch is imported."""
+"""Names that a user may choose from, and files that a user may name, checked before torch is
+imported."""
 
 import glob
 from collections.abc import Sequence
@@ -8,18 +9,46 @@ from ..errors import InvalidInputError, MissingFileError
 
 RENDERER_NAMES = ("auto", "embree", "pyrender")  # renderers
 DEFAULT = "learned"  # the default preset
-PRESET_NAMES = ("learned", "classical", "fast", "paper")  # of :data:`curvireg_torch.pipeline.PRESETS`
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}  # metres per unit
+# of :data:`curvireg_torch.pipeline.PRESETS`
+PRESET_NAMES = ("learned", "classical", "fast", "paper")
+# metres per unit
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 
 PHONE_IMAGES = (".avif", ".heic", ".heif")  # which optional decoders read
-IMAGES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp", *PHONE_IMAGES)
+IMAGES = (
+    ".bmp",
+    ".jpeg",
+    ".jpg",
+    ".pgm",
+    ".png",
+    ".pnm",
+    ".ppm",
+    ".tif",
+    ".tiff",
+    ".webp",
+    *PHONE_IMAGES,
+)
 VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".webm")
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".3mf", ".step", ".stp", ".iges", ".igs", ".dae", ".urdf")
+MESHES = (
+    ".obj",
+    ".ply",
+    ".stl",
+    ".off",
+    ".glb",
+    ".gltf",
+    ".3mf",
+    ".step",
+    ".stp",
+    ".iges",
+    ".igs",
+    ".dae",
+    ".urdf",
+)
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 
 BOX_FORMATS = ("xyxy", "xywh", "fractions", "yolo")
-"""Four numbers of a box: corners in px; corner, width and height in px; corners, and centre, width and height, in
-fractions of the picture."""
+"""Four numbers of a box: corners in px; corner, width and height in px; corners, and centre, width
+and height, in fractions of the picture."""
 
 START_CONVENTIONS = ("opencv", "opengl")
 """Axes of the camera of a given pose: x right, y down, z forward; or x right, y up, z backward."""
@@ -27,7 +56,16 @@ START_CONVENTIONS = ("opencv", "opengl")
 MESH_KINDS = ("exact", "similar")
 """Whether a mesh is that of the photographed object itself, or of another one of its kind."""
 
-SIDE_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
+SIDE_NAMES = (
+    "front",
+    "front-right",
+    "right",
+    "back-right",
+    "back",
+    "back-left",
+    "left",
+    "front-left",
+)
 """Sides of an object, every 45 degrees of azimuth from 0."""
 
 UP_AXES = {
@@ -50,7 +88,9 @@ def is_pattern(path: Path) -> bool:
 
 def is_one_photograph(paths: Sequence[Path]) -> bool:
     """Whether the paths are a single file that is not a video."""
-    return len(paths) == 1 and not (is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS)
+    return len(paths) == 1 and not (
+        is_pattern(paths[0]) or paths[0].is_dir() or paths[0].suffix.lower() in VIDEOS
+    )
 
 
 def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | None = None) -> None:
@@ -58,18 +98,31 @@ def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | N
 
     Of several photographs, those that are missing are reported later, each by itself.
     """
-    for path, kind in [*((photo, "a photograph") for photo in photos), *([(listed, "a list")] if listed else [])]:
+    for path, kind in [
+        *((photo, "a photograph") for photo in photos),
+        *([(listed, "a list")] if listed else []),
+    ]:
         if path.suffix.lower() in MESHES_AND_BANKS:
-            other = next((str(mesh) for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS), "")
-            advice = f"it and {other} seem to be swapped: {_ORDER}" if other else f"{_ORDER}, several by --mesh each"
+            other = next(
+                (str(mesh) for mesh in meshes if mesh.suffix.lower() not in MESHES_AND_BANKS), ""
+            )
+            advice = (
+                f"it and {other} seem to be swapped: {_ORDER}"
+                if other
+                else f"{_ORDER}, several by --mesh each"
+            )
             raise InvalidInputError(f"a mesh where {kind} is expected; {advice}", subject=path)
         if kind == "a photograph" and path.suffix.lower() == ".csv":
-            raise InvalidInputError(f"a list where a photograph is expected; give it as --list {path}", subject=path)
+            raise InvalidInputError(
+                f"a list where a photograph is expected; give it as --list {path}", subject=path
+            )
     for mesh in meshes:
         is_picture = is_pattern(mesh) or mesh.suffix.lower() in (*IMAGES, *VIDEOS)
         if mesh.is_dir() or is_picture:
             kind = "a photograph" if is_picture else "a folder"
-            raise InvalidInputError(f"{kind} where a mesh is expected; {_ORDER} ({', '.join(MESHES)})", subject=mesh)
+            raise InvalidInputError(
+                f"{kind} where a mesh is expected; {_ORDER} ({', '.join(MESHES)})", subject=mesh
+            )
     required = [(path, "photograph") for path in photos] if is_one_photograph(photos) else []
     if listed is None:
         required += [(mesh, "mesh") for mesh in meshes]

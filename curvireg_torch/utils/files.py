@@ -1,4 +1,5 @@
-"""Atomic writes of files, bounded reads of tables, and digests by which results and banks are found again."""
+"""Atomic writes of files, bounded reads of tables, and digests by which results and banks are found
+again."""
 
 import csv
 import errno
@@ -24,14 +25,15 @@ if TYPE_CHECKING:
 
 MAX_NAME = 60  # characters of the name of an uploaded file
 FindFile = Callable[[str], Path]
-"""Where a file lies that another file names. ``folder.joinpath`` follows any name, :func:`only_in` none out of a
-folder."""
+"""Where a file lies that another file names. ``folder.joinpath`` follows any name, :func:`only_in`
+none out of a folder."""
 
 _PACKAGE = Path(__file__).parents[1]
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file and create its folder; at any moment ``path`` holds the old content or all of the new.
+    """Write a file and create its folder; at any moment ``path`` holds the old content or all of
+    the new.
 
     Raises:
         OutputError: the file cannot be written; no temporary file remains.
@@ -41,7 +43,8 @@ def write_file(path: Path, content: bytes) -> None:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists() and not target.is_file():
-            raise OSError(errno.EINVAL, "not a regular file")  # a folder, or a device like /dev/null
+            # a folder, or a device like /dev/null
+            raise OSError(errno.EINVAL, "not a regular file")
         try:
             with temporary.open("xb") as file:
                 file.write(content)
@@ -52,18 +55,23 @@ def write_file(path: Path, content: bytes) -> None:
             temporary.unlink(missing_ok=True)
     except OSError as error:
         advice = "make room, or choose" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "choose"
-        raise OutputError(f"cannot be written ({error.strerror}); {advice} another place", subject=path) from error
+        raise OutputError(
+            f"cannot be written ({error.strerror}); {advice} another place", subject=path
+        ) from error
 
 
 def write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
-    """:func:`write_file` of rows of comma-separated cells; an apostrophe precedes what a spreadsheet would compute."""
+    """:func:`write_file` of rows of comma-separated cells; an apostrophe precedes what a
+    spreadsheet would compute."""
     text = io.StringIO(newline="")
     csv.writer(text, lineterminator="\n").writerows(map(_inert, row) for row in rows)
-    write_file(path, text.getvalue().encode(errors="backslashreplace"))  # file names may be no UTF-8
+    # file names may be no UTF-8
+    write_file(path, text.getvalue().encode(errors="backslashreplace"))
 
 
 class CsvFile:
-    """A CSV file that grows: each row is on disk once it is known. It begins, anew, with the first row.
+    """A CSV file that grows: each row is on disk once it is known. It begins, anew, with the first
+    row.
 
     Cells are written as by :func:`write_csv`.
 
@@ -88,7 +96,9 @@ class CsvFile:
             with self.path.open(mode) as file:
                 file.write(text.getvalue().encode(errors="backslashreplace"))
         except OSError as error:
-            raise OutputError(f"cannot be written ({error.strerror}); make room", subject=self.path) from error
+            raise OutputError(
+                f"cannot be written ({error.strerror}); make room", subject=self.path
+            ) from error
         self._header = None
 
 
@@ -104,7 +114,8 @@ def _inert(cell: object) -> object:
 
 
 def check_writable(folder: Path, name: str) -> None:
-    """Create a folder, or raise :class:`OutputError` that names option ``name``, before work whose results go there."""
+    """Create a folder, or raise :class:`OutputError` that names option ``name``, before work whose
+    results go there."""
     probe = folder / f".probe-{secrets.token_hex(4)}"
     try:
         write_file(probe, b"probe")
@@ -116,7 +127,9 @@ def check_writable(folder: Path, name: str) -> None:
         ) from error
 
 
-def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping[str, str] | None = None) -> None:
+def write_tensors(
+    path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping[str, str] | None = None
+) -> None:
     """:func:`write_file` of a safetensors file."""
     from safetensors.torch import save
 
@@ -125,14 +138,17 @@ def write_tensors(path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping
 
 
 def terminable() -> AbstractContextManager[None]:
-    """Context in which SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: every ``finally``
-    runs, and no partial file remains."""
+    """Context in which SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C
+    does: every ``finally`` runs, and no partial file remains."""
     return signals_handled([signal.SIGTERM, *hangup_signals()], _exit_after)
 
 
 @contextmanager
-def signals_handled(numbers: Iterable[int], handler: Callable[[int, Any], object]) -> Iterator[None]:
-    """Context in which signals call ``handler``; in the main thread, as others cannot handle signals."""
+def signals_handled(
+    numbers: Iterable[int], handler: Callable[[int, Any], object]
+) -> Iterator[None]:
+    """Context in which signals call ``handler``; in the main thread, as others cannot handle
+    signals."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -162,10 +178,14 @@ def read_json(path: Path, kind: type[Any] | tuple[type[Any], ...], readme: str) 
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path) from error
+        raise InvalidInputError(
+            f"damaged, or not JSON ({error}); {readme} shows the layout", subject=path
+        ) from error
     if not isinstance(content, kind):
         expected = "a list" if kind is list else "an object"
-        raise InvalidInputError(f"expected {expected} of JSON; {readme} shows the layout", subject=path)
+        raise InvalidInputError(
+            f"expected {expected} of JSON; {readme} shows the layout", subject=path
+        )
     return content
 
 
@@ -184,10 +204,14 @@ def read_csv(path: Path) -> list[list[str]]:
     """The rows of a CSV file in UTF-8 that are not blank."""
     check_table_size(path)
     try:
-        table = csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True)
+        table = csv.reader(
+            io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True
+        )
         return [cells for cells in table if any(map(str.strip, cells))]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path) from error
+        raise InvalidInputError(
+            f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path
+        ) from error
 
 
 def file_name(text: str) -> str:
@@ -203,7 +227,8 @@ def file_name(text: str) -> str:
 
 
 def found_in(folder: Path) -> FindFile:
-    """A :data:`FindFile` of any name in ``folder``; one with backslashes, as Windows writes them, is read as there.
+    """A :data:`FindFile` of any name in ``folder``; one with backslashes, as Windows writes them,
+    is read as there.
 
     Example:
         >>> found_in(Path("lists"))("shots\\\\0.png").as_posix()
@@ -219,8 +244,8 @@ def found_in(folder: Path) -> FindFile:
 
 
 def only_in(folder: Path) -> FindFile:
-    """A :data:`FindFile` for lists and rigs from strangers: whatever folder a name has, the file with its
-    :func:`file_name` in ``folder`` is meant.
+    """A :data:`FindFile` for lists and rigs from strangers: whatever folder a name has, the file
+    with its :func:`file_name` in ``folder`` is meant.
 
     Example:
         >>> only_in(Path("uploads"))("../../etc/passwd").as_posix()
@@ -232,7 +257,9 @@ def only_in(folder: Path) -> FindFile:
 def check_table_size(path: Path) -> None:
     """Refuse a table that is too large to be read as a whole."""
     if path.stat().st_size > MAX_TABLE_BYTES:
-        raise InvalidInputError(f"larger than {MAX_TABLE_BYTES:,} bytes; split the set", subject=path)
+        raise InvalidInputError(
+            f"larger than {MAX_TABLE_BYTES:,} bytes; split the set", subject=path
+        )
 
 
 def finite_numbers(values: object, count: int) -> tuple[float, ...] | None:
@@ -240,7 +267,9 @@ def finite_numbers(values: object, count: int) -> tuple[float, ...] | None:
     if not isinstance(values, Iterable) or isinstance(values, str | dict):
         return None
     numbers = list(values)
-    if len(numbers) != count or any(isinstance(v, bool) or not isinstance(v, int | float) for v in numbers):
+    if len(numbers) != count or any(
+        isinstance(v, bool) or not isinstance(v, int | float) for v in numbers
+    ):
         return None
     try:
         floats = tuple(float(v) for v in numbers)
@@ -255,7 +284,8 @@ def text_digest(text: str, *, size: int = 8) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """16 hexadecimal digits of a file's content; "" if it cannot be read or is not a regular file."""
+    """16 hexadecimal digits of a file's content; "" if it cannot be read or is not a regular
+    file."""
     try:
         if not path.is_file():
             return ""
@@ -278,7 +308,8 @@ def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
 
 @cache
 def code_digest(*parts: str) -> str:
-    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and constants, and files."""
+    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and
+    constants, and files."""
     digest = hashlib.blake2b(digest_size=8)
     for part in parts:
         path = _PACKAGE / part

@@ -1,7 +1,8 @@
-"""Pictures of unknown origin: which are decoded, decided by their first bytes before any decoder sees them.
+"""Pictures of unknown origin: which are decoded, decided by their first bytes before any decoder
+sees them.
 
-Photographs, masks and textures are opened here and nowhere else. Pillow would choose a decoder by itself, and hand
-PostScript to Ghostscript.
+Photographs, masks and textures are opened here and nowhere else. Pillow would choose a decoder by
+itself, and hand PostScript to Ghostscript.
 """
 
 import re
@@ -21,7 +22,8 @@ PICTURE_STARTS = {
     "BMP": re.compile(rb"BM"),
     "PPM": re.compile(rb"P[1-6]\s"),
 }
-"""First bytes of the formats that are decoded, by Pillow's names; SECURITY.md lists the same formats."""
+"""First bytes of the formats that are decoded, by Pillow's names; SECURITY.md lists the same
+formats."""
 
 PICTURE_NAMES = "JPEG, PNG, TIFF, WebP, BMP, PBM, PGM, PPM"
 MAX_PPM_HEADER = 4096  # bytes of the sizes at the start of a PBM, PGM or PPM file, with comments
@@ -44,7 +46,8 @@ def open_picture(data: bytes) -> "Image":
     """A picture whose pixels are not decoded yet, to be closed by the caller.
 
     Raises:
-        ImageError: another format, a damaged header, or a picture beyond :mod:`curvireg_torch.errors`.
+        ImageError: another format, a damaged header, or a picture beyond
+            :mod:`curvireg_torch.errors`.
 
     Example:
         >>> from PIL import Image
@@ -84,12 +87,15 @@ def damaged_picture(error: Exception) -> ImageError:
         return ImageError(_TOO_MANY_PIXELS)
     reason = str(error).partition("\n")[0]
     if isinstance(error, UnidentifiedImageError) or not reason:
-        return ImageError("damaged or truncated, or of a kind that is not read; convert it to JPEG or PNG")
+        return ImageError(
+            "damaged or truncated, or of a kind that is not read; convert it to JPEG or PNG"
+        )
     return ImageError(f"damaged or truncated ({reason}); fetch or save the file again")
 
 
 def _without_comments(data: bytes) -> bytes:
-    """A PBM, PGM or PPM file without what Pillow reads byte by byte, or with a copy of the rest for each comment."""
+    """A PBM, PGM or PPM file without what Pillow reads byte by byte, or with a copy of the rest for
+    each comment."""
     header = _PPM_HEADER.match(data[:MAX_PPM_HEADER])
     if header is None:
         raise ImageError("damaged or truncated, or with a long header; convert it to JPEG or PNG")

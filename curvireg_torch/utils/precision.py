@@ -23,8 +23,8 @@ def full_precision() -> Iterator[None]:
 
 
 def in_full_precision(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorator: ``function`` computes with autocast off. Scores of views differ by less than bfloat16 can tell apart,
-    and threads would not inherit the caller's autocast anyway."""
+    """Decorator: ``function`` computes with autocast off. Scores of views differ by less than
+    bfloat16 can tell apart, and threads would not inherit the caller's autocast anyway."""
 
     @functools.wraps(function)
     def computed(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

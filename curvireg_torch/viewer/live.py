@@ -1,4 +1,5 @@
-"""A page with the latest frame of a video and the contours of its pose: ``curvireg follow --show``."""
+"""A page with the latest frame of a video and the contours of its pose:
+``curvireg follow --show``."""
 
 import sys
 import tempfile
@@ -24,22 +25,31 @@ ENDED = "The video has ended. This was its last frame; you can close the page."
 
 
 class LivePage:
-    """Opens a page that shows the latest frame; a frame is drawn only once the one before has reached a browser.
+    """Opens a page that shows the latest frame; a frame is drawn only once the one before has
+    reached a browser.
 
     As a context manager, it serves the page on this machine, in a thread.
     """
 
     def __init__(self, registrar: Registrar) -> None:
-        self.registrar, self.frame, self.number, self.ratio = registrar, b"", 0, 1.0
-        self._wanted, self._ended = True, False
+        self.registrar = registrar
+        self.frame = b""
+        self.number = 0
+        self.ratio = 1.0
+        self._wanted = True
+        self._ended = False
 
     def __enter__(self) -> Self:
         app.get("/frame")(self._send)
         ui.page("/")(self._build)
         self._listener = listen(HOST, 0)
         self._folder = tempfile.TemporaryDirectory(prefix="curvireg-follow-")
-        self._server = make_server(self._listener, HOST, browser_folder=Path(self._folder.name), printed_to=sys.stderr)
-        self._thread = threading.Thread(target=self._server.run, args=([self._listener],), daemon=True)
+        self._server = make_server(
+            self._listener, HOST, browser_folder=Path(self._folder.name), printed_to=sys.stderr
+        )
+        self._thread = threading.Thread(
+            target=self._server.run, args=([self._listener],), daemon=True
+        )
         self._thread.start()
         return self
 
@@ -54,7 +64,8 @@ class LivePage:
     def show(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
         """Take the next frame; dropped while the one before is on its way."""
         if self._wanted and image is not None:
-            self._wanted, self.ratio = False, image.shape[-1] / image.shape[-2]
+            self._wanted = False
+            self.ratio = image.shape[-1] / image.shape[-2]
             self.frame = jpeg(annotated_frame(self.registrar, image, result), QUALITY)
             self.number += 1
 

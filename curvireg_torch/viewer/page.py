@@ -20,24 +20,39 @@ STAGES: Mapping[str, str] = {
     "search": "searching around the best views",
     "contours": "fitting contours",
 }
-BOX_HINT = "Drag a rectangle around the object. Without one the whole photograph is searched: slower, less certain."
-BOX_HINT_IN_RIG = "Drag a rectangle around the object. Where there is none, the other photographs say where to look."
+BOX_HINT = (
+    "Drag a rectangle around the object. Without one the whole photograph is searched: "
+    "slower, "
+    "less certain."
+)
+BOX_HINT_IN_RIG = (
+    "Drag a rectangle around the object. Where there is none, the other "
+    "photographs say where to "
+    "look."
+)
 
 
 def build_page(workspace: Workspace) -> None:
-    """Lay out one browser window. It holds nothing: several times a second it shows what changed in the workspace."""
+    """Lay out one browser window. It holds nothing: several times a second it shows what changed in
+    the workspace."""
     ui.add_css((STATIC / "page.css").read_text())
     ui.add_body_html(f"<script>{(STATIC / 'page.js').read_text()}</script>")
     text("a", "To the photograph", "skip", href="#work")
     ui.dark_mode(None)
     with region("header", "top"):
         text("h1", "curvireg")
-        text("p", "Where is this object, and how is it turned? One photograph and its 3D model are enough.")
+        text(
+            "p",
+            "Where is this object, and how is it turned? One photograph and its 3D model are "
+            "enough.",
+        )
     with region("div", "work", id="work"):
         stage = Stage(workspace)
         with region("div", "side"):
-            steps, answers = Steps(workspace), Answers(workspace)
-            preview, inputs = Preview(workspace), Inputs(workspace)
+            steps = Steps(workspace)
+            answers = Answers(workspace)
+            preview = Preview(workspace)
+            inputs = Inputs(workspace)
 
     async def refresh() -> None:
         steps.refresh()
@@ -53,8 +68,11 @@ class Steps:
     """What is there, what is missing, and the button that finds the pose."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session = workspace, workspace.session
-        self.cards, self.facts, self.messages = dict[str, Any](), dict[str, Any](), dict[str, Any]()
+        self.workspace = workspace
+        self.session = workspace.session
+        self.cards = dict[str, Any]()
+        self.facts = dict[str, Any]()
+        self.messages = dict[str, Any]()
         with region("ol", "steps"):
             for number, name in enumerate(("photograph", "mesh", "box"), start=1):
                 with region("li", "step", data_testid=f"step-{name}") as self.cards[name]:
@@ -62,7 +80,10 @@ class Steps:
                     self.facts[name] = text("p", "", "facts", data_testid=f"{name}-facts")
                     if name == "box":
                         self.no_box = button(
-                            "Remove the box", lambda: self.session.shot.set_box(None), "no-box", "quiet"
+                            "Remove the box",
+                            lambda: self.session.shot.set_box(None),
+                            "no-box",
+                            "quiet",
                         )
                     else:
                         file_chooser("Choose files", f"upload-{name}")
@@ -71,17 +92,29 @@ class Steps:
                         self.facts["rig"] = text("p", "", "facts", data_testid="rig-facts")
                         self.messages["rig"] = self._message("rig")
                         with region("div", "row below"):
-                            self.no_photo = button("Remove it", workspace.remove_photo, "no-photo", "quiet")
-                            self.no_rig = button("Without the rig", lambda: workspace.open_rig(None), "no-rig", "quiet")
+                            self.no_photo = button(
+                                "Remove it", workspace.remove_photo, "no-photo", "quiet"
+                            )
+                            self.no_rig = button(
+                                "Without the rig",
+                                lambda: workspace.open_rig(None),
+                                "no-rig",
+                                "quiet",
+                            )
                     if name == "mesh":
                         self.use_mm = button(
-                            "Use mm", lambda: workspace.set_option("unit", "mm"), "use-mm", "quiet below"
+                            "Use mm",
+                            lambda: workspace.set_option("unit", "mm"),
+                            "use-mm",
+                            "quiet below",
                         )
         self.messages["file"] = self._message("file")
         with region("div", "go"):
             self.find = button("Find the pose", self._find, "register", "primary")
             self.stop = button("Stop", workspace.stop, "stop")
-            self.bar = region("progress", "", max="1", value="0", aria_label="progress of the search")
+            self.bar = region(
+                "progress", "", max="1", value="0", aria_label="progress of the search"
+            )
             self.stage = text("p", "", "stage", data_testid="progress", role="status")
             self.seconds = text("p", "", "stage", data_testid="seconds")
         self.messages |= {part: self._message(part) for part in ("pose", "page")}
@@ -94,9 +127,13 @@ class Steps:
 
     def refresh(self) -> None:
         """Show the state of the workspace."""
-        session, workspace, shot = self.session, self.workspace, self.session.shot
+        session = self.session
+        workspace = self.workspace
+        shot = self.session.shot
         for part, element in self.messages.items():
-            set_text(element, workspace.messages.get(part, session.rig_gaps() if part == "rig" else ""))
+            set_text(
+                element, workspace.messages.get(part, session.rig_gaps() if part == "rig" else "")
+            )
         done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
             card.classes(**{"add" if done[name] else "remove": "done"})
@@ -106,21 +143,30 @@ class Steps:
         set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())
         counted = f"{together} photograph{'s' * (together > 1)}"
-        set_text(self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else "")
+        set_text(
+            self.facts["rig"], f"{session.rig_name}: one pose in {counted}" if shot.view else ""
+        )
         self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
         self.no_photo.set_visibility(shot.photo is not None)
-        self.use_mm.set_visibility("(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm")
-        words = "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"
+        self.use_mm.set_visibility(
+            "(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm"
+        )
+        words = (
+            "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"
+        )
         set_text(self.find, words if shot.view is None else f"Find the pose in {counted}")
-        set_enabled(self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching)
+        set_enabled(
+            self.find, bool(done["photograph"] and done["mesh"]) and not workspace.searching
+        )
         self._show_progress()
 
     def _describe_photo(self) -> str:
         shot = self.session.shot
         if shot.photo is None:
             return (
-                "A picture with the whole object in it, or several. Of several, a rig file (a CSV table, COLMAP, BOP) "
+                "A picture with the whole object in it, or several. Of several, a rig file (a CSV "
+                "table, COLMAP, BOP) "
                 "makes one pose."
             )
         H, W = shot.size
@@ -129,13 +175,19 @@ class Steps:
     def _describe_mesh(self) -> str:
         path = self.session.mesh_path
         if path is None:
-            return "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts as a .zip."
+            return (
+                "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts "
+                "as "
+                "a .zip."
+            )
         return f"{self.session.name(path)}: {self.session.mesh_facts}"
 
     def _show_progress(self) -> None:
-        session, workspace = self.session, self.workspace
+        session = self.session
+        workspace = self.workspace
         stage, done, total = session.progress
-        share, words = 0.0, ""
+        share = 0.0
+        words = ""
         if workspace.searching and session.cancelled:
             words = "stopping"
         elif workspace.searching and stage:
@@ -147,9 +199,13 @@ class Steps:
             words = f"receiving {', '.join(name for name, _ in workspace.receiving.values())}"
         elif session.shot.result is not None:
             changed = session.shot.result.inputs != session.inputs()
-            share, words = 1.0, "the inputs have changed since this answer" if changed else "done"
+            share = 1.0
+            words = "the inputs have changed since this answer" if changed else "done"
         self.stop.set_visibility(workspace.searching)
         self.bar.set_visibility(workspace.searching)
         self.bar.props(f"value={share:.3f}")
         set_text(self.stage, words)
-        set_text(self.seconds, f"{time.monotonic() - workspace.started:.0f} s" if workspace.searching else "")
+        set_text(
+            self.seconds,
+            f"{time.monotonic() - workspace.started:.0f} s" if workspace.searching else "",
+        )

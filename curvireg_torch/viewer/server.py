@@ -1,4 +1,5 @@
-"""The server of the viewer: its secret address, what it refuses, the page, its files and uploads."""
+"""The server of the viewer: its secret address, what it refuses, the page, its files and
+uploads."""
 
 import errno
 import ipaddress
@@ -32,9 +33,12 @@ from .page import build_page
 from .workspace import Workspace, show_warning
 
 SECURITY_HEADERS = {
-    # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline and have no nonce.
-    "content-security-policy": "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
-    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' blob:; "
+    # Vue compiles templates in the browser, which takes "unsafe-eval"; NiceGUI's scripts are inline
+    # and have no nonce.
+    "content-security-policy": "default-src 'none'; script-src 'self' 'unsafe-inline' "
+    "'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self' blob:; "
     "worker-src 'self' blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "x-frame-options": "DENY",
@@ -46,11 +50,13 @@ SECURITY_HEADERS = {
 
 SECONDS_TO_END = 3  # that requests on their way may take once the server ends
 _LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]+)(?::\d*)?")  # a header Host: name, or address in brackets, and port
+# a header Host: name, or address in brackets, and port
+_HOST = re.compile(r"(\[[^][]*\]|[^][:@/?#]+)(?::\d*)?")
 
 
 def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> None:
-    """Serve the page with these inputs until Ctrl-C; the printed address contains a random token."""
+    """Serve the page with these inputs until Ctrl-C; the printed address contains a random
+    token."""
     # The page's shutdown removes what is in the folder; a job that still runs may add to it.
     uploads = tempfile.TemporaryDirectory(prefix="curvireg-view-", ignore_cleanup_errors=True)
     with terminable(), listen(host, port) as listener, uploads as folder:
@@ -67,10 +73,14 @@ def serve(options: RegisterOptions, *, host: str, port: int, browser: bool) -> N
 
 
 def make_server(
-    listener: socket.socket, host: str, *, browser_folder: Path | None, printed_to: TextIO | None = None
+    listener: socket.socket,
+    host: str,
+    *,
+    browser_folder: Path | None,
+    printed_to: TextIO | None = None,
 ) -> uvicorn.Server:
-    """A guarded server of the application of NiceGUI, whose secret address is printed; it opens in the browser by a
-    file in ``browser_folder``, if that is given."""
+    """A guarded server of the application of NiceGUI, whose secret address is printed; it opens in
+    the browser by a file in ``browser_folder``, if that is given."""
     prefix = f"/{secrets.token_urlsafe(16)}"
     site = FastAPI(openapi_url=None)
     ui.run_with(
@@ -99,7 +109,9 @@ def make_server(
     return uvicorn.Server(config)
 
 
-def print_address(listener: socket.socket, host: str, prefix: str, printed_to: TextIO | None = None) -> str:
+def print_address(
+    listener: socket.socket, host: str, prefix: str, printed_to: TextIO | None = None
+) -> str:
     """Print and return the address of the page, and say who may use it."""
     bound, number = listener.getsockname()[:2]
     name = socket.gethostname() if _is_everyone(bound) else _plain_host(host)
@@ -107,39 +119,50 @@ def print_address(listener: socket.socket, host: str, prefix: str, printed_to: T
     address = f"http://{name}:{number}{prefix}/"
     print(f"curvireg: {address}   (Ctrl-C ends it)", flush=True, file=printed_to)
     if not _is_loopback(bound):
-        print("curvireg: everyone who reaches this machine with this address can use the page", file=sys.stderr)
+        print(
+            "curvireg: everyone who reaches this machine with this address can use the page",
+            file=sys.stderr,
+        )
     return address
 
 
 def redirect_file(folder: Path, address: str) -> Path:
-    """A page that leads to the secret address, which only this user can read: what a program is started with, such as
-    the address that a browser is to open, all users of a machine can see."""
+    """A page that leads to the secret address, which only this user can read: what a program is
+    started with, such as the address that a browser is to open, all users of a machine can see."""
     page = folder / "open.html"
     content = f"""<!DOCTYPE html>
 <meta charset="utf-8"><meta name="referrer" content="no-referrer"><meta http-equiv="refresh" content="0; url={address}">
 <title>curvireg</title><a href="{address}">To the page</a>
-"""
-    with os.fdopen(os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+"""  # noqa: E501
+    with os.fdopen(
+        os.open(page, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8"
+    ) as file:
         file.write(content)
     return page
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens on a host, perhaps an IPv6 address in brackets, and a port, 0 for a free one."""
+    """A socket that listens on a host, perhaps an IPv6 address in brackets, and a port, 0 for a
+    free one."""
     host = host.strip("[]")
     try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        return socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET
+        )
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise InvalidInputError(f"--port {port}: in use by another program; leave it out for a free one") from None
+            raise InvalidInputError(
+                f"--port {port}: in use by another program; leave it out for a free one"
+            ) from None
         raise InvalidInputError(f"--host {host} --port {port}: {error.strerror}") from None
 
 
 def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
     """The site, without requests of other sites, and with :data:`SECURITY_HEADERS` on every answer.
 
-    A browser that is led here by another site's name (DNS rebinding) sends that name as Host, which must be one of
-    ``hosts``; anything goes if everyone may connect. A script of another site sends its own Origin.
+    A browser that is led here by another site's name (DNS rebinding) sends that name as Host, which
+    must be one of ``hosts``; anything goes if everyone may connect. A script of another site sends
+    its own Origin.
     """
     names = set(map(_plain_host, hosts))
     if any(map(_is_loopback, hosts)):
@@ -155,12 +178,18 @@ def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
         headers = Headers(scope=scope) if scope["type"] != "lifespan" else Headers()
         own = headers.get("host", "").lower()
         named = _HOST.fullmatch(own)
-        is_known = scope["type"] == "lifespan" or is_open or (named is not None and _plain_host(named[1]) in names)
+        is_known = (
+            scope["type"] == "lifespan"
+            or is_open
+            or (named is not None and _plain_host(named[1]) in names)
+        )
         if any(urlsplit(origin).netloc.lower() != own for origin in headers.getlist("origin")):
             refusal = PlainTextResponse("requests of other sites are refused", status_code=403)
             await refusal(scope, receive, send_with_headers)
         elif not is_known:
-            refusal = PlainTextResponse("this is not the name of the page's machine", status_code=400)
+            refusal = PlainTextResponse(
+                "this is not the name of the page's machine", status_code=400
+            )
             await refusal(scope, receive, send_with_headers)
         else:
             await site(scope, receive, send_with_headers)
@@ -170,7 +199,8 @@ def guarded(site: ASGIApp, *hosts: str) -> ASGIApp:
 
 def _plain_host(host: str) -> str:
     """A host in the one way in which it is compared: of IPv6 addresses there are many spellings."""
-    host = host.strip("[]").partition("%")[0].lower()  # the zone behind % has a meaning on this machine only
+    # the zone behind % has a meaning on this machine only
+    host = host.strip("[]").partition("%")[0].lower()
     try:
         return ipaddress.ip_address(host).compressed
     except ValueError:
@@ -206,7 +236,9 @@ def add_page(workspace: Workspace) -> None:
             await workspace.receive(name, int(length), request.stream())
         except InvalidInputError as error:
             workspace.messages["file"] = str(error)
-            return PlainTextResponse(str(error), status_code=507 if isinstance(error, OutputError) else 413)
+            return PlainTextResponse(
+                str(error), status_code=507 if isinstance(error, OutputError) else 413
+            )
         except ClientDisconnect:
             workspace.messages["file"] = f"{name}: it did not arrive; send it again"
         return Response(status_code=204)

@@ -1,4 +1,5 @@
-"""Photographs, mesh, rig and options, what is registered with them, and how. It needs no page and no NiceGUI."""
+"""Photographs, mesh, rig and options, what is registered with them, and how. It needs no page and
+no NiceGUI."""
 
 import math
 import re
@@ -14,7 +15,13 @@ import trimesh
 from torch import Tensor
 
 from ..data import read_photo
-from ..errors import MAX_VIEWER_PHOTOGRAPHS, CurviregError, CurviregWarning, InvalidInputError, MissingFileError
+from ..errors import (
+    MAX_VIEWER_PHOTOGRAPHS,
+    CurviregError,
+    CurviregWarning,
+    InvalidInputError,
+    MissingFileError,
+)
 from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
 from ..evaluation.photograph import register_entry
 from ..evaluation.result_files import View
@@ -33,16 +40,29 @@ from .shot import Answer, Numbers, Result, Shot, numbers
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[View]]
 UNPACKED = "parts"  # the folder of what was in an archive
-_OPTIONS = ("unit", "link", "textures", "up", "pose", "mesh_is", "preset", "pipeline", "renderer", "device")
+_OPTIONS = (
+    "unit",
+    "link",
+    "textures",
+    "up",
+    "pose",
+    "mesh_is",
+    "preset",
+    "pipeline",
+    "renderer",
+    "device",
+)
 _DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
 @dataclass
 class Session:
-    """Photographs, one of which is shown, and the mesh. Methods that compute may take minutes: call them in a thread.
+    """Photographs, one of which is shown, and the mesh. Methods that compute may take minutes: call
+    them in a thread.
 
     Attributes:
-        options: of ``curvireg view``, with the camera of all photographs; :meth:`set_camera` changes it.
+        options: of ``curvireg view``, with the camera of all photographs; :meth:`set_camera`
+            changes it.
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
         rig_path, rig: the file of a rig, and its rows; none if it could not be read.
@@ -69,7 +89,9 @@ class Session:
         """Open the files that the options name, and take their box."""
         options = self.options
         if options.box is not None and not options.photos:
-            raise InvalidInputError("--box: needs a photograph; name one, or draw the box on the page")
+            raise InvalidInputError(
+                "--box: needs a photograph; name one, or draw the box on the page"
+            )
         self.options = replace(options, photos=(), meshes=(), box=None)
         for path in options.photos:
             self.open_photo(path, options.box)
@@ -81,7 +103,8 @@ class Session:
         return Path(path).name if {self.folder, STATIC} & {*Path(path).parents} else str(path)
 
     def without_folders(self, text: str) -> str:
-        """A text in which uploaded files, and those unpacked from an archive, have their names alone."""
+        """A text in which uploaded files, and those unpacked from an archive, have their names
+        alone."""
         if self.folder is None:
             return text
         folders = {str(self.folder), str(self.folder.resolve())}
@@ -94,13 +117,19 @@ class Session:
 
     def close(self) -> None:
         """Forget the photographs, the rig and the mesh."""
-        self.shots, self.shot, self.mesh_path, self.mesh = [], Shot(), None, None
-        self.rig_path, self.rig = None, ()
+        self.shots = []
+        self.shot = Shot()
+        self.mesh_path = None
+        self.mesh = None
+        self.rig_path = None
+        self.rig = ()
 
     def open_photo(self, path: Path, box: Numbers | None = None) -> Shot:
         """Add a photograph, and show it; a box in it loses its distortion too."""
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
-            raise InvalidInputError(f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path)
+            raise InvalidInputError(
+                f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path
+            )
         self.shot = self._opened(path, box, self._row_of(path, self.shots))
         self.shots.append(self.shot)
         return self.shot
@@ -115,15 +144,19 @@ class Session:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
     def _opened(self, path: Path, box: Numbers | None, view: View | None) -> Shot:
-        """A photograph and a box, those of a ``view`` of a rig if there is one, without the distortion of the camera,
-        which must fit the photograph."""
-        photo, camera = read_photo(path), self.options.camera
+        """A photograph and a box, those of a ``view`` of a rig if there is one, without the
+        distortion of the camera, which must fit the photograph."""
+        photo = read_photo(path)
+        camera = self.options.camera
         if view is not None:
-            camera, box = view.camera, box if box is not None or view.box is None else numbers(view.box)
+            camera = view.camera
+            box = box if box is not None or view.box is None else numbers(view.box)
         if not isinstance(camera, Camera):
             return Shot(path, photo, box, view)
         try:
-            image, moved, _, _ = undistorted(photo.image, camera, None if box is None else torch.tensor(box))
+            image, moved, _, _ = undistorted(
+                photo.image, camera, None if box is None else torch.tensor(box)
+            )
         except InvalidInputError as error:
             raise error.with_subject(path if view is None else view.name) from error
         if moved is not None and camera.distorts:
@@ -132,8 +165,8 @@ class Session:
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
     def _open_again(self, shot: Shot, view: View | None) -> Shot:
-        """A photograph with another camera, or row of a rig. Its box stays unless distortion is removed, or no longer
-        is; its result only where no rig is concerned."""
+        """A photograph with another camera, or row of a rig. Its box stays unless distortion is
+        removed, or no longer is; its result only where no rig is concerned."""
         opened = self._opened(shot.path, None, view)
         if opened.is_undistorted or shot.is_undistorted:
             return opened
@@ -143,12 +176,14 @@ class Session:
 
     def _replace_shots(self, shots: list[Shot]) -> None:
         if self.shots:
-            self.shot, self.shots = shots[self.shots.index(self.shot)], shots
+            self.shot = shots[self.shots.index(self.shot)]
+            self.shots = shots
 
     def open_rig(self, path: Path | None) -> None:
-        """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to photographs by their file
-        names. A rig that cannot be used has no rows."""
-        self.rig_path, self.rig = path, ()
+        """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to
+        photographs by their file names. A rig that cannot be used has no rows."""
+        self.rig_path = path
+        self.rig = ()
         try:
             self.rig = () if path is None else self._read_rig(path)
             self._match_rig()
@@ -163,18 +198,24 @@ class Session:
             raise error.with_subject(subject) from error
 
     def _read_rig(self, path: Path) -> tuple[View, ...]:
-        """The rows of a rig. It comes from anyone who has the address: it names files beside it only."""
-        rig = tuple(read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent)))
+        """The rows of a rig. It comes from anyone who has the address: it names files beside it
+        only."""
+        rig = tuple(
+            read_rig(path, self.mesh_path, find=only_in(path if path.is_dir() else path.parent))
+        )
         rows = dict[str, View]()
         for view in rig:
             same = rows.setdefault(_key(view.photo), view)
             if same is not view:
-                message = f"{same.name} and {view.name} have the same file name; rename the photographs"
+                message = (
+                    f"{same.name} and {view.name} have the same file name; rename the photographs"
+                )
                 raise InvalidInputError(message, subject=path)
         return rig
 
     def _match_rig(self) -> None:
-        """Give each photograph its row of the rig; the first of several that have one name gets it."""
+        """Give each photograph its row of the rig; the first of several that have one name gets
+        it."""
         shots: list[Shot] = []
         for shot in self.shots:
             view = self._row_of(shot.path, shots)
@@ -184,13 +225,20 @@ class Session:
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
         """The row of the rig with the file name of a photograph, if none of ``shots`` has it."""
         taken = [_key(shot.path) for shot in shots if shot.view is not None]
-        rows = [view for view in self.rig if _key(view.photo) == _key(path) and _key(path) not in taken]
+        rows = [
+            view for view in self.rig if _key(view.photo) == _key(path) and _key(path) not in taken
+        ]
         return rows[0] if rows else None
 
     def together(self, shot: Shot | None = None) -> list[Shot]:
-        """The photographs that are registered with one, by default the shown one: those of the rig, or it alone."""
+        """The photographs that are registered with one, by default the shown one: those of the rig,
+        or it alone."""
         shot = shot or self.shot
-        return [shot] if shot.view is None else [one for view in self.rig for one in self.shots if one.view is view]
+        return (
+            [shot]
+            if shot.view is None
+            else [one for view in self.rig for one in self.shots if one.view is view]
+        )
 
     @property
     def rig_name(self) -> str:
@@ -207,20 +255,31 @@ class Session:
         others = [shot.path.name for shot in self.shots if shot.view is None]
         gaps = []
         if missing:
-            gaps.append(f"not open: {_listed(missing)}; drop what is missing here" + ", or go on without" * bool(used))
+            gaps.append(
+                f"not open: {_listed(missing)}; drop what is missing here"
+                + ", or go on without" * bool(used)
+            )
         if others:
             gaps.append(f"not in the rig: {_listed(others)}; registered alone")
         return "; ".join(gaps)
 
-    def set_camera(self, camera: Numbers | Camera | None = None, guess: str | float | None = None) -> None:
-        """Change the camera of all photographs that have none in a rig: four numbers, a calibrated one, or a guess.
+    def set_camera(
+        self, camera: Numbers | Camera | None = None, guess: str | float | None = None
+    ) -> None:
+        """Change the camera of all photographs that have none in a rig: four numbers, a calibrated
+        one, or a guess.
 
-        Boxes and results stay unless distortion is removed, or no longer is; after an error nothing has changed.
+        Boxes and results stay unless distortion is removed, or no longer is; after an error nothing
+        has changed.
         """
-        before, self.options = self.options, replace(self.options, camera=camera, guess=guess)
+        before = self.options
+        self.options = replace(self.options, camera=camera, guess=guess)
         try:
             calibrated = isinstance(camera, Camera) or isinstance(before.camera, Camera)
-            shots = [self._open_again(shot, None) if calibrated and not shot.view else shot for shot in self.shots]
+            shots = [
+                self._open_again(shot, None) if calibrated and not shot.view else shot
+                for shot in self.shots
+            ]
         except CurviregError:
             self.options = before
             raise
@@ -230,15 +289,22 @@ class Session:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
         if path.suffix == ".safetensors":
             bank = ViewBank.load(path)
-            mesh, facts = bank.mesh, f"bank of {len(bank)} views"
+            mesh = bank.mesh
+            facts = f"bank of {len(bank)} views"
         else:
             mesh = self.options.load_mesh(path)
             size = " x ".join(f"{v:.4g}" for v in mesh.extents)
-            facts = f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered {_colours_in_words(mesh)}"
-        self.mesh_path, self.mesh, self.mesh_facts = path, mesh, facts
+            facts = (
+                f"{len(mesh.faces):,} faces, {size} {mesh_unit(mesh)}, rendered "
+                f"{_colours_in_words(mesh)}"
+            )
+        self.mesh_path = path
+        self.mesh = mesh
+        self.mesh_facts = facts
         for shot in self.shots:
             shot.result = None
-        if self.rig_path is not None and self.rig_path.is_dir():  # boxes of a BOP scene are those of the mesh
+        # boxes of a BOP scene are those of the mesh
+        if self.rig_path is not None and self.rig_path.is_dir():
             self.open_rig(self.rig_path)
 
     @property
@@ -247,13 +313,18 @@ class Session:
         return self.shot.photo is not None and self.shot.photo.guessed_camera_matrix() is not None
 
     def set_limits(self, **limits: Any) -> None:
-        """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a limit."""
+        """Change what is known of the pose: arguments of :class:`PosePrior`; None removes a
+        limit."""
         known = {**(self.options.limits or {}), **limits}
-        self.options = replace(self.options, limits={n: value for n, value in known.items() if value is not None})
+        self.options = replace(
+            self.options, limits={n: value for n, value in known.items() if value is not None}
+        )
 
     def remove_limits(self) -> None:
         """Forget what was known of the pose, but not which side of the mesh is its front."""
-        self.set_limits(**{name: None for name in self.options.limits or {} if name not in QUALIFIERS})
+        self.set_limits(
+            **{name: None for name in self.options.limits or {} if name not in QUALIFIERS}
+        )
 
     def object_frame(self) -> Tensor:
         """(3, 3) rotation from the mesh's axes to those of limits, see :func:`.object_frame`."""
@@ -261,14 +332,17 @@ class Session:
         return object_frame(mesh_up(self.mesh), (self.options.limits or {}).get("front"))
 
     def hint_direction(self, position: Sequence[float]) -> None:
-        """Limit the pose to views like that from a point beside the object, in the frame of limits, z up."""
+        """Limit the pose to views like that from a point beside the object, in the frame of limits,
+        z up."""
         x, y, z = position
-        azimuth, elevation = math.degrees(math.atan2(x, -y)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
+        azimuth = math.degrees(math.atan2(x, -y)) % 360.0
+        elevation = math.degrees(math.atan2(z, math.hypot(x, y)))
         self.remove_limits()
         self.set_limits(viewpoint=(round(azimuth, 1), round(elevation, 1), 0.0), within=WITHIN)
 
     def mesh_axis(self, position: Sequence[float]) -> str:
-        """The mesh's axis that points to a point on its surface, in the frame of limits about the object's centre."""
+        """The mesh's axis that points to a point on its surface, in the frame of limits about the
+        object's centre."""
         at = self.object_frame().mT @ torch.tensor(list(position), dtype=torch.float64)
         axis = int(at.abs().argmax())
         return ("" if at[axis] > 0 else "-") + "xyz"[axis]
@@ -276,16 +350,22 @@ class Session:
     def preview(self) -> bytes:
         """The mesh as a GLB file, in the frame of limits and its radii."""
         assert self.mesh is not None
-        frame, radius = self.object_frame(), mesh_radius(self.mesh)
+        frame = self.object_frame()
+        radius = mesh_radius(self.mesh)
         return mesh_glb(self.mesh, transform(frame, -frame @ mesh_centre(self.mesh)) / radius)
 
-    def inputs(self, shot: Shot | None = None) -> tuple[RegisterOptions, tuple[Numbers | None, ...]]:
+    def inputs(
+        self, shot: Shot | None = None
+    ) -> tuple[RegisterOptions, tuple[Numbers | None, ...]]:
         """The :meth:`request` of a photograph and the boxes of all that are registered with it."""
         return self.request(shot), tuple(each.box for each in self.together(shot))
 
     def request(self, shot: Shot | None = None) -> RegisterOptions:
-        """The registration that the inputs describe, in the photograph that is shown, or in another."""
-        shot, camera, guess = shot or self.shot, self.options.camera, self.options.guess
+        """The registration that the inputs describe, in the photograph that is shown, or in
+        another."""
+        shot = shot or self.shot
+        camera = self.options.camera
+        guess = self.options.guess
         if shot.view is not None:  # the rig has boxes and cameras
             camera = guess = None
         if isinstance(camera, Camera):
@@ -294,22 +374,38 @@ class Session:
         photos = () if shot.photo is None else tuple(each.path for each in self.together(shot))
         meshes = () if self.mesh_path is None else (self.mesh_path,)
         box = None if shot.view is not None else shot.box
-        return replace(self.options, photos=photos, meshes=meshes, box=box, camera=camera, guess=guess)
+        return replace(
+            self.options, photos=photos, meshes=meshes, box=box, camera=camera, guess=guess
+        )
 
     def command(self) -> str:
-        """The command line that gives the same result; none takes the box of an undistorted photograph, or boxes and
-        photographs that a rig does not have."""
+        """The command line that gives the same result; none takes the box of an undistorted
+        photograph, or boxes and photographs that a rig does not have."""
         if self.shot.view is None:
-            return "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
+            return (
+                "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
+            )
         shots = self.together()
-        if self.rig_path is None or len(shots) < len(self.rig) or not all(shot.has_box_of_view for shot in shots):
+        if (
+            self.rig_path is None
+            or len(shots) < len(self.rig)
+            or not all(shot.has_box_of_view for shot in shots)
+        ):
             return ""
-        return _command_line(self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name)
+        return _command_line(
+            self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name
+        )
 
     def register(self) -> Registration:
-        """Find the pose in the photograph that is shown, as ``curvireg register`` does, or in those of its rig."""
-        start, shot, inputs = time.perf_counter(), self.shot, self.inputs()
-        request, shots, command = inputs[0], self.together(), self.command()  # another may be shown meanwhile
+        """Find the pose in the photograph that is shown, as ``curvireg register`` does, or in those
+        of its rig."""
+        start = time.perf_counter()
+        shot = self.shot
+        inputs = self.inputs()
+        # another may be shown meanwhile
+        request = inputs[0]
+        shots = self.together()
+        command = self.command()
         if shot.photo is None or not request.meshes:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
@@ -325,11 +421,13 @@ class Session:
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
-            self.cancelled, self.searched = False, ()
+            self.cancelled = False
+            self.searched = ()
         result = Result(registrar, *found, inputs, Answer(found[0].hypotheses[0]))
         result.document["viewer"] = {"command": command}
         for each, box in zip(shots, boxes, strict=True):
-            each.result, each.found_box = result, box
+            each.result = result
+            each.found_box = box
         return result.registration
 
     def _register_alone(
@@ -354,8 +452,14 @@ class Session:
             assert shot.view is not None
             assert shot.photo is not None
             camera = Camera(shot.view.camera.at(shot.size).matrix, size=shot.size)
-            views.append(replace(shot.view, photo=shot.path, box=shot.box, camera=camera, image=shot.photo.image))
-        registration, document, photographs = register_rig(Path(self.rig_name), views, registrar, bank_seconds=seconds)
+            views.append(
+                replace(
+                    shot.view, photo=shot.path, box=shot.box, camera=camera, image=shot.photo.image
+                )
+            )
+        registration, document, photographs = register_rig(
+            Path(self.rig_name), views, registrar, bank_seconds=seconds
+        )
         document["mesh"] = self.name(request.meshes[0])
         for row, shot in zip(document["views"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
@@ -364,9 +468,12 @@ class Session:
         return (registration, document, photographs), boxes
 
     def document(self) -> dict[str, Any]:
-        """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done by hand."""
+        """``result.json`` with the answer as its result; ``viewer`` tells what was chosen or done
+        by hand."""
         result = self.shot.require_result()
-        document, registration, answer = dict(result.document), result.chosen, result.answer
+        document = dict(result.document)
+        registration = result.chosen
+        answer = result.answer
         if registration is not result.registration:
             document |= registration.to_dict()
             if registration.views:
@@ -383,16 +490,26 @@ class Session:
         """A Python program that gives the answer."""
         result = self.shot.require_result()
         (request, boxes), prior = result.inputs, result.registration.prior
-        mesh, rows = repr(self.usable_name(request.meshes[0])), result.document["views"]
+        mesh = repr(self.usable_name(request.meshes[0]))
+        rows = result.document["views"]
         photos = [repr(self.usable_name(path)) for path in request.photos]
         if self.shot.is_undistorted:
-            read = "cr.geometry.undistorted(cr.data.read_photo({}).image, cr.load_camera('CALIBRATION')).image"
+            read = (
+                "cr.geometry.undistorted(cr.data.read_photo({}).image, "
+                "cr.load_camera('CALIBRATION')).image"
+            )
             photos = list(map(read.format, photos))
-        more = {name: getattr(request, name) for name in ("link", "textures") if getattr(request, name) is not None}
+        more = {
+            name: getattr(request, name)
+            for name in ("link", "textures")
+            if getattr(request, name) is not None
+        }
         given = "".join(f", {name}={str(value)!r}" for name, value in more.items())
         model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r}{given})"
         model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
-        pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
+        pipeline = (
+            f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
+        )
         pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
         pipeline = f"{pipeline}.with_pose_prior({request.pose!r})" if request.pose else pipeline
         pipeline = "None" if request.bank_decides and not request.pose else pipeline
@@ -407,7 +524,8 @@ class Session:
             call = [
                 f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
                 f"box, camera = {request.box}, {result.document['inputs']['camera']}",
-                f"result = cr.register({photos[0]}, registrar, box=box, camera=camera, prior=prior)",
+                f"result = cr.register({photos[0]}, registrar, box=box, camera=camera, "
+                f"prior=prior)",
             ]
         lines = [
             "import curvireg_torch as cr",
@@ -415,7 +533,11 @@ class Session:
             f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
             *call,
             f"pose = result.hypotheses[{result.answer.number}].pose_dict()",
-            *([f"pose = {result.answer.pose.pose_dict()}  # corrected by hand"] if result.answer.edits else []),
+            *(
+                [f"pose = {result.answer.pose.pose_dict()}  # corrected by hand"]
+                if result.answer.edits
+                else []
+            ),
         ]
         return "\n".join([*lines, "print(pose)", ""])
 
@@ -459,19 +581,33 @@ def _listed(names: Sequence[str]) -> str:
 
 def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:
     """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
-    words = ["curvireg", "register", *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"])]
+    words = [
+        "curvireg",
+        "register",
+        *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"]),
+    ]
     words += list(map(name, options.meshes)) or ["MESH"]
-    limits = {} if options.limits is None or not options.limits.keys() - QUALIFIERS else dict(options.limits)
+    limits = (
+        {}
+        if options.limits is None or not options.limits.keys() - QUALIFIERS
+        else dict(options.limits)
+    )
     values: dict[str, Any] = {
         "box": options.box,
         "camera": "exif" if options.guess == "exif" else options.camera,
         "fov": None if options.guess == "exif" else options.guess,
         **{"near" if limit == "viewpoint" else limit: value for limit, value in limits.items()},
-        **{key.replace("_", "-"): v for key in _OPTIONS if (v := getattr(options, key)) != _DEFAULTS[key]},
+        **{
+            key.replace("_", "-"): v
+            for key in _OPTIONS
+            if (v := getattr(options, key)) != _DEFAULTS[key]
+        },
     }
     for option, value in values.items():
         if value is not None:
-            texts = [str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))]
+            texts = [
+                str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))
+            ]
             is_like_option = texts[0][0] == "-" and isinstance(value, str)
             words += [f"--{option}={value}"] if is_like_option else [f"--{option}", *texts]
     return shlex.join([*words, "--out", "result"])

@@ -1,4 +1,5 @@
-"""A photograph of the page with its box, its result and the chosen pose, and how these are moved by hand."""
+"""A photograph of the page with its box, its result and the chosen pose, and how these are moved by
+hand."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +29,8 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by hand, in words."""
+    """The pose that is shown and saved: a hypothesis, its number from 0, and what was done to it by
+    hand, in words."""
 
     pose: Hypothesis
     number: int = 0
@@ -37,7 +39,8 @@ class Answer:
 
 @dataclass(eq=False)
 class Result:
-    """A registration with its inputs, of one photograph or of those of a rig, and its chosen answer.
+    """A registration with its inputs, of one photograph or of those of a rig, and its chosen
+    answer.
 
     ``answer_before`` is that before the last change by hand.
     """
@@ -52,18 +55,31 @@ class Result:
 
     @property
     def chosen(self) -> Registration:
-        """The registration with the answer first; nobody knows how probable a pose is that was set by hand."""
-        found, answer = self.registration, self.answer
+        """The registration with the answer first; nobody knows how probable a pose is that was set
+        by hand."""
+        found = self.registration
+        answer = self.answer
         if answer.number == 0 and not answer.edits:
             return found
         order = sorted(range(len(found.hypotheses)), key=lambda k: k != answer.number)
-        probabilities = () if answer.edits or not found.probabilities else tuple(found.probabilities[k] for k in order)
+        probabilities = (
+            ()
+            if answer.edits or not found.probabilities
+            else tuple(found.probabilities[k] for k in order)
+        )
         hypotheses = (answer.pose, *(found.hypotheses[k] for k in order[1:]))
         views = found.views
         if views:  # the same pose in the world, which nobody has compared with the photographs
             from_found = torch.linalg.inv(found.transform) @ answer.pose.transform
-            unknown: dict[str, Any] = {"edge_support": None, "similarity": None, "contribution": 0.0}
-            views = tuple(replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown) for v in views)
+            unknown: dict[str, Any] = {
+                "edge_support": None,
+                "similarity": None,
+                "contribution": 0.0,
+            }
+            views = tuple(
+                replace(v, T_cam_from_model=v.T_cam_from_model @ from_found, **unknown)
+                for v in views
+            )
         rest: dict[str, Any] = {"confidence_features": {}, "views": views}
         return replace(found, hypotheses=hypotheses, probabilities=probabilities, **rest)
 
@@ -72,14 +88,20 @@ class Result:
         return T[:3, :3] @ self.registrar.describer.centre + T[:3, 3]
 
     def moved(
-        self, T: Tensor, rotation: Sequence[float] = (0, 0, 0), translation: Sequence[float] = (0, 0, 0)
+        self,
+        T: Tensor,
+        rotation: Sequence[float] = (0, 0, 0),
+        translation: Sequence[float] = (0, 0, 0),
     ) -> Tensor:
-        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along them by radii.
+        """Return the (4, 4) pose ``T``, turned by degrees about the camera's axes and moved along
+        them by radii.
 
         :class:`InvalidInputError` if the object would touch the camera.
         """
         describer = self.registrar.describer
-        angles, shift = (torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation))
+        angles, shift = (
+            torch.tensor(list(v), dtype=torch.float64) for v in (rotation, translation)
+        )
         centre = self.centre(T) + describer.radius * shift
         if float(centre[2]) < NEAREST * describer.radius:
             raise InvalidInputError("the object would touch the camera; move it away")
@@ -89,17 +111,23 @@ class Result:
         return T
 
     def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
-        """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``, its near side."""
-        dx, dy = end[0] - start[0], end[1] - start[1]
+        """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``,
+        its near side."""
+        dx = end[0] - start[0]
+        dy = end[1] - start[1]
         if max(abs(dx), abs(dy)) < 1.0:  # a click
             return T
-        radii = float(self.centre(T)[2]) / float(K[0, 0]) / self.registrar.describer.radius  # that one pixel is long
+        # that one pixel is long
+        radii = float(self.centre(T)[2]) / float(K[0, 0]) / self.registrar.describer.radius
         if turns:
-            return self.moved(T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0))
+            return self.moved(
+                T, rotation=(math.degrees(dy * radii), -math.degrees(dx * radii), 0.0)
+            )
         return self.moved(T, translation=(dx * radii, dy * radii, 0.0))
 
     def scaled(self, T: Tensor, factor: float, roll: float = 0.0) -> Tensor:
-        """Return the pose that shows the object larger, at the same place in the photograph, and rolled by degrees."""
+        """Return the pose that shows the object larger, at the same place in the photograph, and
+        rolled by degrees."""
         shift = (1.0 / factor - 1.0) * self.centre(T) / self.registrar.describer.radius
         return self.moved(T, rotation=(0.0, 0.0, roll), translation=shift.tolist())
 
@@ -108,8 +136,8 @@ class Result:
 class Shot:
     """A photograph, without the distortion of a calibrated camera, and what belongs to it.
 
-    ``box_before`` is that before the last change by hand, ``view`` its row of a rig, ``found_box`` (4,) the box with
-    which the pose was found. Photographs of a rig share their result.
+    ``box_before`` is that before the last change by hand, ``view`` its row of a rig, ``found_box``
+    (4,) the box with which the pose was found. Photographs of a rig share their result.
     """
 
     path: Path = Path()
@@ -146,7 +174,8 @@ class Shot:
 
     @property
     def projection(self) -> tuple[Tensor, Tensor]:
-        """(4, 4) ``T_cam_from_model`` of the answer in this photograph, and (3, 3) camera matrix."""
+        """(4, 4) ``T_cam_from_model`` of the answer in this photograph, and (3, 3) camera
+        matrix."""
         return self.projection_of(self.require_result().answer.pose)
 
     def projection_of(self, pose: Hypothesis) -> tuple[Tensor, Tensor]:
@@ -158,7 +187,8 @@ class Shot:
     def set_box(self, box: Numbers | None) -> None:
         """Replace the box."""
         if box != self.box:
-            self.box_before, self.box = self.box, box
+            self.box_before = self.box
+            self.box = box
 
     def require_result(self) -> Result:
         """The result; an error if there is none yet."""
@@ -169,15 +199,21 @@ class Shot:
     def choose(self, number: int) -> None:
         """Make a hypothesis the answer, by its number from 0."""
         result = self.require_result()
-        result.answer, result.answer_before = Answer(result.registration.hypotheses[number], number), None
+        result.answer = Answer(result.registration.hypotheses[number], number)
+        result.answer_before = None
 
     def place(self, T: Tensor, edit: str = "moved") -> None:
-        """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says how, in words."""
+        """Move the answer to (4, 4) ``T_cam_from_model``, without its measurements; ``edit`` says
+        how, in words."""
         result = self.require_result()
         answer, (before, K), centre = result.answer, self.projection, result.centre(T)
         degrees = float(rotation_error(T[:3, :3], before[:3, :3]))
-        radii = float(torch.linalg.vector_norm(centre - result.centre(before))) / result.registrar.describer.radius
-        allocentric, has_translation = rotation_towards(centre).mT @ T[:3, :3], answer.pose.translation is not None
+        radii = (
+            float(torch.linalg.vector_norm(centre - result.centre(before)))
+            / result.registrar.describer.radius
+        )
+        allocentric = rotation_towards(centre).mT @ T[:3, :3]
+        has_translation = answer.pose.translation is not None
         placed = T if self.view is None else torch.linalg.inv(self.view.T_cam_from_world) @ T
         pose = replace(
             answer.pose,
@@ -192,13 +228,15 @@ class Shot:
             covariance=None,
         )
         edit = f"{edit}: rotated {degrees:.1f} degrees, shifted {radii:.2f} radii"
-        result.answer_before, result.answer = answer, Answer(pose, answer.number, (*answer.edits, edit))
+        result.answer_before = answer
+        result.answer = Answer(pose, answer.number, (*answer.edits, edit))
 
     def fit(self) -> None:
         """Fit the contours at the answer to the photograph's edges."""
         registrar, (T, K) = self.require_result().registrar, self.projection
         assert self.photo is not None
-        contours, margin = registrar.describer.contours, registrar.bank.settings.margin
+        contours = registrar.describer.contours
+        margin = registrar.bank.settings.margin
         fit = fit_contours(contours, self.photo.image, self.found_box, K, T[None], margin=margin)
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
         self.place(fit.transform[0], f"contours fitted, edge support {supports}")
@@ -215,7 +253,9 @@ class Shot:
         assert self.photo is not None
         if result.photographs:
             return views_glb(result.registrar, result.chosen, result.photographs)
-        return pose_glb(result.registrar.bank.mesh, *result.answer.pose.projection, self.photo.image)
+        return pose_glb(
+            result.registrar.bank.mesh, *result.answer.pose.projection, self.photo.image
+        )
 
     def overlay(self) -> bytes:
         """The contours at the answer on the photograph, or on those of the rig, as a PNG file."""
@@ -223,7 +263,9 @@ class Shot:
         assert self.photo is not None
         if result.photographs:
             return views_picture(result.registrar, result.chosen, result.photographs)
-        return png(contour_overlay(result.registrar, result.answer.pose, self.photo.image, self.found_box))
+        return png(
+            contour_overlay(result.registrar, result.answer.pose, self.photo.image, self.found_box)
+        )
 
 
 def numbers(box: Sequence[float]) -> Numbers:
@@ -233,24 +275,39 @@ def numbers(box: Sequence[float]) -> Numbers:
 
 
 def dragged_box(box: Numbers | None, start: Point, end: Point, *, reach: float) -> Numbers | None:
-    """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from inside, or a new one."""
+    """The box in px after a drag: of an edge or corner within ``reach`` px, of all of it from
+    inside, or a new one."""
     (x, y), (u, v) = start, end
     x0, y0, x1, y1 = box or (math.inf, math.inf, -math.inf, -math.inf)
     if x0 - reach <= x <= x1 + reach and y0 - reach <= y <= y1 + reach:
         left, right = _near_edges(x, x0, x1, reach)
         top, bottom = _near_edges(y, y0, y1, reach)
         if not (left or right or top or bottom):
-            x0, y0, x1, y1 = x0 + u - x, y0 + v - y, x1 + u - x, y1 + v - y
-        x0, y0 = u if left else x0, v if top else y0
-        x1, y1 = u if right else x1, v if bottom else y1
+            x0 = x0 + u - x
+            y0 = y0 + v - y
+            x1 = x1 + u - x
+            y1 = y1 + v - y
+        x0 = u if left else x0
+        y0 = v if top else y0
+        x1 = u if right else x1
+        y1 = v if bottom else y1
     else:
-        x0, y0, x1, y1 = x, y, u, v
+        x0 = x
+        y0 = y
+        x1 = u
+        y1 = v
     if min(abs(x1 - x0), abs(y1 - y0)) < MIN_SIDE:
         return box
-    return round(min(x0, x1), 1), round(min(y0, y1), 1), round(max(x0, x1), 1), round(max(y0, y1), 1)
+    return (
+        round(min(x0, x1), 1),
+        round(min(y0, y1), 1),
+        round(max(x0, x1), 1),
+        round(max(y0, y1), 1),
+    )
 
 
 def _near_edges(at: float, low: float, high: float, reach: float) -> tuple[bool, bool]:
-    """Whether the low or the high edge is near; inside, at most a third of the box is near to an edge."""
+    """Whether the low or the high edge is near; inside, at most a third of the box is near to an
+    edge."""
     inside = min(reach, (high - low) / 3)
     return at <= low + inside, at > low + inside and at >= high - inside

@@ -1,4 +1,5 @@
-"""The column beside the photograph: the answers to choose from, the model, and the inputs besides files and box."""
+"""The column beside the photograph: the answers to choose from, the model, and the inputs besides
+files and box."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -25,39 +26,73 @@ DOWNLOADS = {
 VERDICTS = {
     "likely": "Nine in ten such answers are right. Look whether the contours fit all the same.",
     "unsure": "It may be another of the answers below, or none. Choose the one whose contours fit.",
-    "no match": "Probably it is not right: check the mesh, its unit and the box, or choose another answer.",
+    "no match": "Probably it is not right: check the mesh, its unit and the box, or choose "
+    "another answer.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
-UNDISTORTED = "None: the command line takes the box in the photograph as it was taken, the page in the undistorted one."
+UNDISTORTED = (
+    "None: the command line takes the box in the photograph as it was taken, the page "
+    "in the "
+    "undistorted one."
+)
 NOT_IN_RIG = (
-    "None: first write the boxes that were drawn here into the columns x0 to y1 of the rig, and open all photographs."
+    "None: first write the boxes that were drawn here into the columns x0 to y1 of the "
+    "rig, and "
+    "open all photographs."
 )
 PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
-CAMERA_HINT = "With it the position is found. All photographs have the same: type it, or choose a calibration."
-UNIT_CHOICES: Mapping[str | None, str] = {None: "as the file says, else m", **{unit: unit for unit in UNITS}}
+CAMERA_HINT = (
+    "With it the position is found. All photographs have the same: type it, or choose a "
+    "calibration."
+)
+UNIT_CHOICES: Mapping[str | None, str] = {
+    None: "as the file says, else m",
+    **{unit: unit for unit in UNITS},
+}
 AXES: Mapping[str | None, str] = {None: "as the format says", **{axis: axis for axis in UP_AXES}}
 POSES: Mapping[str | None, str] = {None: "default", "any": "any", "upright": "upright"}
 PRESETS: Mapping[str | None, str] = {None: "default", **{name: name for name in PRESET_NAMES}}
 
 
 class Answers:
-    """The chosen answer with its verdict and its downloads, and a card of each answer that can be chosen."""
+    """The chosen answer with its verdict and its downloads, and a card of each answer that can be
+    chosen."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session = workspace, workspace.session
+        self.workspace = workspace
+        self.session = workspace.session
         self.shown_cards: tuple[Result | None, Shot | None] = None, None
         self.shown_answer: tuple[Answer | None, Shot | None] = None, None
-        with region("section", "answers", aria_label="answer", data_testid="answers") as self.section:
+        with region(
+            "section", "answers", aria_label="answer", data_testid="answers"
+        ) as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
                 self.certainty = text("p", "", title=PROBABILITY, data_testid="certainty")
                 with region("div", "row"):
                     for name in DOWNLOADS:
-                        button(name, lambda name=name: self._download(name), f"download-{name}", "quiet")
-                    text("button", "copy as Python", "button quiet", type="button", data_copy="python")
+                        button(
+                            name,
+                            lambda name=name: self._download(name),
+                            f"download-{name}",
+                            "quiet",
+                        )
+                    text(
+                        "button",
+                        "copy as Python",
+                        "button quiet",
+                        type="button",
+                        data_copy="python",
+                    )
                 self.meaning = text("p", "", "facts")
                 self.repairs = region("div", "row", data_testid="repairs")
-            self.cards = region("div", "cards", data_testid="panel-answer", role="group", aria_label="possible answers")
+            self.cards = region(
+                "div",
+                "cards",
+                data_testid="panel-answer",
+                role="group",
+                aria_label="possible answers",
+            )
             self.facts = text("p", "", "lines", data_testid="facts")
 
     async def _download(self, kind: str) -> None:
@@ -70,7 +105,8 @@ class Answers:
 
     async def refresh(self) -> None:
         """Show the answer of the session, if it changed."""
-        shot, answer = self.session.shot, self.session.shot.answer
+        shot = self.session.shot
+        answer = self.session.shot.answer
         self.section.set_visibility(answer is not None)
         if self.shown_answer != (answer, shot):
             self.shown_answer = answer, shot
@@ -84,8 +120,11 @@ class Answers:
             card.props(f"aria-pressed={'true' if answer and number == answer.number else 'false'}")
 
     def _describe(self) -> None:
-        document, shot, result = self.session.document(), self.session.shot, self.session.shot.require_result()
-        answer, pose = result.answer, result.answer.pose
+        document = self.session.document()
+        shot = self.session.shot
+        result = self.session.shot.require_result()
+        answer = result.answer
+        pose = result.answer.pose
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = verdict(document["confidence"], document["none"], document["reliable"])
@@ -94,19 +133,32 @@ class Answers:
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
         set_text(self.meaning, VERDICTS[word])
         confidence = document["confidence"]
-        set_text(self.certainty, "" if confidence is None else f"probability {two_decimals(confidence)}")
+        set_text(
+            self.certainty, "" if confidence is None else f"probability {two_decimals(confidence)}"
+        )
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
         lines = [pose_in_words(pose.rotation, up=mesh_up(mesh), front=front)]
-        lines.append("azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint))
+        lines.append(
+            "azimuth {:.1f}, elevation {:.1f}, theta {:.1f} degrees".format(*pose.viewpoint)
+        )
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
             frame = "translation" if shot.view is None else "translation in the world"
-            lines.append(f"{frame} {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}")
+            lines.append(
+                f"{frame} {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}"
+            )
         numbers = {"score": document["score"], "edge support": document["edge_support"]}
-        lines += [f"{name} {value:.2f}" for name, value in numbers.items() if value is not None and value == value]
+        lines += [
+            f"{name} {value:.2f}"
+            for name, value in numbers.items()
+            if value is not None and value == value
+        ]
         if shot.view is not None:
-            told = [(self.session.name(view["photo"]), view_in_words(view)) for view in document["views"]]
+            told = [
+                (self.session.name(view["photo"]), view_in_words(view))
+                for view in document["views"]
+            ]
             lines += [f"{name}: {words}" for name, words in told if words]
         lines += [*document["warnings"], *remarks(document), *answer.edits]
         set_text(self.facts, "\n".join(lines))
@@ -117,8 +169,11 @@ class Answers:
 
     def _repairs(self, document: Mapping[str, Any]) -> dict[str, Callable[[], None]]:
         """What one click can do about what the page says of the answer."""
-        session, box, found = self.session, document["corrected_box"], dict[str, Callable[[], None]]()
-        shot, options = session.shot, session.options
+        session = self.session
+        box = document["corrected_box"]
+        found = dict[str, Callable[[], None]]()
+        shot = session.shot
+        options = session.options
 
         def search_with(**changes: Any) -> None:
             shot.set_box(changes.pop("box", shot.box))
@@ -138,33 +193,46 @@ class Answers:
         return found
 
     async def _draw_cards(self, shot: Shot) -> None:
-        result, photo, box = shot.require_result(), shot.photo, shot.found_box
+        result = shot.require_result()
+        photo = shot.photo
+        box = shot.found_box
         assert photo is not None
-        image, around = photo.image, [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
-        describer, hypotheses = result.registrar.describer, result.registration.hypotheses
+        image = photo.image
+        around = [0, 0, *photo.image.shape[:0:-1]] if box is None else box.tolist()
+        describer = result.registrar.describer
+        hypotheses = result.registration.hypotheses
         probabilities = result.registration.probabilities or (None,) * len(hypotheses)
 
         def make() -> list[bytes]:
-            return [thumbnail(describer, shot.projection_of(pose), image, around) for pose in hypotheses]
+            return [
+                thumbnail(describer, shot.projection_of(pose), image, around) for pose in hypotheses
+            ]
 
         pictures = await self.workspace.run("page", make) or ()
         self.cards.clear()
         for number, (pose, picture) in enumerate(zip(hypotheses, pictures, strict=False)):
             degrees = float(rotation_error(pose.rotation, hypotheses[0].rotation))
             url = self.workspace.serve(f"answer-{number}.jpeg", picture, "image/jpeg")
-            with self.cards, region("button", "card", type="button", data_testid=f"answer-{number + 1}") as card:
+            with (
+                self.cards,
+                region("button", "card", type="button", data_testid=f"answer-{number + 1}") as card,
+            ):
                 region("img", src=url, alt=f"contours of answer {number + 1}")
-                text("span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else ""))
+                text(
+                    "span", f"Answer {number + 1}" + (f", {degrees:.0f}° from 1" if number else "")
+                )
                 probability = probabilities[number]
                 text("span", "" if probability is None else two_decimals(probability), "facts")
             card.on("click", lambda number=number: shot.choose(number))
 
 
 class Inputs:
-    """Input fields; what is typed or chosen goes into the session, and what changes there is shown."""
+    """Input fields; what is typed or chosen goes into the session, and what changes there is
+    shown."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session = workspace, workspace.session
+        self.workspace = workspace
+        self.session = workspace.session
         self.shown: tuple[Any, ...] = ()
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
@@ -179,7 +247,9 @@ class Inputs:
             self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
             with region("div", "row"):
                 file_chooser("From a file", "upload-camera")
-                self.exif = button("Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet")
+                self.exif = button(
+                    "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
+                )
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -205,7 +275,9 @@ class Inputs:
         camera = numbers(typed) if len(typed) == 4 else None
         await self._set_camera(camera, None if camera else next(iter(typed), None))
 
-    async def _set_camera(self, camera: Numbers | None = None, guess: str | float | None = None) -> None:
+    async def _set_camera(
+        self, camera: Numbers | None = None, guess: str | float | None = None
+    ) -> None:
         await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
 
     def _camera(self) -> tuple[float, ...]:
@@ -215,7 +287,8 @@ class Inputs:
 
     def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
-        session, view = self.session, self.session.shot.view
+        session = self.session
+        view = self.session.shot.view
         set_text(self.command, session.command() or (UNDISTORTED if view is None else NOT_IN_RIG))
         set_text(self.python, "" if session.shot.answer is None else session.python())
         now = (session.shot.path, view is None, session.options)
@@ -231,16 +304,27 @@ class Inputs:
         set_text(self.camera_facts, self._describe_camera())
 
     def _describe_camera(self) -> str:
-        camera, guess, photo = self.session.options.camera, self.session.options.guess, self.session.shot.photo
+        camera = self.session.options.camera
+        guess = self.session.options.guess
+        photo = self.session.shot.photo
         if self.session.shot.view is not None:
-            return "of each photograph, from the rig" + ", without its distortion" * self.session.shot.is_undistorted
+            return (
+                "of each photograph, from the rig"
+                + ", without its distortion" * self.session.shot.is_undistorted
+            )
         if guess == "exif" and photo is not None:
-            focal = f"{photo.focal_35mm:g} mm of a 35 mm camera" if photo.focal_35mm else "has no focal length"
+            focal = (
+                f"{photo.focal_35mm:g} mm of a 35 mm camera"
+                if photo.focal_35mm
+                else "has no focal length"
+            )
             return f"from the photograph's EXIF, {focal}"
         if guess is not None:
             return "from the field of view, to about 10 %"
         if isinstance(camera, Camera):
-            return "from a calibration file" + (", without its distortion" if camera.distorts else "")
+            return "from a calibration file" + (
+                ", without its distortion" if camera.distorts else ""
+            )
         if camera:
             return ""
         if photo is not None and photo.camera() is not None:
@@ -261,7 +345,8 @@ class Preview:
     """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a hint."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session = workspace, workspace.session
+        self.workspace = workspace
+        self.session = workspace.session
         self.shown: tuple[Any, ...] = ()
         self.scene: Any = None
         self.mark = ""
@@ -271,7 +356,12 @@ class Preview:
                 button("It looks like this", self._hint, "looks-like-this")
                 self.no_hint = button("No hint", self.session.remove_limits, "no-hint", "quiet")
                 for name, label in (("up", "Mark what is up"), ("front", "Mark the front")):
-                    button(label, lambda name=name: setattr(self, "mark", name), f"mark-{name}", "quiet")
+                    button(
+                        label,
+                        lambda name=name: setattr(self, "mark", name),
+                        f"mark-{name}",
+                        "quiet",
+                    )
             self.facts = text("p", "", "facts", data_testid="hint-facts")
 
     async def _hint(self) -> None:
@@ -282,7 +372,9 @@ class Preview:
     async def _clicked(self, event: Any) -> None:
         if not self.mark or not event.hits:
             return
-        name, self.mark, hit = self.mark, "", event.hits[0]
+        name = self.mark
+        self.mark = ""
+        hit = event.hits[0]
         axis = self.session.mesh_axis((hit.x, hit.y, hit.z))
         if name == "up":
             self.session.set_limits(front=None)
@@ -292,7 +384,8 @@ class Preview:
 
     async def refresh(self) -> None:
         """Show the mesh of the session, if it or its frame changed, and the hint."""
-        mesh, limits = self.session.mesh, self.session.options.limits or {}
+        mesh = self.session.mesh
+        limits = self.session.options.limits or {}
         self.section.set_visibility(mesh is not None)
         hint = limits.keys() - {"front"}
         self.no_hint.set_visibility(bool(hint))
@@ -305,7 +398,8 @@ class Preview:
         set_text(self.facts, f"Click on the side that is {self.mark}." if self.mark else words)
         if self.shown == (mesh, limits.get("front")):
             return
-        self.shown, self.scene = (mesh, limits.get("front")), None
+        self.shown = (mesh, limits.get("front"))
+        self.scene = None
         self.place.clear()
         if mesh is None or len(mesh.faces) > MAX_VIEWER_FACES:
             return
@@ -313,7 +407,11 @@ class Preview:
             self._draw(self.workspace.serve("model.glb", content, "model/gltf-binary"))
 
     def _draw(self, url: str) -> None:
-        look = {"grid": False, "camera": ui.scene.perspective_camera(fov=40), "background_color": "#c8ced3"}
+        look = {
+            "grid": False,
+            "camera": ui.scene.perspective_camera(fov=40),
+            "background_color": "#c8ced3",
+        }
         with self.place, ui.scene(340, 240, on_click=self._clicked, **look) as scene:
             scene.gltf(url)
             for name, end in (("up", [0, 0, 1.0]), ("front", [0, -1.2, 0])):

@@ -22,42 +22,64 @@ from .workspace import Workspace
 
 PHOTO_SIDE = 2400  # px of the longer side of the displayed photograph, which can be zoomed
 THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs
-LAYER_SIDE, MOVING_SIDE = 1400, 480  # px of the longer side of the layers over it, and while a pose is moved
+# px of the longer side of the layers over it, and while a pose is moved
+LAYER_SIDE = 1400
+MOVING_SIDE = 480
 COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
 HELP = {
-    "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move it. The wheel zooms.",
-    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: roll. Arrow keys move, "
+    "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move "
+    "it. The wheel zooms.",
+    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: "
+    "roll. Arrow keys move, "
     "with Shift turn.",
 }
 
 
 class Stage:
-    """The photographs, one of which is large and can be zoomed; ``page.js`` sends what mouse, fingers and keys do."""
+    """The photographs, one of which is large and can be zoomed; ``page.js`` sends what mouse,
+    fingers and keys do."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self.workspace, self.session = workspace, workspace.session
+        self.workspace = workspace
+        self.session = workspace.session
         self.shown: dict[str, Any] = {}  # what the page shows, to draw only what has changed
-        self.mode, self.mask = "box", np.zeros((1, 1), bool)
+        self.mode = "box"
+        self.mask = np.zeros((1, 1), bool)
         # What a drag began with: the box or the pose, where, and whether it turns.
         self.pressed: tuple[Any, Point, bool] | None = None
         self.drawn: Numbers | None = None  # the box, as it is dragged
         self.moved: Tensor | None = None  # the pose that is being moved by hand
-        self._last_gesture, self._following = 0.0, False
+        self._last_gesture = 0.0
+        self._following = False
         with region("section", "stage", aria_label="photograph", data_testid="stage"):
             with region("div", "empty") as self.empty:
                 text("p", "Drop a photograph and a mesh anywhere on this page", "large")
-                text("p", "The two may come together and in any order. Nothing is sent to the internet.")
+                text(
+                    "p",
+                    "The two may come together and in any order. Nothing is sent to the internet.",
+                )
                 with region("div", "row"):
                     file_chooser("Choose files", "upload-any")
                     button("Try the sample", workspace.load_sample, "sample", "primary")
             with region("div", "photo-area") as self.area:
-                self.strip = region("div", "strip", role="group", aria_label="photographs", data_testid="strip")
-                with region("div", "toolbar", role="toolbar", aria_label="photograph, box and pose"):
+                self.strip = region(
+                    "div", "strip", role="group", aria_label="photographs", data_testid="strip"
+                )
+                with region(
+                    "div", "toolbar", role="toolbar", aria_label="photograph, box and pose"
+                ):
                     self.modes = {
-                        mode: button(mode.capitalize(), lambda mode=mode: self._set_mode(mode), f"mode-{mode}", "quiet")
+                        mode: button(
+                            mode.capitalize(),
+                            lambda mode=mode: self._set_mode(mode),
+                            f"mode-{mode}",
+                            "quiet",
+                        )
                         for mode in HELP
                     }
-                    self.undo = button("Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it")
+                    self.undo = button(
+                        "Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it"
+                    )
                     self.fit = button("Fit the contours", self._fit, "fit", "quiet")
                     for name, symbol in {"out": "−", "fit": "⤢", "in": "+"}.items():
                         zoom = {"type": "button", "data_zoom": name, "aria_label": f"zoom {name}"}
@@ -68,7 +90,9 @@ class Stage:
                     region("div", "canvas", data_testid="photograph") as self.canvas,
                 ):
                     self.photo = region("img", alt="the photograph", draggable="false")
-                    self.solid, self.lines = (region("img", alt="", draggable="false") for _ in range(2))
+                    self.solid, self.lines = (
+                        region("img", alt="", draggable="false") for _ in range(2)
+                    )
                     self.shapes = ui.html("", sanitize=False).classes("shapes")
                 with region("div", "layers") as self.layers:
                     with region("label"):
@@ -76,9 +100,15 @@ class Stage:
                         slider = {"type": "range", "min": "0", "max": "100", "value": "35"}
                         region("input", data_testid="mesh", data_property="--mesh", **slider)
                     with region("label"):
-                        contours = region("input", type="checkbox", data_testid="contours", checked="checked")
+                        contours = region(
+                            "input", type="checkbox", data_testid="contours", checked="checked"
+                        )
                         text("span", "Contours")
-                    contours.on("change", lambda e: self.lines.set_visibility(bool(e.args)), args=["target.checked"])
+                    contours.on(
+                        "change",
+                        lambda e: self.lines.set_visibility(bool(e.args)),
+                        args=["target.checked"],
+                    )
                     text("p", LEGEND, "facts")
         ui.on("stage", self._handle)
 
@@ -100,8 +130,10 @@ class Stage:
 
     async def _handle(self, event: Any) -> None:
         """Correct the box or the pose; coordinates come as fractions of the photograph."""
-        shot, what = self.session.shot, event.args
-        if shot.photo is None or shot.photo is not self.shown.get("photo"):  # another window has just changed it
+        shot = self.session.shot
+        what = event.args
+        # another window has just changed it
+        if shot.photo is None or shot.photo is not self.shown.get("photo"):
             return
         H, W = shot.size
         point = float(what.get("x", 0.0)) * W - 0.5, float(what.get("y", 0.0)) * H - 0.5
@@ -115,9 +147,11 @@ class Stage:
             await self._follow()
 
     def _change_box(self, what: Any, point: Point, reach: float) -> None:
-        shot, kind = self.session.shot, what["type"]
+        shot = self.session.shot
+        kind = what["type"]
         if kind == "press":
-            self.pressed, self.drawn = (shot.box, point, False), shot.box
+            self.pressed = (shot.box, point, False)
+            self.drawn = shot.box
         elif kind == "move" and self.pressed is not None:
             self.drawn = dragged_box(shot.box, self.pressed[1], point, reach=reach)
         elif kind in ("release", "cancel") and self.pressed is not None:
@@ -151,27 +185,35 @@ class Stage:
             elif kind == "nudge" and what["shift"]:
                 self.moved = result.moved(T, rotation=(what["dy"], -what["dx"], 0.0))
             elif kind == "nudge":
-                self.moved = result.moved(T, translation=(0.01 * what["dx"], 0.01 * what["dy"], 0.0))
+                self.moved = result.moved(
+                    T, translation=(0.01 * what["dx"], 0.01 * what["dy"], 0.0)
+                )
         except InvalidInputError:  # the object would touch the camera: it stays
             return
 
     def _on_mesh(self, x: float, y: float) -> bool:
         """Whether the mesh is drawn at a pixel."""
         (rows, columns), (H, W) = self.mask.shape, self.session.shot.size
-        row, column = int((y + 0.5) / H * rows), int((x + 0.5) / W * columns)
+        row = int((y + 0.5) / H * rows)
+        column = int((x + 0.5) / W * columns)
         return 0 <= row < rows and 0 <= column < columns and bool(self.mask[row, column])
 
     async def _follow(self) -> None:
-        """Draw the pose that is being moved; poses that come meanwhile are dropped but for the last."""
+        """Draw the pose that is being moved; poses that come meanwhile are dropped but for the
+        last."""
         if self._following:
             return
-        self._following, drawn = True, None
+        self._following = True
+        drawn = None
         shot = self.session.shot
-        registrar, K = shot.require_result().registrar, shot.projection[1]
+        registrar = shot.require_result().registrar
+        K = shot.projection[1]
         try:
             while self.moved is not None and self.moved is not drawn:
                 drawn = self.moved
-                layers = await asyncio.to_thread(pose_layers, registrar, (drawn, K), shot.size, MOVING_SIDE)
+                layers = await asyncio.to_thread(
+                    pose_layers, registrar, (drawn, K), shot.size, MOVING_SIDE
+                )
                 if self.moved is not None:
                     self._show_layers(layers)
         finally:
@@ -179,7 +221,8 @@ class Stage:
 
     def _commit(self) -> None:
         """Make the pose that was moved the answer."""
-        shot, moved = self.session.shot, self.moved
+        shot = self.session.shot
+        moved = self.moved
         self._end_gesture()
         if moved is None or shot.answer is None or shot.photo is not self.shown.get("photo"):
             return
@@ -204,16 +247,22 @@ class Stage:
         self.area.set_visibility(shot.photo is not None)
         if shot.photo is None:
             return
-        new_photo, new_box = self._changed("photo", shot.photo), self._changed("box", shot.box)
+        new_photo = self._changed("photo", shot.photo)
+        new_box = self._changed("box", shot.box)
         if self._changed("result", shot.result) or new_photo:
             self._end_gesture()
             self.mode = "box" if shot.result is None else "pose"
-        elif new_box and self.pressed is None and self.moved is None:  # changed elsewhere on the page
+        # changed elsewhere on the page
+        elif new_box and self.pressed is None and self.moved is None:
             self.mode = "box"
         if new_photo:
             self.shown["answer"] = "of another photograph"  # those of a rig share theirs
             await self._show_photo()
-        if self.pressed is None and self.moved is not None and time.monotonic() - self._last_gesture > COMMIT_SECONDS:
+        if (
+            self.pressed is None
+            and self.moved is not None
+            and time.monotonic() - self._last_gesture > COMMIT_SECONDS
+        ):
             self._commit()
         self._show_mode()
         if self._changed("answer", shot.answer):
@@ -226,21 +275,30 @@ class Stage:
         await self._show_strip()
 
     async def _show_strip(self) -> None:
-        """Show small pictures of the photographs, if there are several, and mark the one that is shown."""
+        """Show small pictures of the photographs, if there are several, and mark the one that is
+        shown."""
         shots = tuple(self.session.shots)  # others may be opened meanwhile
         images = [shot.photo.image for shot in shots if shot.photo is not None]
         if list(map(id, images)) != list(map(id, self.shown.get("strip", []))):
             self.shown["strip"] = images
 
             def make() -> list[bytes]:
-                return [jpeg(shrink(to_uint8(image), THUMBNAIL_SIDE), 80) for image in images if len(images) > 1]
+                return [
+                    jpeg(shrink(to_uint8(image), THUMBNAIL_SIDE), 80)
+                    for image in images
+                    if len(images) > 1
+                ]
 
             pictures = await self.workspace.run("page", make) or ()
             self.strip.clear()
             for number, picture in enumerate(pictures):
                 url = self.workspace.serve(f"photograph-{number}.jpg", picture, "image/jpeg")
                 name = self.session.name(shots[number].path)
-                attributes = {"type": "button", "title": name, "data_testid": f"photograph-{number + 1}"}
+                attributes = {
+                    "type": "button",
+                    "title": name,
+                    "data_testid": f"photograph-{number + 1}",
+                }
                 with self.strip, region("button", "thumbnail", **attributes) as thumbnail:
                     region("img", src=url, alt=name)
                 thumbnail.on("click", lambda shot=shots[number]: self._select(shot))
@@ -255,7 +313,8 @@ class Stage:
         self.workspace.messages.pop("pose", None)
 
     def _show_mode(self) -> None:
-        is_pose, shot = self.mode == "pose", self.session.shot
+        is_pose = self.mode == "pose"
+        shot = self.session.shot
         self.canvas.props(f"data-mode={self.mode}")
         self.viewport.props(f'aria-label="Photograph. {HELP[self.mode]}"')
         self.hint.set_content(HELP[self.mode])
@@ -270,29 +329,38 @@ class Stage:
     async def _show_photo(self) -> None:
         photo = self.session.shot.photo
         assert photo is not None
-        content = await self.workspace.run("page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92))
+        content = await self.workspace.run(
+            "page", lambda: jpeg(shrink(to_uint8(photo.image), PHOTO_SIDE), 92)
+        )
         if content:
             H, W = photo.image.shape[-2:]
-            self.photo.props(f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"')
+            self.photo.props(
+                f'src="{self.workspace.serve("photograph.jpg", content, "image/jpeg")}"'
+            )
             self.viewport.style(f"--ratio: {W / H:.5f}")
 
     async def _render_answer(self) -> None:
         shot = self.session.shot
         if shot.answer is None:
             return
-        registrar, projection = shot.require_result().registrar, shot.projection
+        registrar = shot.require_result().registrar
+        projection = shot.projection
         draw = partial(pose_layers, registrar, projection, shot.size, LAYER_SIDE)
         if layers := await self.workspace.run("page", draw):
             self._show_layers(layers)
 
     def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:
         self.mask = layers[2]
-        for element, name, content in zip((self.solid, self.lines), ("solid", "lines"), layers[:2], strict=True):
+        for element, name, content in zip(
+            (self.solid, self.lines), ("solid", "lines"), layers[:2], strict=True
+        ):
             element.props(f'src="{self.workspace.serve(f"{name}.png", content, "image/png")}"')
 
     def _draw_shapes(self) -> None:
         """Draw the box, with handles where it can be changed."""
-        shot, is_box, parts = self.session.shot, self.mode == "box", ""
+        shot = self.session.shot
+        is_box = self.mode == "box"
+        parts = ""
         box = self.drawn if is_box and self.pressed is not None else shot.box
         if shot.photo is None:
             return
@@ -303,17 +371,21 @@ class Stage:
             parts += f"<rect {shape} class='rim'/><rect {shape} class='line'/>"
         if box is not None and is_box:  # squares of the same size at every zoom
             middle = ((x0 + x1) / 2, (y0 + y1) / 2)
-            points = [(x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle]
+            points = [
+                (x, y) for x in (x0, middle[0], x1) for y in (y0, middle[1], y1) if (x, y) != middle
+            ]
             path = " ".join(f"M{x:g} {y:g}h0" for x, y in points)
             parts += f"<path d='{path}' class='handle rim'/><path d='{path}' class='handle line'/>"
-        self.shapes.set_content(f"<svg viewBox='-0.5 -0.5 {W} {H}' preserveAspectRatio='none'>{parts}</svg>")
+        self.shapes.set_content(
+            f"<svg viewBox='-0.5 -0.5 {W} {H}' preserveAspectRatio='none'>{parts}</svg>"
+        )
 
 
 def pose_layers(
     registrar: Registrar, projection: tuple[Tensor, Tensor], size: tuple[int, int], side: int
 ) -> tuple[bytes, bytes, np.ndarray]:
-    """Two transparent PNGs over a photograph of ``size`` (H, W), at most ``side`` px long: the shaded mesh and its
-    contours; and a mask of the mesh."""
+    """Two transparent PNGs over a photograph of ``size`` (H, W), at most ``side`` px long: the
+    shaded mesh and its contours; and a mask of the mesh."""
     T, K = projection
     scale = min(1.0, side / max(size))
     small = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))

@@ -17,7 +17,11 @@ def region(tag: str, classes: str = "", **values: str) -> Any:
 
 def text(tag: str, content: str = "", classes: str = "", **values: str) -> Any:
     """An element with text."""
-    return ui.html(escape(content), tag=tag, sanitize=False).classes(classes).props(_attributes(values))
+    return (
+        ui.html(escape(content), tag=tag, sanitize=False)
+        .classes(classes)
+        .props(_attributes(values))
+    )
 
 
 def _attributes(values: Mapping[str, str]) -> str:
@@ -29,9 +33,13 @@ def set_text(element: Any, content: str) -> None:
     element.set_content(escape(content))
 
 
-def button(label: str, on_click: Callable[..., Any], test_id: str, classes: str = "", **values: str) -> Any:
+def button(
+    label: str, on_click: Callable[..., Any], test_id: str, classes: str = "", **values: str
+) -> Any:
     """A button; symbols need an ``aria_label``."""
-    element = text("button", label, f"button {classes}", type="button", data_testid=test_id, **values)
+    element = text(
+        "button", label, f"button {classes}", type="button", data_testid=test_id, **values
+    )
     return element.on("click", lambda: on_click())
 
 
@@ -53,4 +61,6 @@ def file_chooser(label: str, test_id: str) -> None:
     with region("label", "button file"):
         ui.label(label)
         accept = ",".join((*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip"))
-        region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props("multiple")
+        region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props(
+            "multiple"
+        )

@@ -1,4 +1,5 @@
-"""The work that the windows of the page show, and the files that it receives. It needs no NiceGUI."""
+"""The work that the windows of the page show, and the files that it receives. It needs no
+NiceGUI."""
 
 import asyncio
 import errno
@@ -16,7 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from ..data import load_camera
-from ..errors import MAX_ARCHIVE_FILES, MAX_MESH_BYTES, MAX_VIEWER_BYTES, CurviregError, InvalidInputError, OutputError
+from ..errors import (
+    MAX_ARCHIVE_FILES,
+    MAX_MESH_BYTES,
+    MAX_VIEWER_BYTES,
+    CurviregError,
+    InvalidInputError,
+    OutputError,
+)
 from ..evaluation.opening import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
@@ -26,9 +34,19 @@ CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
 MAX_ARCHIVE_DEPTH = 32  # folders around a file in a zip archive
 DIRECTORY_BYTES = 1024  # largest mean size of an entry in the directory of a zip archive
 RIG_PARTS = ("cameras.txt", "scene_gt.json", "scene_gt_info.json")
-SAMPLE_CREDIT = "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh was modelled after it"
+SAMPLE_CREDIT = (
+    "photograph by Rachel Michetti, courtesy of Pikolo Espresso Bar (CC0); the mesh "
+    "was modelled "
+    "after it"
+)
 SAMPLE_BOX = (172.0, 18.0, 409.0, 308.0)  # of the cup, in px
-SAMPLE_OPTIONS: dict[str, Any] = {"unit": "mm", "up": None, "pose": "upright", "limits": None, "mesh_is": None}
+SAMPLE_OPTIONS: dict[str, Any] = {
+    "unit": "mm",
+    "up": None,
+    "pose": "upright",
+    "limits": None,
+    "mesh_is": None,
+}
 SAMPLE_OPTIONS |= {"camera": None, "guess": 30.0}  # estimated from the ellipses in the photograph
 
 _caught: ContextVar[list[Any]] = ContextVar("caught")
@@ -44,18 +62,21 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
-        messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the "page" itself.
+        messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the
+            "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving: folders, names and sizes of files that are being received.
         started: when the search began, in seconds of ``time.monotonic``.
     """
 
     def __init__(self, options: RegisterOptions, folder: Path) -> None:
-        self.session, self.folder = Session(options, folder), folder
+        self.session = Session(options, folder)
+        self.folder = folder
         self.messages: dict[str, str] = {}
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving = dict[Path, tuple[str, int]]()
-        self.started, self._version = 0.0, 0
+        self.started = 0.0
+        self._version = 0
         self._lock = asyncio.Lock()
         self._search: asyncio.Task[None] | None = None
         self._begun = False  # whether the search has waited for the jobs before it
@@ -104,9 +125,14 @@ class Workspace:
         self.messages[part] = self.session.without_folders(message)
 
     def start_search(self) -> asyncio.Task[None]:
-        """Find the pose in the photograph that is shown, as soon as files are open; one search at a time."""
+        """Find the pose in the photograph that is shown, as soon as files are open; one search at a
+        time."""
         if self._search is None:
-            self.session.progress, self.session.cancelled, self.started = ("", 0, 1), False, time.monotonic()
+            self.session.progress, self.session.cancelled, self.started = (
+                ("", 0, 1),
+                False,
+                time.monotonic(),
+            )
             self._begun = False
             self._search = asyncio.create_task(self._find())
         return self._search
@@ -130,10 +156,13 @@ class Workspace:
             shutil.rmtree(folder, ignore_errors=True)
 
     async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
-        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or a calibration."""
+        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or
+        a calibration."""
         stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
         if stored + sum(each for _, each in self.receiving.values()) + size > MAX_VIEWER_BYTES:
-            raise InvalidInputError(f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs")
+            raise InvalidInputError(
+                f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs"
+            )
         path = self._new_place(name)
         self.receiving[path.parent] = name, size
         try:
@@ -157,13 +186,17 @@ class Workspace:
                 async for block in blocks:
                     received += len(block)
                     if received > size:  # in chunks, a request may send more than it has announced
-                        raise InvalidInputError(f"{path.name}: larger than announced; send it again")
+                        raise InvalidInputError(
+                            f"{path.name}: larger than announced; send it again"
+                        )
                     await asyncio.to_thread(file.write, block)
         except OSError as error:
             raise cannot_store(path.name, error) from error
 
     async def _open_upload(self, path: Path) -> None:
-        suffix, session, rig = path.suffix.lower(), self.session, self.session.rig_path
+        suffix = path.suffix.lower()
+        session = self.session
+        rig = self.session.rig_path
         kinds = (*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
         self.messages.pop("file", None)
         if suffix in kinds and self._before_sample is not None:
@@ -171,14 +204,20 @@ class Workspace:
         if suffix not in kinds:
             self.messages["file"] = (
                 f"{path.name}: neither a photograph ({PICTURE_NAMES}) nor a mesh "
-                f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and buffers) nor a "
-                f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or scene_camera.json)"
+                f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and "
+                f"buffers) nor a "
+                f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or "
+                f"scene_camera.json)"
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
             if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
                 await self.set_option("unit", "mm")  # of BOP sets
             await self.open_rig(path.parent if path.name == "scene_camera.json" else path)
-        elif rig is not None and (not session.rig or path.name in RIG_PARTS) and suffix in CALIBRATIONS:
+        elif (
+            rig is not None
+            and (not session.rig or path.name in RIG_PARTS)
+            and suffix in CALIBRATIONS
+        ):
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
             await self.open_rig(rig)
         elif suffix in CALIBRATIONS:
@@ -194,7 +233,15 @@ class Workspace:
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
         session = self.session
-        used = [path for path in (session.mesh_path, session.rig_path, *(shot.path for shot in session.shots)) if path]
+        used = [
+            path
+            for path in (
+                session.mesh_path,
+                session.rig_path,
+                *(shot.path for shot in session.shots),
+            )
+            if path
+        ]
         for folder in set(self.folder.glob("upload-*")) - self.receiving.keys():
             if not any(folder in (path, *path.parents) for path in used):
                 shutil.rmtree(folder)
@@ -214,7 +261,11 @@ class Workspace:
     async def remove_photo(self) -> None:
         """Close the photograph that is shown; a search in it is stopped."""
         shot = self.session.shot
-        await self.run("photograph", lambda: self.session.remove_photo(shot), stop=shot in self.session.searched)
+        await self.run(
+            "photograph",
+            lambda: self.session.remove_photo(shot),
+            stop=shot in self.session.searched,
+        )
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
@@ -223,7 +274,8 @@ class Workspace:
             await self.open_mesh(self.session.mesh_path)
 
     def _leave_sample(self) -> None:
-        """Close the sample and bring back the options of before it, as one's own files replace it."""
+        """Close the sample and bring back the options of before it, as one's own files replace
+        it."""
         if self._before_sample is not None:
             self.session.close()
             self.session.options, self._before_sample = self._before_sample, None
@@ -252,7 +304,8 @@ class Workspace:
         session.open_mesh(STATIC / "cup.ply")
 
     def serve(self, name: str, content: bytes, media_type: str) -> str:
-        """Put a file on the server; returns its address relative to the page, which is new each time."""
+        """Put a file on the server; returns its address relative to the page, which is new each
+        time."""
         self._version += 1
         self.files[name] = (content, media_type)
         return f"file/{name}?v={self._version}"
@@ -265,8 +318,9 @@ def cannot_store(name: str, error: OSError) -> OutputError:
 
 
 class _Archive(FileIO):
-    """A zip archive of which no more than ``most`` bytes are read at a time, while ``zipfile`` reads its directory:
-    several records tell its size, and it becomes many times as large in memory."""
+    """A zip archive of which no more than ``most`` bytes are read at a time, while ``zipfile``
+    reads its directory: several records tell its size, and it becomes many times as large in
+    memory."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -286,17 +340,27 @@ class _Archive(FileIO):
 
 
 def unpack(archive: Path, folder: Path) -> Path:
-    """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of the only mesh."""
+    """Unpack a zip archive into a new folder, which ``zipfile`` does not leave; return the path of
+    the only mesh."""
     name = archive.name
     try:
         with _Archive(archive) as file, zipfile.ZipFile(file) as content:
             file.most = None
             members = content.infolist()
-            if len(members) > MAX_ARCHIVE_FILES or sum(member.file_size for member in members) > MAX_MESH_BYTES:
+            if (
+                len(members) > MAX_ARCHIVE_FILES
+                or sum(member.file_size for member in members) > MAX_MESH_BYTES
+            ):
                 limits = f"{MAX_ARCHIVE_FILES:,} files or {MAX_MESH_BYTES:,} bytes when unpacked"
-                raise InvalidInputError(f"{name}: more than {limits}; pack only the mesh and its parts")
+                raise InvalidInputError(
+                    f"{name}: more than {limits}; pack only the mesh and its parts"
+                )
             if any(member.filename.count("/") > MAX_ARCHIVE_DEPTH for member in members):
-                message = f"folders in more than {MAX_ARCHIVE_DEPTH} folders; pack only the mesh and its parts"
+                message = (
+                    f"folders in more than {MAX_ARCHIVE_DEPTH} folders; pack only the mesh "
+                    f"and "
+                    f"its parts"
+                )
                 raise InvalidInputError(f"{name}: {message}")
             content.extractall(folder)  # at most the bytes that the headers claim
     except InvalidInputError:
@@ -304,11 +368,19 @@ def unpack(archive: Path, folder: Path) -> Path:
     except Exception as error:  # zipfile raises many kinds
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             raise cannot_store(name, error) from None
-        raise InvalidInputError(f"{name}: the archive cannot be unpacked; pack it again, without a password") from None
-    meshes = [p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")]
+        raise InvalidInputError(
+            f"{name}: the archive cannot be unpacked; pack it again, without a password"
+        ) from None
+    meshes = [
+        p for p in folder.rglob("*") if p.suffix.lower() in MESHES and not p.name.startswith("._")
+    ]
     robots = [path for path in meshes if path.suffix.lower() == ".urdf"]
     meshes = robots if len(robots) == 1 else meshes  # the others are those of its links
     if len(meshes) != 1:
-        found = "no mesh" if not meshes else "several meshes: " + ", ".join(p.name for p in meshes[:4])
-        raise InvalidInputError(f"{name}: {found}; put one of {', '.join(MESHES)} with its parts into it")
+        found = (
+            "no mesh" if not meshes else "several meshes: " + ", ".join(p.name for p in meshes[:4])
+        )
+        raise InvalidInputError(
+            f"{name}: {found}; put one of {', '.join(MESHES)} with its parts into it"
+        )
     return meshes[0]

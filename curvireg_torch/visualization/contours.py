@@ -1,4 +1,5 @@
-"""The contours that were fitted, as anti-aliased lines with a dark rim, which show on any background."""
+"""The contours that were fitted, as anti-aliased lines with a dark rim, which show on any
+background."""
 
 from collections.abc import Sequence
 
@@ -13,13 +14,19 @@ from ..matching import ViewDescriber
 from ..rendering.contours import LEVELS
 from .encoding import to_uint8
 
-OUTLINE, CREASE, BOX, RIM = (0, 255, 80), (255, 170, 0), (255, 255, 255), (0, 0, 0)
+OUTLINE = (0, 255, 80)
+CREASE = (255, 170, 0)
+BOX = (255, 255, 255)
+RIM = (0, 0, 0)
 RIM_OPACITY = 0.7  # of the black rim
-FIT_SIZE = LEVELS[-1][0]  # Side in px of the crop in which contours are found, as in the last rounds of a fit
-# Side of the object in px of the picture for which a fit's number of points would be drawn without gaps
+# Side in px of the crop in which contours are found, as in the last rounds of a fit
+FIT_SIZE = LEVELS[-1][0]
+# Side of the object in px of the picture for which a fit's number of points would be drawn without
+# gaps
 SIDE_WITHOUT_GAPS = 20.0
 MAX_DENSITY = 80.0  # Largest multiple of a fit's number of points
-# Shortest inner edge that is drawn, as a fraction of the object's size: rough meshes have bumps of all directions
+# Shortest inner edge that is drawn, as a fraction of the object's size: rough meshes have bumps of
+# all directions
 SHORT = 0.06
 
 
@@ -29,7 +36,8 @@ def line_width(size: Sequence[int]) -> float:
 
 
 def close_up(size: Sequence[int], box: Sequence[float]) -> tuple[int, int, int, int]:
-    """A square window around a box in px with a margin, moved into a photograph of ``size`` (H, W) and cut there."""
+    """A square window around a box in px with a margin, moved into a photograph of ``size`` (H, W)
+    and cut there."""
     (H, W), (x0, y0, x1, y1) = size, box
     side = round(1.3 * max(x1 - x0, y1 - y0)) + 2
     left = max(0, min(round(0.5 * (x0 + x1 - side)), W - side))
@@ -45,21 +53,30 @@ def draw_window(
     scale: float,
     box: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box in px below them.
+    """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box
+    in px below them.
 
-    ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh. ``window`` is x0,
-    y0, x1, y1 without the last column and row, and is resized by ``scale``.
+    ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh.
+    ``window`` is x0, y0, x1, y1 without the last column and row, and is resized by ``scale``.
     """
     x0, y0, x1, y1 = window
     picture = to_uint8(image[:, y0:y1, x0:x1])
     if scale != 1.0:
         size = max(1, round((x1 - x0) * scale)), max(1, round((y1 - y0) * scale))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC))
-    fx, fy = picture.shape[1] / (x1 - x0), picture.shape[0] / (y1 - y0)
-    moved = [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]]  # of pixel centres
+        picture = np.asarray(
+            cv2.resize(
+                picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+            )
+        )
+    fx = picture.shape[1] / (x1 - x0)
+    fy = picture.shape[0] / (y1 - y0)
+    # of pixel centres
+    moved = [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]]
     resize = torch.tensor(moved, dtype=torch.float64)
     if box is not None:
-        corners = resize @ torch.tensor([[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64)
+        corners = resize @ torch.tensor(
+            [[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64
+        )
         start, end = corners[:2].mT.round().int().tolist()
         width = max(1, round(line_width(picture.shape[:2]) / 3))
         for colour, thickness in ((RIM, width + 2), (BOX, width)):
@@ -74,8 +91,11 @@ def draw_window(
     return picture
 
 
-def contour_layer(describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]) -> np.ndarray:
-    """Outline (green), inner occluding edges and creases (orange) of a mesh at a pose, on a transparent layer.
+def contour_layer(
+    describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]
+) -> np.ndarray:
+    """Outline (green), inner occluding edges and creases (orange) of a mesh at a pose, on a
+    transparent layer.
 
     Args:
         describer: of the mesh.
@@ -104,7 +124,9 @@ def contour_layer(describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence
     to_inner = _distance(inner[near])
     green = _coverage(to_outline, width / 2)
     orange = _coverage(to_inner, max(0.75, width / 3))
-    alpha = RIM_OPACITY * np.maximum(_coverage(to_outline, width), _coverage(to_inner, 0.85 * width))
+    alpha = RIM_OPACITY * np.maximum(
+        _coverage(to_outline, width), _coverage(to_inner, 0.85 * width)
+    )
     colour = np.zeros((*alpha.shape, 3), np.float32)
     for paint, cover in ((CREASE, orange), (OUTLINE, green)):
         colour += cover[..., None] * (np.array(paint, np.float32) - colour)
@@ -117,10 +139,12 @@ def contour_layer(describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence
 def contour_pixels(
     describer: ViewDescriber, T: Tensor, K: Tensor, size: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (P, 2) of the contours that a fit compares at a pose, and which of them are on the outline (P,) bool.
+    """Pixels (P, 2) of the contours that a fit compares at a pose, and which of them are on the
+    outline (P,) bool.
 
-    They are found in the crop of the projected mesh, as in the last rounds of a fit, or in the picture of ``size``
-    (H, W) if a part of the mesh is behind the camera, with as many points as a line without gaps needs.
+    They are found in the crop of the projected mesh, as in the last rounds of a fit, or in the
+    picture of ``size`` (H, W) if a part of the mesh is behind the camera, with as many points as a
+    line without gaps needs.
     """
     pose = T[None].double().cpu()
     K = K.double().cpu()
@@ -148,7 +172,8 @@ def _mask(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray:
 
 
 def _long_lines(lines: np.ndarray, least: float) -> np.ndarray:
-    """Lines (H, W) without their parts that are shorter than ``least`` px; points at most two px apart are a line."""
+    """Lines (H, W) without their parts that are shorter than ``least`` px; points at most two px
+    apart are a line."""
     connected = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(connected, connectivity=8)
     extent = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) - 2
@@ -156,7 +181,8 @@ def _long_lines(lines: np.ndarray, least: float) -> np.ndarray:
 
 
 def _distance(lines: np.ndarray) -> np.ndarray:
-    """Distance of each pixel to the nearest pixel of the lines, smoothed so that stairs become slopes."""
+    """Distance of each pixel to the nearest pixel of the lines, smoothed so that stairs become
+    slopes."""
     if not lines.any():
         return np.full(lines.shape, np.inf, np.float32)
     distance = cv2.distanceTransform((~lines).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

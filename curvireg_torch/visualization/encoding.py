@@ -13,7 +13,9 @@ def png(picture: np.ndarray) -> bytes:
 
 def jpeg(picture: np.ndarray, quality: int) -> bytes:
     """A JPEG file of (H, W, 3) uint8 RGB; ``quality`` is 0 to 100."""
-    return bytes(cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
+    return bytes(
+        cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    )
 
 
 def shrink(picture: np.ndarray, side: int) -> np.ndarray:
@@ -26,7 +28,8 @@ def shrink(picture: np.ndarray, side: int) -> np.ndarray:
 
 
 def to_uint8(image: Tensor) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8; black for NaN."""
+    """(H, W, 3) uint8 RGB, always a copy, of a (1 or 3, H, W) image, floating in [0, 1] or uint8;
+    black for NaN."""
     pixels = image.detach().cpu()
     if pixels.is_floating_point():
         pixels = (pixels.float().nan_to_num(0.0, 0.0, 0.0).clamp(0, 1) * 255).round().byte()

@@ -1,4 +1,5 @@
-"""Pictures that show whether a registration is right: contours on the photograph, and how the pose was found."""
+"""Pictures that show whether a registration is right: contours on the photograph, and how the pose
+was found."""
 
 import math
 from collections.abc import Sequence
@@ -21,21 +22,30 @@ from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
 from .encoding import to_uint8
 
-LEAST, MOST = 960, 1600  # px of the photograph's longer side in the picture
+# px of the photograph's longer side in the picture
+LEAST = 960
+MOST = 1600
 NARROWEST = 720  # px of width that the caption needs
 TILE = 180  # least side of a small picture in px
 GAP = 10  # px between pictures
-PAPER, INK, FAINT = (255, 255, 255), (30, 30, 30), (100, 100, 100)
+PAPER = (255, 255, 255)
+INK = (30, 30, 30)
+FAINT = (100, 100, 100)
 VERDICT_COLOURS = {"likely": (20, 125, 65), "unsure": (185, 105, 0), "no match": (190, 40, 40)}
 LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. White: the box."
 
 
-def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any) -> np.ndarray:
-    """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the box (white).
+def contour_overlay(
+    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+) -> np.ndarray:
+    """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the
+    box (white).
 
     Args:
-        registrar, result: the result of this registrar, or one of its hypotheses; it is drawn with its ``projection``.
-        image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or a path; (4,) px.
+        registrar, result: the result of this registrar, or one of its hypotheses; it is drawn with
+            its ``projection``.
+        image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or
+            a path; (4,) px.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -43,19 +53,28 @@ def contour_overlay(registrar: Registrar, result: Registration | Hypothesis, ima
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
     describer = registrar.of_model(getattr(result, "model", 0)).describer
-    return draw_window(describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist())
+    return draw_window(
+        describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist()
+    )
 
 
 def views_sheet(
-    describer: ViewDescriber, views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]]
+    describer: ViewDescriber,
+    views: Sequence[tuple[tuple[Tensor, Tensor], Tensor, Sequence[float] | None, str]],
 ) -> np.ndarray:
-    """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or None, caption."""
+    """(H, W, 3) uint8 RGB: photographs side by side; of each pose and camera matrix, pixels, box or
+    None, caption."""
     columns = math.ceil(math.sqrt(len(views)))
     side = MOST // columns - GAP
     tiles = []
     for projection, image, box, caption in views:
         H, W = image.shape[-2:]
-        tiles.append((caption, draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box)))
+        tiles.append(
+            (
+                caption,
+                draw_window(describer, projection, image, (0, 0, W, H), side / max(H, W), box),
+            )
+        )
     height = max(picture.shape[0] for _, picture in tiles)
     sheet = Image.new("RGB", (MOST, -(-len(views) // columns) * (height + 32 + GAP)), PAPER)
     _paste_tiles(sheet, tiles, (0, 0), columns, (side, height), 16)
@@ -70,10 +89,12 @@ def _paste_tiles(
     size: tuple[int, int],
     line: int,
 ) -> None:
-    """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line`` px high."""
+    """Paste pictures into a grid of cells of ``size`` (W, H), each with its caption below, ``line``
+    px high."""
     draw, font, (W, H) = ImageDraw.Draw(sheet), ImageFont.load_default(line), size
     for k, (caption, picture) in enumerate(tiles):
-        x, y = corner[0] + k % columns * (W + GAP), corner[1] + k // columns * (H + 2 * line + GAP)
+        x = corner[0] + k % columns * (W + GAP)
+        y = corner[1] + k // columns * (H + 2 * line + GAP)
         h, w = picture.shape[:2]
         sheet.paste(Image.fromarray(picture), (x + (W - w) // 2, y + (H - h) // 2))
         draw.text((x, y + H + line // 3), caption, INK, font)
@@ -83,10 +104,13 @@ def _paste_tiles(
 def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
-    """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see :func:`contour_overlay`."""
+    """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
+    :func:`contour_overlay`."""
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
-    crop = crop_regions([item.image], item.box[None, None], size=settings.image_size, margin=settings.margin)[0]
+    crop = crop_regions(
+        [item.image], item.box[None, None], size=settings.image_size, margin=settings.margin
+    )[0]
     field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))[0]
     at = result.allocentric_rotation[None], torch.tensor([result.distance])
     shaded = registrar.describer.shaded(*at)[0]  # grey, or grey and RGB
@@ -108,10 +132,11 @@ def _field_picture(field: Tensor) -> np.ndarray:
 def registration_sheet(
     registrar: Registrar, result: Registration, image: Any, box: Any, *, note: str = ""
 ) -> np.ndarray:
-    """The photograph with the pose's contours and a caption; below it a close-up, the compared fields and the rivals.
+    """The photograph with the pose's contours and a caption; below it a close-up, the compared
+    fields and the rivals.
 
-    The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the answer and its
-    probability. Arguments as for :func:`contour_overlay`; ``note`` ends the legend.
+    The photograph's longer side becomes 960 to 1600 px. Below a rival stand its rotation from the
+    answer and its probability. Arguments as for :func:`contour_overlay`; ``note`` ends the legend.
 
     Returns:
         (H', W', 3) uint8 RGB.
@@ -120,27 +145,45 @@ def registration_sheet(
     registrar = registrar.of_model(result.model)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
-    photograph = draw_window(registrar.describer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist())
-    height, width = photograph.shape[0], max(NARROWEST, photograph.shape[1])
+    photograph = draw_window(
+        registrar.describer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist()
+    )
+    height = photograph.shape[0]
+    width = max(NARROWEST, photograph.shape[1])
     count = 3 + len(result.hypotheses)
     rows = -(-count // (width // TILE))
     columns = -(-count // rows)
     side = (width - GAP) // columns - GAP
-    text, line = max(15, width // 60), max(12, side // 13)
-    top, step = height + 4 * text + GAP, side + 2 * line + GAP
+    text = max(15, width // 60)
+    line = max(12, side // 13)
+    top = height + 4 * text + GAP
+    step = side + 2 * line + GAP
     sheet = Image.new("RGB", (width, top + rows * step), PAPER)
     sheet.paste(Image.fromarray(photograph), ((width - photograph.shape[1]) // 2, 0))
     _draw_caption(ImageDraw.Draw(sheet), registrar, result, (GAP, height + text // 2), text, note)
-    _paste_tiles(sheet, _small_pictures(registrar, result, item, side), (GAP, top), columns, (side, side), line)
+    _paste_tiles(
+        sheet,
+        _small_pictures(registrar, result, item, side),
+        (GAP, top),
+        columns,
+        (side, side),
+        line,
+    )
     return np.asarray(sheet).copy()
 
 
 def _draw_caption(
-    draw: ImageDraw.ImageDraw, registrar: Registrar, result: Registration, corner: tuple[int, int], size: int, note: str
+    draw: ImageDraw.ImageDraw,
+    registrar: Registrar,
+    result: Registration,
+    corner: tuple[int, int],
+    size: int,
+    note: str,
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
-    word, font = verdict(result.confidence, result.none, result.reliable), ImageFont.load_default(size)
+    word = verdict(result.confidence, result.none, result.reliable)
+    font = ImageFont.load_default(size)
     badge = word
     if result.confidence is not None:
         badge += f": confidence {two_decimals(result.confidence)}"
@@ -167,7 +210,9 @@ def _small_pictures(
     window = close_up(item.size, item.box.tolist())
     scale = side / max(window[2] - window[0], window[3] - window[1])
     describer = registrar.describer
-    close_ups = [draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses]
+    close_ups = [
+        draw_window(describer, h.projection, item.image, window, scale) for h in result.hypotheses
+    ]
     sides = side_pictures(registrar, result, item.image, item.box)
     names = "photograph field", "view field", "pose"
     captions = "edges of the photograph", "edges of the mesh", "mesh at this pose"
@@ -177,5 +222,10 @@ def _small_pictures(
 
 
 def _rival(result: Registration, index: int) -> str:
-    angle = f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° away"
-    return f"{angle} ({two_decimals(result.probabilities[index])})" if result.probabilities else angle
+    angle = (
+        f"rival: {float(rotation_error(result.hypotheses[index].rotation, result.rotation)):.0f}° "
+        f"away"
+    )
+    return (
+        f"{angle} ({two_decimals(result.probabilities[index])})" if result.probabilities else angle
+    )

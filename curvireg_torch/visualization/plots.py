@@ -1,4 +1,5 @@
-"""Figures of registrations, as ``matplotlib.figure.Figure``; :class:`MissingDependencyError` without matplotlib."""
+"""Figures of registrations, as ``matplotlib.figure.Figure``; :class:`MissingDependencyError`
+without matplotlib."""
 
 from typing import Any
 
@@ -9,7 +10,8 @@ from .overlay import side_pictures
 
 
 def viewpoints(bank: ViewBank, result: Registration) -> Any:
-    """Best score of each viewing direction of a bank over azimuth and elevation; several maxima are rival poses.
+    """Best score of each viewing direction of a bank over azimuth and elevation; several maxima are
+    rival poses.
 
     The hypotheses are numbered, best first.
     """
@@ -25,15 +27,20 @@ def viewpoints(bank: ViewBank, result: Registration) -> Any:
     for number, pose in enumerate(result.hypotheses, start=1):
         azimuth, elevation, _ = pose.viewpoint
         axes.plot(azimuth % 360.0, elevation, "o", mfc="white", mec="black", ms=11, clip_on=False)
-        axes.annotate(str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8)
+        axes.annotate(
+            str(number), (azimuth % 360.0, elevation), ha="center", va="center_baseline", fontsize=8
+        )
     return figure
 
 
 def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any) -> Any:
-    """The photograph and its field, the pose and its field; arguments as for :func:`.contour_overlay`."""
+    """The photograph and its field, the pose and its field; arguments as for
+    :func:`.contour_overlay`."""
     pictures = side_pictures(registrar, result, image, box)
     figure = _figure(10.0, 2.9)
-    for axes, (name, pixels) in zip(figure.subplots(1, len(pictures)), pictures.items(), strict=True):
+    for axes, (name, pixels) in zip(
+        figure.subplots(1, len(pictures)), pictures.items(), strict=True
+    ):
         axes.imshow(pixels)
         axes.set_title(name)
         axes.set_axis_off()
@@ -53,5 +60,7 @@ def _figure(width: float, height: float) -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingDependencyError("plots: matplotlib is not installed; pip install matplotlib") from error
+        raise MissingDependencyError(
+            "plots: matplotlib is not installed; pip install matplotlib"
+        ) from error
     return Figure(figsize=(width, height), layout="constrained")

@@ -19,15 +19,24 @@ from ..utils.choices import UNITS
 from .encoding import jpeg, shrink, to_uint8
 
 _PHOTO_SIDE = 1024
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenCV's camera to glTF's, which has y up and looks along -z
-_MATT = {"name": "matt", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}, "doubleSided": True}
+# from OpenCV's camera to glTF's, which has y up and looks along -z
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_MATT = {
+    "name": "matt",
+    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9},
+    "doubleSided": True,
+}
 
 
-def pose_glb(mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor) -> bytes:
-    """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane behind the mesh.
+def pose_glb(
+    mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Tensor, image: Tensor
+) -> bytes:
+    """A GLB file: the mesh at its pose, a camera at the origin, and the photograph on a plane
+    behind the mesh.
 
-    Lengths are metres and y points up, as glTF requires. A glTF camera has no principal point, so the exact camera and
-    the pose, in the mesh's unit, are in the ``extras`` of the node "photograph". Textures become colours of vertices.
+    Lengths are metres and y points up, as glTF requires. A glTF camera has no principal point, so
+    the exact camera and the pose, in the mesh's unit, are in the ``extras`` of the node
+    "photograph". Textures become colours of vertices.
 
     Args:
         mesh: from :func:`curvireg_torch.load_mesh`, with its unit in ``mesh.units``.
@@ -35,7 +44,8 @@ def pose_glb(mesh: trimesh.Trimesh, T_cam_from_model: Tensor, camera_matrix: Ten
         image: (1 or 3, H, W) floating in [0, 1] or uint8.
 
     Raises:
-        InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object behind the camera.
+        InvalidInputError: a pose that is not rigid, an unusable camera or image, or an object
+            behind the camera.
 
     Example:
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]], dtype=torch.float64)
@@ -52,38 +62,55 @@ def mesh_glb(mesh: trimesh.Trimesh, transform: Tensor) -> bytes:
     """A GLB file of the mesh alone, moved by a (4, 4) transform to glTF's axes and metres."""
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), transform=transform.numpy())
-    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_make_matt))
+    return bytes(
+        trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_make_matt)
+    )
 
 
 def scene_glb(
-    mesh: trimesh.Trimesh, T_world_from_model: Tensor, cameras: Sequence[tuple[Tensor, Tensor, Tensor]]
+    mesh: trimesh.Trimesh,
+    T_world_from_model: Tensor,
+    cameras: Sequence[tuple[Tensor, Tensor, Tensor]],
 ) -> bytes:
-    """:func:`pose_glb` of a pose in the world and of cameras: ``T_cam_from_world``, camera matrix and photograph."""
+    """:func:`pose_glb` of a pose in the world and of cameras: ``T_cam_from_world``, camera matrix
+    and photograph."""
     T = T_world_from_model.detach().cpu().double()
     unit = mesh_unit(mesh) or "m"
     metres = UNITS[unit]
     scale = np.diag([metres, metres, metres, 1.0])
     scene = trimesh.Scene()
     scene.add_geometry(_coloured(mesh), node_name="object", transform=scale @ _FLIP @ T.numpy())
-    lenses, nodes = [], []
+    lenses = []
+    nodes = []
     for number, (pose, matrix, image) in enumerate(cameras):
         check_camera_matrix(matrix)
         check_photograph(image, "image")
-        P, K = pose.detach().cpu().double(), matrix.detach().cpu().double()
+        P = pose.detach().cpu().double()
+        K = matrix.detach().cpu().double()
         depth = float((P @ T @ torch.cat([mesh_centre(mesh), torch.ones(1)]))[2])
         if depth <= 0:
-            raise InvalidInputError("T_cam_from_model: the object is behind the camera; check the pose")
+            raise InvalidInputError(
+                "T_cam_from_model: the object is behind the camera; check the pose"
+            )
         H, W = (int(n) for n in image.shape[-2:])
         world_from_camera = scale @ _FLIP @ np.linalg.inv(P.numpy())
         plane = _photograph_plane(image, K, depth + 1.05 * mesh_radius(mesh))
         scene.add_geometry(plane, node_name=f"picture {number}", transform=world_from_camera)
-        yfov, aspect = 2 * math.atan(H / (2 * float(K[1, 1]))), W * float(K[1, 1]) / (H * float(K[0, 0]))
+        yfov = 2 * math.atan(H / (2 * float(K[1, 1])))
+        aspect = W * float(K[1, 1]) / (H * float(K[0, 0]))
         lens = {"yfov": yfov, "aspectRatio": aspect, "znear": 0.01 * depth * metres}
         lenses.append({"type": "perspective", "perspective": lens})
-        exact = {"T_cam_from_model": (P @ T).tolist(), "camera_matrix": K.tolist(), "size": [W, H], "unit": unit}
+        exact = {
+            "T_cam_from_model": (P @ T).tolist(),
+            "camera_matrix": K.tolist(),
+            "size": [W, H],
+            "unit": unit,
+        }
         place = world_from_camera @ _FLIP @ np.linalg.inv(scale)
         name = "photograph" if len(cameras) == 1 else f"photograph {number}"
-        nodes.append({"name": name, "camera": number, "matrix": place.T.flatten().tolist(), "extras": exact})
+        nodes.append(
+            {"name": name, "camera": number, "matrix": place.T.flatten().tolist(), "extras": exact}
+        )
 
     def with_cameras(tree: dict[str, Any]) -> None:
         tree["cameras"] = lenses
@@ -95,7 +122,11 @@ def scene_glb(
                 material["extensions"] = {"KHR_materials_unlit": {}}
                 tree["extensionsUsed"] = ["KHR_materials_unlit"]
 
-    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=with_cameras))
+    return bytes(
+        trimesh.exchange.gltf.export_glb(
+            scene, include_normals=True, tree_postprocessor=with_cameras
+        )
+    )
 
 
 def _make_matt(tree: dict[str, Any]) -> None:
@@ -113,8 +144,11 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     rgb = np.full(3, 190 / 255)
     colours = surface_colours(mesh)
     if colours is not None:
-        index, zero = np.arange(len(faces), dtype=np.int32), np.zeros(len(faces), np.float32)
-        corners = [colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))]
+        index = np.arange(len(faces), dtype=np.int32)
+        zero = np.zeros(len(faces), np.float32)
+        corners = [
+            colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))
+        ]
         rgb = np.stack(corners, axis=1)
     # From sRGB: the vertex colours of glTF are linear.
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
@@ -127,15 +161,21 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _photograph_plane(image: Tensor, K: Tensor, depth: float) -> trimesh.Trimesh:
     """The photograph as a plane at a depth, in OpenCV's camera frame."""
     H, W = (int(n) for n in image.shape[-2:])
-    right, bottom = W - 0.5, H - 0.5
+    right = W - 0.5
+    bottom = H - 0.5
     edges = [[-0.5, -0.5, 1.0], [right, -0.5, 1.0], [right, bottom, 1.0], [-0.5, bottom, 1.0]]
     pixels = torch.tensor(edges, dtype=torch.float64)
     corners = (depth * pixels @ torch.linalg.inv(K).T).numpy()
     uv = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
     faces = np.array([[0, 3, 2], [0, 2, 1]])  # counterclockwise after the flip
-    texture = Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))  # exporters write it as JPEG
+    # exporters write it as JPEG
+    texture = Image.open(BytesIO(jpeg(shrink(to_uint8(image), _PHOTO_SIDE), 85)))
     material = trimesh.visual.material.PBRMaterial(
-        name="picture", baseColorTexture=texture, metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True
+        name="picture",
+        baseColorTexture=texture,
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        doubleSided=True,
     )
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(corners, faces, visual=visual, process=False)

@@ -1,4 +1,5 @@
-"""One HTML page of results: thumbnails with the contours at the estimated poses, best or worst first."""
+"""One HTML page of results: thumbnails with the contours at the estimated poses, best or worst
+first."""
 
 import base64
 import html
@@ -29,15 +30,15 @@ figcaption {{ overflow-wrap: anywhere }}
 <main id="all">
 {figures}
 </main><script>const all = document.getElementById("all")</script></body></html>
-"""
+"""  # noqa: E501
 
 
 @dataclass(frozen=True)
 class SheetEntry:
     """A photograph on the page: the number of its row, from 1, its name, and the outcome in words.
 
-    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red); ``picture`` is the file
-    of its thumbnail; ``rank`` is smaller for better ones.
+    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red);
+    ``picture`` is the file of its thumbnail; ``rank`` is smaller for better ones.
     """
 
     number: int
@@ -51,7 +52,8 @@ class SheetEntry:
 def thumbnail(
     describer: ViewDescriber, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]
 ) -> bytes:
-    """JPEG of a (3, H, W) uint8 photograph around a box in px, with the mesh's contours at the pose.
+    """JPEG of a (3, H, W) uint8 photograph around a box in px, with the mesh's contours at the
+    pose.
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3) of the photograph.
     """
@@ -60,12 +62,16 @@ def thumbnail(
     return jpeg(draw_window(describer, projection, image, window, scale, box), 80)
 
 
-def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int = MAX_ENTRIES) -> None:
-    """Write the page of ``rows`` as one file, best first; ``table`` is the name of the file that has all of them.
+def write_sheet(
+    path: Path, title: str, rows: Sequence[SheetEntry], *, table: str, each: int = MAX_ENTRIES
+) -> None:
+    """Write the page of ``rows`` as one file, best first; ``table`` is the name of the file that
+    has all of them.
 
     Of many rows, ``each`` of the best and of the worst are shown.
     """
-    note, rows = "Best first; failed ones last.", sorted(rows, key=lambda row: row.rank)
+    note = "Best first; failed ones last."
+    rows = sorted(rows, key=lambda row: row.rank)
     if len(rows) > 2 * each:
         rows = [*rows[:each], *rows[-each:]]
         note = f"The {each} best, then the {each} worst; {table} has them all."
@@ -75,7 +81,8 @@ def write_sheet(path: Path, title: str, rows: Sequence[SheetEntry], *, table: st
 
 
 def _figure(entry: SheetEntry) -> str:
-    name, picture = html.escape(entry.name), ""
+    name = html.escape(entry.name)
+    picture = ""
     if entry.picture is not None and entry.picture.is_file():
         data = base64.b64encode(entry.picture.read_bytes()).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'

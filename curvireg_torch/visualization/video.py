@@ -19,9 +19,11 @@ _LONGER_SIDE = 960  # of the frames in px; larger ones are scaled down
 
 
 class OverlayVideo(AbstractContextManager["OverlayVideo"]):
-    """Writes frames with the contours of the mesh at the pose, and the confidence in words, to an MP4 file.
+    """Writes frames with the contours of the mesh at the pose, and the confidence in words, to an
+    MP4 file.
 
-    The file is complete only after :meth:`close`; as a context manager, the video closes itself, whatever happens.
+    The file is complete only after :meth:`close`; as a context manager, the video closes itself,
+    whatever happens.
 
     Args:
         path: of the file, which ends in ``.mp4``.
@@ -32,16 +34,21 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         >>> import tempfile
         >>> import curvireg_torch as cr
         >>> from curvireg_torch.synthetic import example_mesh
-        >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90), image_size=64, progress=False)
+        >>> bank = cr.ViewBank.build(example_mesh(), cr.sample_views(azimuth_step=90),
+        ...     image_size=64, progress=False)
         >>> registrar, image = cr.Registrar(bank), torch.rand(3, 120, 160)
-        >>> with OverlayVideo(Path(tempfile.mkdtemp(), "overlay.mp4"), registrar, fps=10.0) as video:
-        ...     video.add(image, registrar([image], [[40, 30, 120, 90]], cr.camera_matrix(150, 150, 79.5, 59.5))[0])
+        >>> with OverlayVideo(Path(tempfile.mkdtemp(), "overlay.mp4"), registrar,
+        ...     fps=10.0) as video:
+        ...     video.add(image, registrar([image], [[40, 30, 120, 90]], cr.camera_matrix(150, 150,
+        ...     79.5, 59.5))[0])
         >>> video.path.name
         'overlay.mp4'
     """
 
     def __init__(self, path: Path, registrar: Registrar, *, fps: float) -> None:
-        self.path, self.registrar, self.fps = path, registrar, fps
+        self.path = path
+        self.registrar = registrar
+        self.fps = fps
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
 
@@ -62,9 +69,12 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         self._writer.write(picture[..., ::-1])
 
     def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
-        self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)  # the codec needs even numbers
+        # the codec needs even numbers
+        self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size)
+        writer = cv2.VideoWriter(
+            str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, self._size
+        )
         if not writer.isOpened():
             warnings.warn("this OpenCV has no MPEG-4 encoder; no overlay is written", stacklevel=3)
         return writer
@@ -78,25 +88,41 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         self.close()
 
 
-def annotated_frame(registrar: Registrar, image: Tensor, result: Registration | FailedRegistration) -> np.ndarray:
-    """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose, and a caption."""
+def annotated_frame(
+    registrar: Registrar, image: Tensor, result: Registration | FailedRegistration
+) -> np.ndarray:
+    """(H, W, 3) uint8 of the image, of at most 960 px, with the mesh's contours if there is a pose,
+    and a caption."""
     H, W = image.shape[-2:]
     found = isinstance(result, Registration)
     describer = registrar.of_model(result.model if found else 0).describer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
-    picture = draw_window(describer, result.projection if found else None, image, (0, 0, W, H), scale)
+    picture = draw_window(
+        describer, result.projection if found else None, image, (0, 0, W, H), scale
+    )
     text, colour = caption(result)
     scale = max(0.4, picture.shape[1] / 1200)
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
     cv2.rectangle(picture, (0, 0), (width + 12, height + below + 6), colour, cv2.FILLED)
-    cv2.putText(picture, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.putText(
+        picture,
+        text,
+        (6, height + 4),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        scale,
+        (255, 255, 255),
+        1,
+        cv2.LINE_AA,
+    )
     return picture
 
 
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
-        return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS["no match"]
+        return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS[
+            "no match"
+        ]
     word = verdict(result.confidence, result.none, result.reliable)
     number = "" if result.confidence is None else f", confidence {two_decimals(result.confidence)}"
     return word + number, VERDICT_COLOURS[word]

@@ -2,12 +2,13 @@
 A gallery of failures
 =====================
 
-A generated photograph of a toy truck is registered with its own mesh and camera. The first picture shows a correct
-pose. Each of the others violates one condition of the method, and the estimated pose, drawn by its contours, is wrong.
+A generated photograph of a toy truck is registered with its own mesh and camera. The first picture
+shows a correct pose. Each of the others violates one condition of the method, and the estimated
+pose, drawn by its contours, is wrong.
 
-**Check the confidence.** It was fitted on generated photographs that meet most of these conditions. Where they are
-violated, confidence and edge support drop: none of the wrong poses below is called reliable (0.9 or more). This is no
-guarantee, so check the overlay first.
+**Check the confidence.** It was fitted on generated photographs that meet most of these conditions.
+Where they are violated, confidence and edge support drop: none of the wrong poses below is called
+reliable (0.9 or more). This is no guarantee, so check the overlay first.
 """
 
 import matplotlib.pyplot as plt
@@ -16,11 +17,17 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.synthetic import example_mesh, procedural_background, random_pose, synthesize_photograph
+from curvireg_torch.synthetic import (
+    example_mesh,
+    procedural_background,
+    random_pose,
+    synthesize_photograph,
+)
 from curvireg_torch.visualization import contour_overlay
 from scripts.scenes.families import random_shape
 
-mesh, size = example_mesh(), (360, 480)
+mesh = example_mesh()
+size = (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 upright = cr.Pipeline().with_pose_prior("upright")
 truck = cr.Registrar(mesh, pipeline=upright, progress=False)
@@ -42,7 +49,10 @@ def show(picture, box, truth, title, registrar=truck):
     ax.set(title=f"{title}\n{error:.0f}° from the truth; {numbers}", xticks=[], yticks=[])
     (x0, y0, x1, y1), room = box.tolist(), 50
     height, width = picture.shape[1:]
-    ax.set(xlim=(max(x0 - room, 0), min(x1 + room, width)), ylim=(min(y1 + room, height), max(y0 - room, 0)))
+    ax.set(
+        xlim=(max(x0 - room, 0), min(x1 + room, width)),
+        ylim=(min(y1 + room, height), max(y0 - room, 0)),
+    )
     plt.show()
 
 
@@ -82,12 +92,18 @@ show(
 # The mesh of another object
 # --------------------------
 #
-# The mesh is a car's, with its front along -y like the truck's. A similar mesh works sometimes; here front and back are
-# confused.
+# The mesh is a car's, with its front along -y like the truck's. A similar mesh works sometimes;
+# here front and back are confused.
 
 vertices, faces, _ = random_shape(np.random.default_rng(3), "car")
 car = trimesh.Trimesh(vertices, faces, process=False)
-show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=upright, progress=False))
+show(
+    picture,
+    box,
+    truth,
+    "another object's mesh",
+    cr.Registrar(car, pipeline=upright, progress=False),
+)
 
 # %%
 # A box that is far too large
@@ -97,14 +113,21 @@ show(picture, box, truth, "another object's mesh", cr.Registrar(car, pipeline=up
 
 picture, box, truth = photograph(1)
 x0, y0, x1, y1 = box.tolist()
-wide, high = x1 - x0, y1 - y0
-show(picture, torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y1 + 0.4 * high]), truth, "a wrong box")
+wide = x1 - x0
+high = y1 - y0
+show(
+    picture,
+    torch.tensor([x0 - 0.3 * wide, y0 - 0.1 * high, x1 + 0.1 * wide, y1 + 0.4 * high]),
+    truth,
+    "a wrong box",
+)
 
 # %%
 # The whole image as the box
 # --------------------------
 #
-# A given box is trusted: the object is assumed to fill it. Without a box, the object would be detected.
+# A given box is trusted: the object is assumed to fill it. Without a box, the object would be
+# detected.
 
 picture, box, truth = photograph(5)
 show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image")
@@ -113,8 +136,8 @@ show(picture, torch.tensor([-0.5, -0.5, 479.5, 359.5]), truth, "the whole image"
 # Four fifths hidden
 # ------------------
 #
-# An occluder covers the object; the box is that of the whole object. With six tenths hidden, this truck is still
-# registered.
+# An occluder covers the object; the box is that of the whole object. With six tenths hidden, this
+# truck is still registered.
 
 picture, box, truth = photograph(2)
 x0, y0, x1, y1 = box.tolist()

@@ -2,15 +2,16 @@
 The method in pictures
 ======================
 
-Photograph and mesh are both converted to vector fields and then to descriptors; matching them gives a pose.
+Photograph and mesh are both converted to vector fields and then to descriptors; matching them gives
+a pose.
 """
 
 # %%
 # Input
 # -----
 #
-# A photograph, a box around the object, the camera matrix if known, and a mesh. Here all are generated, so that the
-# true pose is known.
+# A photograph, a box around the object, the camera matrix if known, and a mesh. Here all are
+# generated, so that the true pose is known.
 
 from dataclasses import replace
 
@@ -22,7 +23,8 @@ from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.visualization import contour_overlay
 
-mesh, size = example_mesh(), (360, 480)
+mesh = example_mesh()
+size = (360, 480)
 K = cr.camera_matrix(520.0, 520.0, 239.5, 179.5, dtype=torch.float64)
 generator = torch.Generator().manual_seed(1)
 truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0))
@@ -44,9 +46,9 @@ plt.show()
 # The photograph's side: a field
 # ------------------------------
 #
-# The square crop around the box becomes a vector field: its length is the edge strength, its direction points across
-# the edge. Focus curves respond to every edge in focus; the default, a small network trained on generated scenes,
-# responds to the edges of the object's shape only.
+# The square crop around the box becomes a vector field: its length is the edge strength, its
+# direction points across the edge. Focus curves respond to every edge in focus; the default, a
+# small network trained on generated scenes, responds to the edges of the object's shape only.
 
 crop = cr.crop_images([photograph], box[None], size=128)[0]
 focus = cr.MultiScaleFocusCurves()(crop)
@@ -62,11 +64,13 @@ plt.show()
 # The mesh's side: depth views and their curvilinear saliency
 # -----------------------------------------------------------
 #
-# The depth of the mesh is rendered from many viewpoints. The curvilinear saliency of a depth image is the difference of
-# the principal curvatures of its graph: large at occluding contours and creases, zero on planes and spheres.
+# The depth of the mesh is rendered from many viewpoints. The curvilinear saliency of a depth image
+# is the difference of the principal curvatures of its graph: large at occluding contours and
+# creases, zero on planes and spheres.
 
 registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
-bank, describer = registrar.bank, registrar.matcher.describer
+bank = registrar.bank
+describer = registrar.matcher.describer
 distances = bank.views.distance * mesh_radius(mesh)
 some = torch.arange(20, len(bank), len(bank) // 6)[:6]
 depth = describer.depth(bank.rotations[some], distances[some])[0]
@@ -84,14 +88,17 @@ plt.show()
 # Both become HOG descriptors
 # ---------------------------
 #
-# HOG accumulates orientations modulo 180 degrees in 8 x 8 cells, so a field and its negative have equal descriptors.
-# The drawing shows the directions *along* the edges in each cell, for the photograph and for the right view.
+# HOG accumulates orientations modulo 180 degrees in 8 x 8 cells, so a field and its negative have
+# equal descriptors. The drawing shows the directions *along* the edges in each cell, for the
+# photograph and for the right view.
 
 query = registrar.matcher.query([photograph], box[None])
 with torch.no_grad():
     ranking = registrar.matcher.rank(query)
 right = int(cr.rotation_error(bank.rotations, truth[:3, :3].to(bank.rotations)).argmin())
-view_field = cr.DepthCurvilinearSaliency(sigma=0.8)(describer.depth(bank.rotations[[right]], distances[[right]])[0])
+view_field = cr.DepthCurvilinearSaliency(sigma=0.8)(
+    describer.depth(bank.rotations[[right]], distances[[right]])[0]
+)
 
 
 def draw_cells(axes, field, title):
@@ -101,8 +108,11 @@ def draw_cells(axes, field, title):
         for x in range(8):
             for k, weight in enumerate(cells[y, x]):
                 angle = torch.tensor((k + 0.5) * torch.pi / 9 + torch.pi / 2)
-                dx, dy = 0.45 * angle.cos(), 0.45 * angle.sin()
-                axes.plot([x - dx, x + dx], [y - dy, y + dy], color="black", alpha=float(weight), lw=1.5)
+                dx = 0.45 * angle.cos()
+                dy = 0.45 * angle.sin()
+                axes.plot(
+                    [x - dx, x + dx], [y - dy, y + dy], color="black", alpha=float(weight), lw=1.5
+                )
     axes.set(title=title, xticks=[], yticks=[], aspect="equal", xlim=(-0.6, 7.6), ylim=(7.6, -0.6))
 
 
@@ -115,10 +125,11 @@ plt.show()
 # A score for every view
 # ----------------------
 #
-# The product of the ranking terms for all azimuths and elevations of the bank. The cross marks the true viewpoint.
-# Other high scores become hypotheses, too.
+# The product of the ranking terms for all azimuths and elevations of the bank. The cross marks the
+# true viewpoint. Other high scores become hypotheses, too.
 
-azimuths, elevations = bank.views.azimuth.unique(), bank.views.elevation.unique()
+azimuths = bank.views.azimuth.unique()
+elevations = bank.views.elevation.unique()
 order = (bank.views.elevation * 1000 + bank.views.azimuth).argsort()
 scores = ranking.scores[0][order].reshape(len(elevations), len(azimuths)).log10().clamp(min=-12)
 azimuth, elevation, _ = cr.viewpoint_from_rotation(truth[:3, :3])
@@ -134,8 +145,9 @@ plt.show()
 # From the best views to a pose
 # -----------------------------
 #
-# From the best distinct views, the contour fit moves the mesh's contours onto the photograph's edges. Left: the best
-# view of the bank, placed into the box; a pose that is not fitted has no calibrated confidence. Right: the final pose.
+# From the best distinct views, the contour fit moves the mesh's contours onto the photograph's
+# edges. Left: the best view of the bank, placed into the box; a pose that is not fitted has no
+# calibrated confidence. Right: the final pose.
 
 coarse = cr.Registrar(bank, pipeline=replace(bank.pipeline, contours=False))
 before = coarse([photograph], box[None], K)[0]

@@ -1,17 +1,20 @@
 """Render photographs with known poses in BOP's layout, for `curvireg evaluate bop`.
 
     python scripts/benchmark/make.py --kind printed --count 300 --out /data/printed [--jobs 2]
-    python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out /data/shelf
-    python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count 300 --out /data/chairs
+    python scripts/benchmark/make.py --kind shelf --objects 8 20 --cameras 3 --count 100 --out
+    /data/shelf python scripts/benchmark/make.py --kind furniture --meshes /data/furniture --count
+    300 --out /data/chairs
 
---kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py; ``shapes``, the
-procedural families of scripts/scenes; ``tied`` ones, of which several poses look the same from most sides; ``shelf``,
-several printed packages side by side, all annotated. A scene has one photograph, or one for each of --cameras, or
---frames of a moving camera. --cut puts a fraction of the object outside the photograph. To calibrate confidence, --cad
-annotates an object as another one: similar, of its kind; wrong, any other; print, a package of the same shape with
-another print; mirrored, a tied shape's mirror image. Scene i depends only on the seed and i; an interrupted run can be
-resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture, ``bbox_visib`` of its visible part.
-OUT/benchmark.json holds the options, and the group of each object for scripts/calibration.
+--kind: ``printed`` packages, whose labels alone tell their sides apart; ``furniture`` of meshes.py;
+``shapes``, the procedural families of scripts/scenes; ``tied`` ones, of which several poses look
+the same from most sides; ``shelf``, several printed packages side by side, all annotated. A scene
+has one photograph, or one for each of --cameras, or --frames of a moving camera. --cut puts a
+fraction of the object outside the photograph. To calibrate confidence, --cad annotates an object as
+another one: similar, of its kind; wrong, any other; print, a package of the same shape with another
+print; mirrored, a tied shape's mirror image. Scene i depends only on the seed and i; an interrupted
+run can be resumed. Boxes are exact: ``bbox_obj`` of the whole silhouette inside the picture,
+``bbox_visib`` of its visible part. OUT/benchmark.json holds the options, and the group of each
+object for scripts/calibration.
 """
 
 import argparse
@@ -45,11 +48,14 @@ from scripts.scenes.tied import tied_shape
 
 KINDS = ("printed", "shelf", "furniture", "shapes", "tied")
 CADS = ("exact", "similar", "wrong", "print", "mirrored")
-SAME_LOOK = 0.97  # fraction of the surface that has the same material after a symmetry of the appearance
+# fraction of the surface that has the same material after a symmetry of the appearance
+SAME_LOOK = 0.97
 TWIN = 100_000  # added to the number of an object with another print, or of its mirror image
 MIN_PIXELS = 400  # of a silhouette; smaller ones are not annotated
-MAX_PROPORTION = 1.6  # factor between the proportions of similar objects; if none is within it, the closest is taken
-FULL_TURN = 12  # symmetries about z of a body of revolution, whose azimuth is undefined: it is excluded
+# factor between the proportions of similar objects; if none is within it, the closest is taken
+MAX_PROPORTION = 1.6
+# symmetries about z of a body of revolution, whose azimuth is undefined: it is excluded
+FULL_TURN = 12
 
 
 class Packages:
@@ -58,7 +64,8 @@ class Packages:
     photographs: Sequence[Path] = ()  # pictures on walls and floors
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self.seed, self.ids = options.seed, list(range(1, options.models + 1))
+        self.seed = options.seed
+        self.ids = list(range(1, options.models + 1))
         self.written = self.ids  # those with a mesh file
 
     @lru_cache(maxsize=100)  # noqa: B019 (lives as long as its process)
@@ -101,7 +108,8 @@ class Twins(Packages):
 
 
 class Shapes(Packages):
-    """Procedural shapes of several materials; object k is of family k modulo their number, and half are uniform."""
+    """Procedural shapes of several materials; object k is of family k modulo their number, and half
+    are uniform."""
 
     families: Sequence[str] = tuple(FAMILIES)
 
@@ -109,7 +117,10 @@ class Shapes(Packages):
     def mesh(self, obj_id: int) -> TexturedMesh:
         rng = np.random.default_rng((self.seed, 3, obj_id))
         vertices, faces, materials = random_shape(rng, self.group(obj_id))
-        paints = [Texture(random_colour(rng)[None, None].astype(np.float32)) for _ in range(int(materials.max()) + 1)]
+        paints = [
+            Texture(random_colour(rng)[None, None].astype(np.float32))
+            for _ in range(int(materials.max()) + 1)
+        ]
         size = np.exp(rng.uniform(np.log(0.05), np.log(1.0)))
         mesh = TexturedMesh.from_arrays(size * vertices, faces, paints, paint=materials)
         return mesh.recoloured(paints[0]) if rng.random() < 0.5 else mesh
@@ -118,9 +129,12 @@ class Shapes(Packages):
     def symmetries(self, obj_id: int) -> Array:
         """Those of shape and materials."""
         mesh = self.mesh(obj_id)
-        solid = trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3))
+        solid = trimesh.Trimesh(
+            mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.triangles)).reshape(-1, 3)
+        )
         points, faces = trimesh.sample.sample_surface(solid, 4000, seed=0)
-        tree, paint = cKDTree(points), mesh.paint[faces]
+        tree = cKDTree(points)
+        paint = mesh.paint[faces]
         kept = []
         for S in mesh_symmetries(solid).numpy():
             _, nearest = tree.query(points @ S[:3, :3].T + S[:3, 3])
@@ -149,7 +163,8 @@ class Tied(Shapes):
         rng = np.random.default_rng((self.seed, 4, obj_id % TWIN))
         vertices, faces = tied_shape(rng, self.group(obj_id % TWIN))
         if obj_id >= TWIN:
-            vertices, faces = vertices * (-1.0, 1.0, 1.0), faces[:, ::-1]
+            vertices = vertices * (-1.0, 1.0, 1.0)
+            faces = faces[:, ::-1]
         paint = Texture(random_colour(rng)[None, None].astype(np.float32))
         return TexturedMesh.from_arrays(rng.uniform(0.03, 0.3) * vertices, faces, [paint])
 
@@ -162,7 +177,8 @@ class Furniture(Packages):
 
     def __init__(self, options: argparse.Namespace) -> None:
         listing = json.loads((options.meshes / "meshes.json").read_text())
-        self.folder, self.turns = options.meshes, np.array(listing["turns"])
+        self.folder = options.meshes
+        self.turns = np.array(listing["turns"])
         about_z = {k for k, R in enumerate(self.turns) if R[2, 2] > 0.99}
         rows = [m for m in listing["meshes"] if m["half"] == options.half]
         good = [m for m in rows if min(m["extents"]) > 0.08 * max(m["extents"])]
@@ -212,12 +228,18 @@ class Furniture(Packages):
 
 
 def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
-    """Write the model of an object, a PLY file in mm with one texture, unless it exists; its row of models_info."""
-    mesh, path = objects.mesh(obj_id), folder / f"obj_{obj_id:06d}.ply"
+    """Write the model of an object, a PLY file in mm with one texture, unless it exists; its row of
+    models_info."""
+    mesh = objects.mesh(obj_id)
+    path = folder / f"obj_{obj_id:06d}.ply"
     if not path.exists():
         mesh.save_ply(path)
-    low, high = 1000.0 * mesh.hull.min(axis=0), 1000.0 * mesh.hull.max(axis=0)
-    row = {"diameter": 1000.0 * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())}
+    low = 1000.0 * mesh.hull.min(axis=0)
+    high = 1000.0 * mesh.hull.max(axis=0)
+    row = {
+        "diameter": 1000.0
+        * float(np.linalg.norm(mesh.hull[:, None] - mesh.hull[None], axis=2).max())
+    }
     row |= {f"min_{c}": float(x) for c, x in zip("xyz", low, strict=True)}
     row |= {f"size_{c}": float(x) for c, x in zip("xyz", high - low, strict=True)}
     discrete = []
@@ -228,18 +250,30 @@ def model_row(objects: Packages, folder: Path, obj_id: int) -> dict[str, Any]:
     return row | ({"symmetries_discrete": discrete} if discrete else {})
 
 
-def compose(objects: Packages, options: argparse.Namespace, index: int, attempt: int) -> tuple[Scene, dict[int, Any]]:
+def compose(
+    objects: Packages, options: argparse.Namespace, index: int, attempt: int
+) -> tuple[Scene, dict[int, Any]]:
     """Scene ``index``, and the mesh that each of its objects is annotated as: obj_id and mesh."""
     rng = np.random.default_rng((options.seed, index, attempt))
-    size, ids = tuple(options.size), objects.ids
+    size = tuple(options.size)
+    ids = objects.ids
     if options.kind == "shelf":
         low, high = options.objects
         chosen = rng.choice(ids, min(int(rng.integers(low, high + 1)), len(ids)), replace=False)
         meshes = [(int(k), objects.mesh(int(k))) for k in chosen]
-        scene = shelf(meshes, objects.texture, rng, size=size, occlusion=options.occlusion, cameras=options.cameras)
+        scene = shelf(
+            meshes,
+            objects.texture,
+            rng,
+            size=size,
+            occlusion=options.occlusion,
+            cameras=options.cameras,
+        )
         annotated = {k: (k, mesh) for k, mesh in meshes}
     else:
-        shown = ids[np.random.default_rng((options.seed, 1)).permutation(len(ids))[index % len(ids)]]
+        shown = ids[
+            np.random.default_rng((options.seed, 1)).permutation(len(ids))[index % len(ids)]
+        ]
         mesh = objects.mesh(shown)
         if options.bare and rng.random() < options.bare:
             mesh = mesh.recoloured(Texture(random_colour(rng)[None, None].astype(np.float32)))
@@ -259,7 +293,9 @@ def compose(objects: Packages, options: argparse.Namespace, index: int, attempt:
         if options.cut:
             fraction = float(rng.uniform(*options.cut))
             hull = scene.shapes[0].hull
-            scene = replace(scene, views=[cut(view, hull, size, fraction, rng) for view in scene.views])
+            scene = replace(
+                scene, views=[cut(view, hull, size, fraction, rng) for view in scene.views]
+            )
     if options.frames > 1:
         points = np.concatenate([shape.hull for shape in scene.shapes if shape.obj_id is not None])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -268,7 +304,8 @@ def compose(objects: Packages, options: argparse.Namespace, index: int, attempt:
 
 
 def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> list[list[float]]:
-    """Write scene ``index`` unless it exists; the visible fractions of each photograph's objects."""
+    """Write scene ``index`` unless it exists; the visible fractions of each photograph's
+    objects."""
     folder = options.out / "test" / f"{index:06d}"
     if folder.exists():
         infos = json.loads((folder / "scene_gt_info.json").read_text())
@@ -287,7 +324,9 @@ def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> li
     part = folder.with_suffix(".part")
     shutil.rmtree(part, ignore_errors=True)
     (part / "rgb").mkdir(parents=True)
-    truths, cameras, infos = {}, {}, {}
+    truths = {}
+    cameras = {}
+    infos = {}
     targets = [shape for shape in scene.shapes if shape.obj_id is not None]
     for k, ((R, t, K), picture) in enumerate(zip(scene.views, pictures, strict=True)):
         seed = (options.seed, index, 0 if options.frames > 1 else k)  # one camera takes all frames
@@ -303,9 +342,13 @@ def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> li
             obj_id, mesh = annotated[shape.obj_id]
             rotation, translation = shape.pose(R, t)
             translation = translation + rotation @ (shape.mesh.centre - mesh.centre)
-            pose = {"cam_R_m2c": rotation.ravel().tolist(), "cam_t_m2c": (1000.0 * translation).tolist()}
+            pose = {
+                "cam_R_m2c": rotation.ravel().tolist(),
+                "cam_t_m2c": (1000.0 * translation).tolist(),
+            }
             truths[k].append(pose | {"obj_id": obj_id})
-            seen, whole = int(picture.seen[n].sum()), int(picture.whole[n].sum())
+            seen = int(picture.seen[n].sum())
+            whole = int(picture.whole[n].sum())
             boxes = {"bbox_obj": _box(picture.whole[n]), "bbox_visib": _box(picture.seen[n])}
             counts = {"px_count_all": whole, "px_count_visib": seen, "px_count_valid": whole}
             infos[k].append(boxes | counts | {"visib_fract": seen / whole})
@@ -316,22 +359,34 @@ def make_scene(objects: Packages, options: argparse.Namespace, index: int) -> li
 
 
 def _box(mask: Array) -> list[int]:
-    """BOP's x, y, width, height in px between the centres of the outermost pixels; -1 four times for none."""
+    """BOP's x, y, width, height in px between the centres of the outermost pixels; -1 four times
+    for none."""
     if not mask.any():
         return [-1, -1, -1, -1]
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    rows = np.flatnonzero(mask.any(axis=1))
+    columns = np.flatnonzero(mask.any(axis=0))
     return [int(x) for x in (columns[0], rows[0], columns[-1] - columns[0], rows[-1] - rows[0])]
 
 
 def write_targets(options: argparse.Namespace) -> int:
-    """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their number."""
+    """List the instances that are visible enough in BOP's ``test_targets_bop19.json``; their
+    number."""
     targets = []
     for folder in sorted(p for p in (options.out / "test").iterdir() if p.name.isdecimal()):
-        truths, infos = (json.loads((folder / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info"))
+        truths, infos = (
+            json.loads((folder / f"scene_{name}.json").read_text()) for name in ("gt", "gt_info")
+        )
         for key in sorted(truths, key=int):
             for truth, info in zip(truths[key], infos[key], strict=True):
-                if info["visib_fract"] >= 1.0 - options.occlusion and min(info["bbox_visib"][2:]) > 0:
-                    row = {"scene_id": int(folder.name), "im_id": int(key), "obj_id": truth["obj_id"]}
+                if (
+                    info["visib_fract"] >= 1.0 - options.occlusion
+                    and min(info["bbox_visib"][2:]) > 0
+                ):
+                    row = {
+                        "scene_id": int(folder.name),
+                        "im_id": int(key),
+                        "obj_id": truth["obj_id"],
+                    }
                     targets.append(row | {"inst_count": 1})
     write_json(options.out / "test_targets_bop19.json", targets)
     return len(targets)
@@ -358,7 +413,9 @@ def _model(obj_id: int) -> dict[str, Any]:
 
 
 def arguments() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kind", choices=KINDS, default="printed")
     parser.add_argument("--count", type=int, default=300, help="scenes")
     parser.add_argument("--seed", type=int, default=29)
@@ -366,15 +423,33 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--size", type=int, nargs=2, default=(480, 640), metavar=("H", "W"))
     parser.add_argument("--models", type=int, default=60, help="printed packages to choose from")
     parser.add_argument("--meshes", type=Path, help="folder of meshes.py, for furniture")
-    parser.add_argument("--half", choices=("held-out", "train"), default="held-out", help="of the furniture")
+    parser.add_argument(
+        "--half", choices=("held-out", "train"), default="held-out", help="of the furniture"
+    )
     parser.add_argument("--cad", choices=CADS, default="exact")
     parser.add_argument("--pose", choices=("upright", "free", "mixed"), default="mixed")
-    parser.add_argument("--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour")
-    parser.add_argument("--objects", type=int, nargs=2, default=(8, 20), metavar=("LOW", "HIGH"), help="on a shelf")
-    parser.add_argument("--occlusion", type=float, default=0.6, help="largest hidden fraction of a target")
-    parser.add_argument("--cut", type=float, nargs=2, metavar=("LOW", "HIGH"), help="fraction outside the photograph")
-    parser.add_argument("--cameras", type=int, default=1, help="photographs of each scene, from different sides")
-    parser.add_argument("--frames", type=int, default=1, help="photographs of each scene by one moving camera")
+    parser.add_argument(
+        "--bare", type=float, default=0.0, help="fraction of the objects in one uniform colour"
+    )
+    parser.add_argument(
+        "--objects", type=int, nargs=2, default=(8, 20), metavar=("LOW", "HIGH"), help="on a shelf"
+    )
+    parser.add_argument(
+        "--occlusion", type=float, default=0.6, help="largest hidden fraction of a target"
+    )
+    parser.add_argument(
+        "--cut",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="fraction outside the photograph",
+    )
+    parser.add_argument(
+        "--cameras", type=int, default=1, help="photographs of each scene, from different sides"
+    )
+    parser.add_argument(
+        "--frames", type=int, default=1, help="photographs of each scene by one moving camera"
+    )
     parser.add_argument("--jobs", type=int, default=1)
     return parser
 
@@ -387,11 +462,19 @@ def main() -> None:
     models = options.out / "models"
     models.mkdir(exist_ok=True)
     ids = objects.written
-    with ProcessPoolExecutor(options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)) as pool:
+    with ProcessPoolExecutor(
+        options.jobs, get_context("spawn"), initializer=_start, initargs=(options,)
+    ) as pool:
         rows = list(tqdm(pool.map(_model, ids, chunksize=4), total=len(ids), desc="models"))
-        write_json(models / "models_info.json", {str(k): row for k, row in zip(ids, rows, strict=True)})
+        write_json(
+            models / "models_info.json", {str(k): row for k, row in zip(ids, rows, strict=True)}
+        )
         list(tqdm(pool.map(_one, range(options.count)), total=options.count, desc="scenes"))
-    kept = {k: str(v) if isinstance(v, Path) else v for k, v in vars(options).items() if k not in ("out", "jobs")}
+    kept = {
+        k: str(v) if isinstance(v, Path) else v
+        for k, v in vars(options).items()
+        if k not in ("out", "jobs")
+    }
     groups = {obj_id: objects.group(obj_id % TWIN) for obj_id in objects.written}
     write_json(options.out / "benchmark.json", kept | {"groups": groups})
     print(f"{write_targets(options)} targets in {options.count} scenes in {options.out}")

@@ -1,12 +1,14 @@
 """Fetch real textured meshes for the benchmark, bring them into one frame and catalogue them.
 
-The meshes are those of Debian's package sweethome3d-furniture 1.8-1: 820 OBJ files with materials and textures; CC0,
-CC BY 3.0 and, model by model, what the package's ``copyright`` and the catalogue's ``license`` say. They are not part
-of this project and stay in OUT. In OUT/meshes every object has a folder of its own; z is up, the front points along
--y, and units are metres. OUT/meshes.json lists name, kind, half (``held-out`` or ``train``, by a hash of the name;
-copies of held-out meshes are excluded), licence, and the symmetries of shape and of appearance.
+The meshes are those of Debian's package sweethome3d-furniture 1.8-1: 820 OBJ files with materials
+and textures; CC0, CC BY 3.0 and, model by model, what the package's ``copyright`` and the
+catalogue's ``license`` say. They are not part of this project and stay in OUT. In OUT/meshes every
+object has a folder of its own; z is up, the front points along -y, and units are metres.
+OUT/meshes.json lists name, kind, half (``held-out`` or ``train``, by a hash of the name; copies of
+held-out meshes are excluded), licence, and the symmetries of shape and of appearance.
 
-    python scripts/benchmark/meshes.py --out /data/benchmark [--deb sweethome3d-furniture_1.8-1_all.deb]
+    python scripts/benchmark/meshes.py --out /data/benchmark [--deb
+    sweethome3d-furniture_1.8-1_all.deb]
 """
 
 import argparse
@@ -30,7 +32,8 @@ from scripts.scenes.textured import TexturedMesh
 
 PACKAGE = "sweethome3d-furniture"
 SHA256 = "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668"
-MAX_FACES, MIN_FLATNESS = 20_000, 0.04
+MAX_FACES = 20_000
+MIN_FLATNESS = 0.04
 LICENCES = {
     "BlendSwap-CC-0": "CC0-1.0",
     "BlendSwap-CC-BY": "CC-BY-3.0",
@@ -40,19 +43,19 @@ LICENCES = {
 }
 
 KINDS = {
-    "chair": r"((oak|osaka|ryokan|cafe|folding|plastic|teck|child|children) )?chair|chair with cushion|class seat",
+    "chair": r"((oak|osaka|ryokan|cafe|folding|plastic|teck|child|children) )?chair|chair with cushion|class seat",  # noqa: E501
     "armchair": r"(modern |rattan |winchester )?armchair",
-    "sofa": r"(burlap |clear |rattan |winchester )?(sofa|couch)( [23] seats)?|futon couch|convertible sofa bz",
+    "sofa": r"(burlap |clear |rattan |winchester )?(sofa|couch)( [23] seats)?|futon couch|convertible sofa bz",  # noqa: E501
     "bed": r"(child |iron |hospital |captain's |baby )?bed",
     "bench": r"(painted )?bench|wood bank",
     "bookcase": r"(full )?bookcase|shelves|vertical shelves",
-    "cabinet": r"wardrobe|cupboard|dresser.*|drawers cabinet|(small )?lower cabinet|high cabinet|filing cabinet"
+    "cabinet": r"wardrobe|cupboard|dresser.*|drawers cabinet|(small )?lower cabinet|high cabinet|filing cabinet"  # noqa: E501
     r"|bedside table|sink cabinet|glass door cabinet",
-    "cooker": r"(double |small )?oven|(large )?stove|cooker|microwave|(clothes )?washing machine|dryer machine"
+    "cooker": r"(double |small )?oven|(large )?stove|cooker|microwave|(clothes )?washing machine|dryer machine"  # noqa: E501
     r"|(large )?fridge|refrigerator",
     "washbasin": r"washbasin|vanity",
     "toilet": r"toilets unit",
-    "car": r"chevrolet|concept sedan.*|ford focus|peugeot.*|renault.*|suv|seat leon|smart car|vw new beetle|van"
+    "car": r"chevrolet|concept sedan.*|ford focus|peugeot.*|renault.*|suv|seat leon|smart car|vw new beetle|van"  # noqa: E501
     r"|car model",
     "bus": r"(city )?bus",
     "bicycle": r"bicycle|bike",
@@ -60,15 +63,17 @@ KINDS = {
     "screen": r"tv( 16:9)?|wall flat tv|apple imac.*",
     "laptop": r"laptop|apple ibook",
 }
-"""Objects of one kind share the direction of the front and the general build, as checked by eye. Groups for which this
-does not hold (animals, cups, desks, motorcycles, bathtubs, pianos, shoes, sitting people) have no kind."""
+"""Objects of one kind share the direction of the front and the general build, as checked by eye.
+Groups for which this does not hold (animals, cups, desks, motorcycles, bathtubs, pianos, shoes,
+sitting people) have no kind."""
 
 UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Rotation from the catalogue's frame (y up, front +z) to ours (z up, front -y)."""
 
 
 def fetch(out: Path, deb: Path | None) -> Path:
-    """Download the package if needed, check its digest and unpack it; returns the folder of the libraries."""
+    """Download the package if needed, check its digest and unpack it; returns the folder of the
+    libraries."""
     source = out / "source"
     source.mkdir(parents=True, exist_ok=True)
     if deb is None:
@@ -93,9 +98,13 @@ def catalogue(unpacked: Path) -> list[dict]:
     rows = []
     for library in sorted(LICENCES):
         entries: dict[int, dict[str, str]] = {}
-        text = (unpacked / library / "PluginFurnitureCatalog.properties").read_text(encoding="latin1")
+        text = (unpacked / library / "PluginFurnitureCatalog.properties").read_text(
+            encoding="latin1"
+        )
         for name, number, value in re.findall(r"^(\w+)#(\d+)=(.*)$", text, re.MULTILINE):
-            entries.setdefault(int(number), {})[name] = value.encode("latin1").decode("unicode_escape").strip()
+            entries.setdefault(int(number), {})[name] = (
+                value.encode("latin1").decode("unicode_escape").strip()
+            )
         for _, entry in sorted(entries.items()):
             name = re.sub(r"\W+", "-", f"{library}-{Path(entry['model']).stem}").lower()
             rows.append(
@@ -106,7 +115,9 @@ def catalogue(unpacked: Path) -> list[dict]:
                     "licence": entry.get("license") or LICENCES[library],
                     "creator": entry.get("creator", library),
                     "source": f"{library}{entry['model']}",
-                    "rotation": [float(x) for x in entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()],
+                    "rotation": [
+                        float(x) for x in entry.get("modelRotation", "1 0 0 0 1 0 0 0 1").split()
+                    ],
                     "size": [float(entry[k]) / 100 for k in ("width", "depth", "height")],
                 }
             )
@@ -114,11 +125,14 @@ def catalogue(unpacked: Path) -> list[dict]:
 
 
 def kind_of(name: str) -> str | None:
-    return next((kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower())), None)
+    return next(
+        (kind for kind, pattern in KINDS.items() if re.fullmatch(pattern, name.lower())), None
+    )
 
 
 def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
-    """Write the object in our frame, keeping all lines but the coordinates; returns why it is left out, or None."""
+    """Write the object in our frame, keeping all lines but the coordinates; returns why it is left
+    out, or None."""
     source = unpacked / row["source"]
     lines = source.read_text(encoding="latin1").splitlines()
     if sum(len(line.split()) - 3 for line in lines if line.startswith("f ")) > MAX_FACES:
@@ -126,7 +140,8 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
     points = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=float)
     R = UP @ np.array(row["rotation"]).reshape(3, 3)
     rotated = points @ R.T
-    low, high = rotated.min(axis=0), rotated.max(axis=0)
+    low = rotated.min(axis=0)
+    high = rotated.max(axis=0)
     if (high - low).min() < MIN_FLATNESS * (high - low).max():
         return "flat"
     if (folder / "model.obj").exists():
@@ -145,30 +160,43 @@ def convert(row: dict, unpacked: Path, folder: Path) -> str | None:
     for other in source.parent.iterdir():
         if other.is_file() and other.suffix.lower() != ".obj":
             (folder / other.name).write_bytes(other.read_bytes())
-    part = folder / "model.obj.part"  # renamed when complete, so that an interrupted run can be resumed
+    # renamed when complete, so that an interrupted run can be resumed
+    part = folder / "model.obj.part"
     part.write_text("\n".join(written) + "\n", encoding="latin1")
     part.replace(folder / "model.obj")
     return None
 
 
 def candidate_rotations() -> np.ndarray:
-    """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30 degrees about z."""
-    signs = [np.diag(s) for s in np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, -1).T.astype(float)]
-    orders = [np.eye(3)[list(p)] for p in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))]
+    """(32, 3, 3) possible symmetries: the 24 rotations of a cube, identity first, and steps of 30
+    degrees about z."""
+    signs = [
+        np.diag(s)
+        for s in np.array(np.meshgrid([1, -1], [1, -1], [1, -1])).reshape(3, -1).T.astype(float)
+    ]
+    orders = [
+        np.eye(3)[list(p)]
+        for p in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+    ]
     cube = [s @ o for o in orders for s in signs if np.linalg.det(s @ o) > 0]
     cube.sort(key=lambda R: -np.trace(R))
-    about_z = Rotation.from_euler("z", [[30 * k] for k in range(1, 12) if k % 3], degrees=True).as_matrix()
+    about_z = Rotation.from_euler(
+        "z", [[30 * k] for k in range(1, 12) if k % 3], degrees=True
+    ).as_matrix()
     return np.concatenate([cube, about_z])
 
 
 def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
-    """20,000 points of the surface relative to the centre of its box, in radii, and their colours in [0, 1]."""
+    """20,000 points of the surface relative to the centre of its box, in radii, and their colours
+    in [0, 1]."""
     corners = model.triangles.reshape(-1, 3)
     mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
     points, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
-    points, face = np.asarray(points), np.asarray(face)
+    points = np.asarray(points)
+    face = np.asarray(face)
     weights = trimesh.triangles.points_to_barycentric(model.triangles[face], points)
-    uv, colours = np.einsum("ij,ijk->ik", weights, model.uv[face]), np.empty((len(points), 3))
+    uv = np.einsum("ij,ijk->ik", weights, model.uv[face])
+    colours = np.empty((len(points), 3))
     for number, paint in enumerate(model.paints):
         here = model.paint[face] == number
         colours[here] = paint.colours(points[here], uv[here]) ** (1 / 2.2)
@@ -178,25 +206,39 @@ def sample_points(model: TexturedMesh) -> tuple[np.ndarray, np.ndarray]:
 def symmetries(points: np.ndarray, colours: np.ndarray) -> tuple[list[int], list[int]]:
     """Candidate rotations that map the shape to itself, and those that preserve its colours too.
 
-    90 % of the points lie within 4 % of the radius of others, and 90 % have their colour, blurred over 48 neighbours.
+    90 % of the points lie within 4 % of the radius of others, and 90 % have their colour, blurred
+    over 48 neighbours.
     """
-    tree, some = cKDTree(points), slice(None, None, 16)
+    tree = cKDTree(points)
+    some = slice(None, None, 16)
 
     def fits(R: np.ndarray, part: slice) -> bool:
-        return float(np.mean(np.isfinite(tree.query(points[part] @ R.T, distance_upper_bound=0.04)[0]))) >= 0.9
+        return (
+            float(
+                np.mean(np.isfinite(tree.query(points[part] @ R.T, distance_upper_bound=0.04)[0]))
+            )
+            >= 0.9
+        )
 
     def blurred(R: np.ndarray) -> np.ndarray:
         return np.asarray(colours[tree.query(points[some] @ R.T, k=48)[1]].mean(axis=1))
 
-    rotations, own = candidate_rotations(), blurred(np.eye(3))
-    shape = [k for k, R in enumerate(rotations) if fits(R, slice(None, None, 400)) and fits(R, some)]
-    same = [k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.1]
+    rotations = candidate_rotations()
+    own = blurred(np.eye(3))
+    shape = [
+        k for k, R in enumerate(rotations) if fits(R, slice(None, None, 400)) and fits(R, some)
+    ]
+    same = [
+        k for k in shape if (np.abs(blurred(rotations[k]) - own).max(axis=1) > 0.12).mean() < 0.1
+    ]
     return shape, same
 
 
 def copy_of(cloud: np.ndarray, others: dict[str, tuple[np.ndarray, cKDTree]]) -> str | None:
-    """Name of the first of the others with the same shape: 90 % of the points within 4 % of the radius."""
-    span, some = np.ptp(cloud, axis=0), cloud[::16]
+    """Name of the first of the others with the same shape: 90 % of the points within 4 % of the
+    radius."""
+    span = np.ptp(cloud, axis=0)
+    some = cloud[::16]
     for name, (extents, tree) in others.items():
         near = np.abs(extents - span).max() < 0.03
         if near and np.isfinite(tree.query(some, distance_upper_bound=0.04)[0]).mean() >= 0.9:
@@ -209,7 +251,8 @@ def half_of(name: str) -> str:
 
 
 def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray | None]:
-    """Convert one object; returns its row, why it is left out (or None), and points of its surface."""
+    """Convert one object; returns its row, why it is left out (or None), and points of its
+    surface."""
     row, unpacked, out = task
     folder = out / "meshes" / row["id"]
     reason = convert(row, unpacked, folder)
@@ -234,7 +277,9 @@ def examine(task: tuple[dict, Path, Path]) -> tuple[dict, str | None, np.ndarray
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--deb", type=Path, help="file of the package (default: apt-get download)")
     parser.add_argument("--jobs", type=int, default=1)
@@ -245,7 +290,11 @@ def main() -> None:
     listing |= {"meshes": [], "left_out": {}}
     clouds: dict[str, tuple[np.ndarray, cKDTree]] = {}
     for half in ("held-out", "train"):
-        tasks = [(row, unpacked, arguments.out) for name, row in sorted(once.items()) if half_of(name) == half]
+        tasks = [
+            (row, unpacked, arguments.out)
+            for name, row in sorted(once.items())
+            if half_of(name) == half
+        ]
         with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
             results = list(tqdm(pool.map(examine, tasks), desc=half, total=len(tasks)))
         for row, why, cloud in results:

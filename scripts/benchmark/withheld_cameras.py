@@ -2,8 +2,9 @@
 
     python scripts/benchmark/withheld_cameras.py DATASET --out ROWS.jsonl [--limit 30]
 
-DATASET is the folder of a BOP set, or one that make.py wrote. Objects that are at least 95 % visible are registered
-twice; finished rows of ROWS.jsonl are kept. Rotations are compared as seen by a camera that looks at the object.
+DATASET is the folder of a BOP set, or one that make.py wrote. Objects that are at least 95 %
+visible are registered twice; finished rows of ROWS.jsonl are kept. Rotations are compared as seen
+by a camera that looks at the object.
 """
 
 import argparse
@@ -33,7 +34,13 @@ def measured(registrar: cr.Registrar, sample: Row, K: Tensor | None) -> Row:
     """Error, confidence and focal length of one registration."""
     result = registrar([sample["image"]], sample["box"][None], K)[0]
     if not result.ok:
-        return {"error": 180.0, "reliable": False, "confidence": 0.0, "focal": None, "deviation": None}
+        return {
+            "error": 180.0,
+            "reliable": False,
+            "confidence": 0.0,
+            "focal": None,
+            "deviation": None,
+        }
     centre = registrar.describer.centre
     truth = transform(sample["rotation"].double(), sample["translation"].double())
     same = symmetry_transforms(sample["model_info"])[:, :3, :3]
@@ -49,7 +56,8 @@ def measured(registrar: cr.Registrar, sample: Row, K: Tensor | None) -> Row:
 
 
 def summary(rows: list[Row], name: str) -> Row:
-    """Shares within 5 and 15 degrees, median error, reliable answers, and the wrong ones among these."""
+    """Shares within 5 and 15 degrees, median error, reliable answers, and the wrong ones among
+    these."""
     errors = torch.tensor([row[name]["error"] for row in rows])
     reliable = [row[name] for row in rows if row[name]["reliable"]]
     return {
@@ -63,7 +71,9 @@ def summary(rows: list[Row], name: str) -> Row:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--limit", type=int, help="objects, spread evenly over the set")
@@ -90,7 +100,11 @@ def main() -> None:
     sure = [row["estimated"] for row in kept if (row["estimated"]["deviation"] or 1.0) < 0.05]
     right = sum(abs(one["focal"] - 1.0) <= 0.1 for one in sure)
     report = {name: summary(kept, name) for name in ("given", "estimated")}
-    print(json.dumps({**report, "deviation below 5 %": len(sure), "of these within 10 %": right}, indent=2))
+    print(
+        json.dumps(
+            {**report, "deviation below 5 %": len(sure), "of these within 10 %": right}, indent=2
+        )
+    )
 
 
 if __name__ == "__main__":

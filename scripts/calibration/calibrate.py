@@ -1,14 +1,17 @@
-"""Fit the constants of confidence, covariance, detection, refinement and following on generated photographs.
+"""Fit the constants of confidence, covariance, detection, refinement and following on generated
+photographs.
 
-    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--models instance] [--write]
+    python scripts/calibration/calibrate.py WORK [--meshes FURNITURE] [--count 400] [--models
+    instance] [--write]
 
-The script renders the sets that WORK lacks (make.py: the object's own mesh, also cut by the border, half hidden, grey,
-or with several poses that look alike; a similar one; a wrong one, or one with another print; and sequences), registers,
-refines, follows and detects their objects into WORK/*.jsonl, of which finished rows are kept, and fits. Everything
-depends on the seeds in SETS alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
-scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object, so every measure is
-of kinds that the fit has not seen. --write stores the constants in curvireg_torch/registration/calibration.json and
-their quality in scripts/results/calibration.json.
+The script renders the sets that WORK lacks (make.py: the object's own mesh, also cut by the border,
+half hidden, grey, or with several poses that look alike; a similar one; a wrong one, or one with
+another print; and sequences), registers, refines, follows and detects their objects into
+WORK/*.jsonl, of which finished rows are kept, and fits. Everything depends on the seeds in SETS
+alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
+scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object,
+so every measure is of kinds that the fit has not seen. --write stores the constants in
+curvireg_torch/registration/calibration.json and their quality in scripts/results/calibration.json.
 """
 
 import argparse
@@ -52,7 +55,9 @@ Row: TypeAlias = dict[str, Any]
 
 CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
 FURNITURE = ("--kind", "furniture", "--bare", "0.2")
-SHAPES, PRINTED, TIED = ("--kind", "shapes"), ("--kind", "printed"), ("--kind", "tied")
+SHAPES = ("--kind", "shapes")
+PRINTED = ("--kind", "printed")
+TIED = ("--kind", "tied")
 CUT = ("--cut", "0.1", "0.6")
 SETS: dict[str, tuple[float, tuple[str, ...]]] = {
     "furniture": (1.0, (*FURNITURE, "--cad", "exact")),
@@ -71,14 +76,26 @@ SETS: dict[str, tuple[float, tuple[str, ...]]] = {
 }
 """Of each set: scenes, as a fraction of --count, and options of make.py."""
 
-ESTIMATED = {"estimated_shapes": "shapes", "estimated_packages": "packages", "estimated_wrong": "wrong"}
+ESTIMATED = {
+    "estimated_shapes": "shapes",
+    "estimated_packages": "packages",
+    "estimated_wrong": "wrong",
+}
 """Sets whose camera is withheld and estimated, and those with the same photographs."""
 
 SCENES_PER_MESH = 2.0
 
-SHARES = {"tied": 0.1, "cut": 0.1, "cut_packages": 0.05, "print": 0.05, "mirrored": 0.02, "wrong": 0.08}
+SHARES = {
+    "tied": 0.1,
+    "cut": 0.1,
+    "cut_packages": 0.05,
+    "print": 0.05,
+    "mirrored": 0.02,
+    "wrong": 0.08,
+}
 SHARES |= {"estimated_wrong": 0.08}
-"""Assumed shares of the photographs that users have; those of the other sets have the rest, each the same weight."""
+"""Assumed shares of the photographs that users have; those of the other sets have the rest, each
+the same weight."""
 
 ABSENT = (
     "print",
@@ -105,9 +122,20 @@ GREY = (
 )  # sets in which every third mesh loses its colours
 
 RIGHT = 30.0  # degrees within which a registration is right
-FINE_DEGREES, FINE_FRACTION = 10.0, 0.1  # and fraction of the distance, within which a refined or tracked pose is right
+# and fraction of the distance, within which a refined or tracked pose is right
+FINE_DEGREES = 10.0
+FINE_FRACTION = 0.1
 
-STARTS = ((5.0, 0.0), (10.0, 0.0), (15.0, 0.0), (20.0, 0.0), (30.0, 0.0), (0.0, 0.05), (0.0, 0.1), (0.0, 0.2))
+STARTS = (
+    (5.0, 0.0),
+    (10.0, 0.0),
+    (15.0, 0.0),
+    (20.0, 0.0),
+    (30.0, 0.0),
+    (0.0, 0.05),
+    (0.0, 0.1),
+    (0.0, 0.2),
+)
 """Degrees and fraction of the distance by which the starts of refinements are off."""
 
 FOLDS = 5
@@ -131,7 +159,11 @@ KINDS = {"refinement": "refined", "tracking": "sequences", "detection": "detecte
 def sets_of(models: Sequence[str], meshes: Path | None) -> list[str]:
     """Sets of the models, without those of furniture where there is none."""
     names = dict.fromkeys(name for model in models for name in MODELS[model])
-    return [name for name in names if meshes is not None or "furniture" not in SETS[photographs_of(name)][1]]
+    return [
+        name
+        for name in names
+        if meshes is not None or "furniture" not in SETS[photographs_of(name)][1]
+    ]
 
 
 def photographs_of(name: str) -> str:
@@ -139,7 +171,9 @@ def photographs_of(name: str) -> str:
     return ESTIMATED.get(name, name)
 
 
-def render_sets(work: Path, meshes: Path | None, count: int, jobs: int, models: Sequence[str]) -> None:
+def render_sets(
+    work: Path, meshes: Path | None, count: int, jobs: int, models: Sequence[str]
+) -> None:
     """Render the sets of ``models`` that ``work`` lacks; finished scenes are kept."""
     for name in dict.fromkeys(map(photographs_of, sets_of(models, meshes))):
         fraction, options = SETS[name]
@@ -152,8 +186,8 @@ def render_sets(work: Path, meshes: Path | None, count: int, jobs: int, models: 
 
 
 def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
-    """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those that an exact mesh
-    without colours has for the registrar."""
+    """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
+    that an exact mesh without colours has for the registrar."""
     listed = sample["model_info"].get("symmetries_discrete", [])
     known = [
         torch.eye(3).double()[None],
@@ -166,7 +200,9 @@ def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
 def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
     S = symmetries_of(sample) if S is None else S
-    return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(dim=1)
+    return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(
+        dim=1
+    )
 
 
 def truth_of(sample: Row) -> Tensor:
@@ -188,11 +224,17 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     if not result.ok:
         return
     seen = sample
-    R = torch.stack([h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses])
+    R = torch.stack(
+        [h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses]
+    )
     if K is None:  # compare as seen by a camera that looks straight at the object
         ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
-        seen = sample | {"rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()}
-    evidence = torch.tensor([[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]).double()
+        seen = sample | {
+            "rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()
+        }
+    evidence = torch.tensor(
+        [[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]
+    ).double()
     weights = torch.tensor(SCORE_WEIGHTS if registrar.is_exact else RANK_ALONE, dtype=torch.float64)
     row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
@@ -208,15 +250,21 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
 def model_centre(sample: Row) -> Tensor:
     """(3,) middle of the model's box, in mm."""
     info = sample["model_info"]
-    return torch.tensor([info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64)
+    return torch.tensor(
+        [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64
+    )
 
 
 def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
-    """Rows of refinements from wrong starts, and in the photograph ``other``, which does not show the object."""
-    T, K = truth_of(sample), sample["camera_matrix"].double()
+    """Rows of refinements from wrong starts, and in the photograph ``other``, which does not show
+    the object."""
+    T = truth_of(sample)
+    K = sample["camera_matrix"].double()
     generator = torch.Generator().manual_seed(sample["scene_id"])
     for degrees, fraction in (*STARTS, (0.0, 0.0)):
-        axis = torch.nn.functional.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        axis = torch.nn.functional.normalize(
+            torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+        )
         sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
         start = T.clone()
         start[:3, :3] = rotation_from_axis_angle(axis * np.radians(degrees)) @ T[:3, :3]
@@ -224,7 +272,10 @@ def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         absent = degrees == fraction == 0.0
         result = registrar.refine([(other if absent else sample)["image"]], K, [start])[0]
         if result.ok:
-            yield {"features": dict(result.confidence_features), "right": not absent and fine(result.transform, sample)}
+            yield {
+                "features": dict(result.confidence_features),
+                "right": not absent and fine(result.transform, sample),
+            }
 
 
 def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
@@ -235,7 +286,10 @@ def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
         for sample in frames[stride::stride]:
             result = follow(sample["image"])
             if result.ok and "region" in result.confidence_features:
-                yield {"features": dict(result.confidence_features), "right": fine(result.transform, sample)}
+                yield {
+                    "features": dict(result.confidence_features),
+                    "right": fine(result.transform, sample),
+                }
 
 
 def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
@@ -244,11 +298,18 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         lost = not result.ok and isinstance(result.error, LostObjectError)
         found = result.detection if result.ok else result.error.detection if lost else None
-        if found is not None and not float(found.response).is_integer():  # not a number of landmarks
+        # not a number of landmarks
+        if found is not None and not float(found.response).is_integer():
             query = registrar.matcher.query([shown["image"]], found.box[None].float())
-            features = {"response": found.response, "similarity": float(registrar.matcher.similarity(query))}
+            features = {
+                "response": found.response,
+                "similarity": float(registrar.matcher.similarity(query)),
+            }
             overlap = float(box_iou(found.box[None], shown["box"][None].double()))
-            yield {"features": features, "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP}
+            yield {
+                "features": features,
+                "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP,
+            }
 
 
 def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
@@ -256,7 +317,8 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     kind, folder, pose, indices, beside = task
     torch.set_num_threads(1)
     data = BOPDataset(folder)
-    samples, other = [data[i] for i in indices], data[beside]
+    samples = [data[i] for i in indices]
+    other = data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
     mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
     grey = kind in GREY and samples[0]["obj_id"] % 3 == 0
@@ -272,18 +334,26 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
             "detected": lambda s: detected(registrar, s, other),
         }
         method = methods.get(
-            kind, lambda s: registered(registrar, s, with_camera=kind not in (*MODELS["category"], *ESTIMATED))
+            kind,
+            lambda s: registered(
+                registrar, s, with_camera=kind not in (*MODELS["category"], *ESTIMATED)
+            ),
         )
         found = [(s, row) for s in samples for row in method(s)]
     groups = json.loads((folder / "benchmark.json").read_text())["groups"]
     more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
-    return [{"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row} for s, row in found]
+    return [
+        {"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row}
+        for s, row in found
+    ]
 
 
 def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
-    """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read from the file."""
+    """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
+    from the file."""
     photographs = photographs_of(kind)
-    folder, out = work / (photographs if photographs in SETS else "shapes"), work / f"{kind}.jsonl"
+    folder = work / (photographs if photographs in SETS else "shapes")
+    out = work / f"{kind}.jsonl"
     data = BOPDataset(folder)
     annotations = [data.annotation(i) for i in range(len(data))]
     listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
@@ -291,7 +361,8 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
     known = {tuple(row["task"]) for row in done}
 
     def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
-        upright = kind in UPRIGHT and entry[0] % 2 == 0  # of these, make.py alternates upright and any pose
+        # of these, make.py alternates upright and any pose
+        upright = kind in UPRIGHT and entry[0] % 2 == 0
         return entry[1], int(not upright)
 
     tasks = []
@@ -303,7 +374,9 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
             tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
         found = pool.map(measure, [task for _, task in tasks])
-        for (key, _), rows in zip(tasks, tqdm(found, total=len(tasks), desc=kind, unit="mesh"), strict=True):
+        for (key, _), rows in zip(
+            tasks, tqdm(found, total=len(tasks), desc=kind, unit="mesh"), strict=True
+        ):
             done.append({"task": key, "rows": rows})
             file.write(json.dumps(done[-1]) + "\n")
             file.flush()
@@ -313,7 +386,8 @@ def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[
 def folds_of(rows: Sequence[Row]) -> np.ndarray:
     """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
     groups, counts = np.unique([row["group"] for row in rows], return_counts=True)
-    size, fold = [0] * FOLDS, {}
+    size = [0] * FOLDS
+    fold = {}
     for k in np.argsort(-counts, kind="stable"):
         fold[groups[k]] = int(np.argmin(size))
         size[fold[groups[k]]] += int(counts[k])
@@ -328,13 +402,16 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     names = list(rows[0]["features"])
     X = np.array([[row["features"][n] or 0.0 for n in names] for row in rows])
     y = np.array([row["right"] for row in rows])
-    mean, spread = X.mean(axis=0), X.std(axis=0)
+    mean = X.mean(axis=0)
+    spread = X.std(axis=0)
     spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
     Z = (X - mean) / spread
 
     def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
         logit = Z @ p[:-1] + p[-1]
-        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + 0.5 * float(p[:-1] @ p[:-1])
+        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + 0.5 * float(
+            p[:-1] @ p[:-1]
+        )
         slope = weight * (expit(logit) - y)
         return value, np.append(Z.T @ slope + p[:-1], slope.sum())
 
@@ -343,15 +420,20 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     found = minimize(loss, np.zeros(len(names) + 1), jac=True, bounds=bounds, method="L-BFGS-B").x
     w = found[:-1] / spread
     bias = float(found[-1] - w @ mean)
-    return {"weights": dict(zip(names, w.round(4).tolist(), strict=True)), "bias": round(bias, 4), "n": len(y)}
+    return {
+        "weights": dict(zip(names, w.round(4).tolist(), strict=True)),
+        "bias": round(bias, 4),
+        "n": len(y),
+    }
 
 
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
-    """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some pose is right and some
-    are not; without ``ties`` the resolution is 0."""
+    """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
+    pose is right and some are not; without ``ties`` the resolution is 0."""
     decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
     most = max((len(rows[k]["scores"]) for k in decided), default=1)
-    behind, right = np.full((len(decided), most), np.inf), np.zeros((len(decided), most), bool)
+    behind = np.full((len(decided), most), np.inf)
+    right = np.zeros((len(decided), most), bool)
     for place, k in enumerate(decided):
         scores = np.array(rows[k]["scores"])
         behind[place, : len(scores)] = scores.max() - scores
@@ -360,7 +442,10 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     def loss(slope: float, resolution: float) -> float:
         logits = -slope * np.maximum(0.0, behind - resolution)
         of_right = np.where(right, logits, -np.inf)
-        return float(weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1)) + 0.05 * slope**2)
+        return float(
+            weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1))
+            + 0.05 * slope**2
+        )
 
     found = []
     for resolution in RESOLUTIONS if ties else (0.0,):
@@ -382,15 +467,25 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     """How well probabilities (n,) tell the right answers (n,) bool."""
     sure = p >= RELIABLE
     quality: Row = {"n": len(p), "right": float(np.average(right, weights=weight))}
-    quality |= {"said": float(np.average(p, weights=weight)), "reliable": float(np.average(sure, weights=weight))}
-    quality["auc"] = float(roc_auc_score(right, p, sample_weight=weight)) if len(set(right.tolist())) == 2 else None
-    quality["right if reliable"] = float(np.average(right[sure], weights=weight[sure])) if sure.any() else None
+    quality |= {
+        "said": float(np.average(p, weights=weight)),
+        "reliable": float(np.average(sure, weights=weight)),
+    }
+    quality["auc"] = (
+        float(roc_auc_score(right, p, sample_weight=weight))
+        if len(set(right.tolist())) == 2
+        else None
+    )
+    quality["right if reliable"] = (
+        float(np.average(right[sure], weights=weight[sure])) if sure.any() else None
+    )
     quality["reliable and wrong"] = int((sure & ~right).sum())
     return quality
 
 
 def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
-    """Constants of a model of registrations, and their quality on held-out folds, in all and by set."""
+    """Constants of a model of registrations, and their quality on held-out folds, in all and by
+    set."""
     for row in rows:
         present = row["set"] not in ABSENT
         row["right"] = present and min(row["errors"]) < RIGHT
@@ -398,28 +493,44 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
     sets = np.array([row["set"] for row in rows])
     ordinary = float(sum(name not in SHARES for name in sets))
     factor = ordinary / (1.0 - sum(SHARES[name] for name in set(sets) if name in SHARES))
-    weight = np.array([factor * SHARES[name] / (sets == name).sum() if name in SHARES else 1.0 for name in sets])
+    weight = np.array(
+        [factor * SHARES[name] / (sets == name).sum() if name in SHARES else 1.0 for name in sets]
+    )
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
 
     def fit(train: np.ndarray) -> Row:
         some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
-        return fit_logistic(some, weight[train], signs) | fit_shares(some, weight[train], ties=exact)
+        return fit_logistic(some, weight[train], signs) | fit_shares(
+            some, weight[train], ties=exact
+        )
 
-    fold, p = folds_of(rows), np.zeros(len(rows))
+    fold = folds_of(rows)
+    p = np.zeros(len(rows))
     for k in range(FOLDS):
         constants = fit(fold != k)
-        p[fold == k] = [first_probability(row, constants) for row, own in zip(rows, fold == k, strict=True) if own]
+        p[fold == k] = [
+            first_probability(row, constants)
+            for row, own in zip(rows, fold == k, strict=True)
+            if own
+        ]
     first = np.array([row["first"] for row in rows])
     quality = quality_of(p, first, weight)
     by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
     by_set["grey"] = np.array([row["grey"] for row in rows])
     by_set["with colours"] = ~by_set["grey"]
-    quality["sets"] = {name: quality_of(p[own], first[own], weight[own]) for name, own in by_set.items() if own.any()}
+    quality["sets"] = {
+        name: quality_of(p[own], first[own], weight[own])
+        for name, own in by_set.items()
+        if own.any()
+    }
     return fit(np.full(len(rows), True)), quality
 
 
-def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str], meshes: Path | None) -> tuple[Row, Row]:
-    """Constants, those of other ``models`` as they were, and quality of the new ones on held-out kinds of objects."""
+def calibrate(
+    work: Path, jobs: int, limit: int | None, models: Sequence[str], meshes: Path | None
+) -> tuple[Row, Row]:
+    """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
+    kinds of objects."""
     constants: Row = json.loads(CONSTANTS.read_text())
     quality: Row = {}
     for name in models:
@@ -427,18 +538,28 @@ def calibrate(work: Path, jobs: int, limit: int | None, models: Sequence[str], m
             rows = rows_of(work, KINDS[name], jobs, limit)
             constants[name] = fit_logistic(rows, np.ones(len(rows)), {})
             continue
-        rows = [row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs, limit)]
+        rows = [
+            row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs, limit)
+        ]
         constants[name], quality[name] = fit_registrations(rows, exact=name == "instance")
         right = [row for row in rows if row["first"] and "distance2" in row]
-        distances = [row["distance2"] for row in right if first_probability(row, constants[name]) >= RELIABLE]
+        distances = [
+            row["distance2"] for row in right if first_probability(row, constants[name]) >= RELIABLE
+        ]
         if distances:
-            scale = constants["covariance_scale"] * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+            scale = (
+                constants["covariance_scale"]
+                * float(np.quantile(distances, 0.9))
+                / float(chi2.ppf(0.9, 6))
+            )
             quality[name]["covariance_scale"] = round(scale, 3)
     return constants, quality
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("work", type=Path)
     parser.add_argument("--meshes", type=Path, help="folder of scripts/benchmark/meshes.py")
     parser.add_argument("--count", type=int, default=400, help="photographs of each set")
@@ -451,7 +572,9 @@ def main() -> None:
     render_sets(options.work, options.meshes, options.count, options.jobs, options.models)
     if options.render:
         return
-    constants, quality = calibrate(options.work, options.jobs, options.limit, options.models, options.meshes)
+    constants, quality = calibrate(
+        options.work, options.jobs, options.limit, options.models, options.meshes
+    )
     record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))
     if options.write:

@@ -1,7 +1,8 @@
-"""Histogram of oriented gradients of images with scikit-image's results, as it can be offered to kornia.
+"""Histogram of oriented gradients of images with scikit-image's results, as it can be offered to
+kornia.
 
-It depends on torch alone, and follows kornia's habits: a function and its module, a Convention block, no keyword-only
-options, errors of Python.
+It depends on torch alone, and follows kornia's habits: a function and its module, a Convention
+block, no keyword-only options, errors of Python.
 """
 
 import math
@@ -22,10 +23,12 @@ def histogram_of_oriented_gradients(
     r"""Compute the histogram of oriented gradients (HOG) of each image.
 
     Convention:
-        - Gradients are differences of the neighbours on both sides, zero at the border of the image; of several
-          channels each pixel has the gradient of the channel in which it is longest.
-        - Orientations are modulo 180 degrees. Bin :math:`i` holds those in :math:`[i, i + 1) \cdot 180 / n` degrees,
-          from x to y. A pixel votes with the length of its gradient for one bin and one cell.
+        - Gradients are differences of the neighbours on both sides, zero at the border of the
+          image; of several channels each pixel has the gradient of the channel in which it is
+          longest.
+        - Orientations are modulo 180 degrees. Bin :math:`i` holds those in
+          :math:`[i, i + 1) \cdot 180 / n` degrees, from x to y. A pixel votes with the length of
+          its gradient for one bin and one cell.
         - Blocks are normalised by L2-Hys. The result is that of ``skimage.feature.hog``.
 
     Args:
@@ -37,8 +40,8 @@ def histogram_of_oriented_gradients(
         eps: added, squared, to squared norms of blocks.
 
     Returns:
-        the descriptors with shape :math:`(B, R, S, B_H, B_W, N)`: rows and columns of blocks, rows and columns of cells
-        in a block, orientations.
+        the descriptors with shape :math:`(B, R, S, B_H, B_W, N)`: rows and columns of blocks, rows
+        and columns of cells in a block, orientations.
 
     Example:
         >>> histogram_of_oriented_gradients(torch.rand(2, 1, 64, 48)).shape
@@ -55,14 +58,18 @@ def histogram_of_oriented_gradients(
     rows = input.shape[-2] // cell_size[0]
     columns = input.shape[-1] // cell_size[1]
     if rows < block_size[0] or columns < block_size[1]:
-        raise ValueError(f"Input must hold one block of {block_size} cells of {cell_size} px. Got {input.shape}")
+        raise ValueError(
+            f"Input must hold one block of {block_size} cells of {cell_size} px. Got {input.shape}"
+        )
     gx, gy = _longest_gradient(input)
     squared = gx * gx + gy * gy
     is_zero = squared == 0
     # The root has no derivative at 0.
     length = torch.where(is_zero, 1.0, squared).sqrt().masked_fill(is_zero, 0.0)
     position = torch.atan2(gy, gx).detach() * (num_orientations / math.pi)
-    index = torch.remainder(torch.remainder(position, num_orientations).floor(), num_orientations).long()
+    index = torch.remainder(
+        torch.remainder(position, num_orientations).floor(), num_orientations
+    ).long()
     votes = F.one_hot(index, num_orientations).movedim(-1, 1) * length[:, None]
     cells = F.avg_pool2d(votes[..., : rows * cell_size[0], : columns * cell_size[1]], cell_size)
     blocks = cells.unfold(2, block_size[0], 1).unfold(3, block_size[1], 1)
@@ -71,7 +78,8 @@ def histogram_of_oriented_gradients(
 
 
 def _longest_gradient(input: Tensor) -> tuple[Tensor, Tensor]:
-    """x and y differences (B, H, W) of the channel in which they are longest, zero at the border."""
+    """x and y differences (B, H, W) of the channel in which they are longest, zero at the
+    border."""
     gx = F.pad(input[..., 2:] - input[..., :-2], (1, 1, 0, 0))
     gy = F.pad(input[..., 2:, :] - input[..., :-2, :], (0, 0, 1, 1))
     channel = (gx * gx + gy * gy).argmax(dim=1, keepdim=True)
@@ -107,6 +115,7 @@ class HistogramOfOrientedGradients(nn.Module):
 
     def __repr__(self) -> str:
         return (
-            f"{type(self).__name__}(num_orientations={self.num_orientations}, cell_size={self.cell_size}, "
+            f"{type(self).__name__}(num_orientations={self.num_orientations}, "
+            f"cell_size={self.cell_size}, "
             f"block_size={self.block_size}, clip={self.clip}, eps={self.eps})"
         )

@@ -29,7 +29,8 @@ class Case:
         category: class or object.
         image_path, mesh_path, unit: files, and the unit of the mesh.
         box: (4,) x0, y0, x1, y1 in px.
-        pose: (3, 4) float64 model to camera; without translation (NaN) it is that of a camera that looks at the box.
+        pose: (3, 4) float64 model to camera; without translation (NaN) it is that of a camera that
+            looks at the box.
         camera: (3, 3) camera matrix in px, None if unknown.
     """
 
@@ -49,14 +50,18 @@ class Case:
     def crop(self, settings: BankSettings) -> Tensor:
         """(1, 3, S, S) crop of the photograph, framed as the views of a bank."""
         image = read_image(self.image_path)
-        return crop_images([image], self.box[None], size=settings.image_size, margin=settings.margin)[0]
+        return crop_images(
+            [image], self.box[None], size=settings.image_size, margin=settings.margin
+        )[0]
 
     def view(self, mesh: trimesh.Trimesh) -> tuple[Tensor, float]:
-        """Rotation (3, 3) and distance in model units of a camera that looks at the object's centre.
+        """Rotation (3, 3) and distance in model units of a camera that looks at the object's
+        centre.
 
         Without translation the distance is that of banks.
         """
-        R, t = self.pose[:, :3], self.pose[:, 3]
+        R = self.pose[:, :3]
+        t = self.pose[:, 3]
         if not bool(t.isfinite().all()):
             return R, DEFAULT_DISTANCE * mesh_radius(mesh)
         centre = R @ mesh_centre(mesh) + t
@@ -64,19 +69,25 @@ class Case:
 
     @property
     def has_distance(self) -> bool:
-        """Whether camera and true translation are known, without which there is no error of the distance."""
+        """Whether camera and true translation are known, without which there is no error of the
+        distance."""
         return self.camera is not None and bool(self.pose[:, 3].isfinite().all())
 
 
-def find_cases(kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None) -> list[Case]:
-    """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by mesh.
+def find_cases(
+    kind: str, root: Path, *, pixel_origin: int = 1, limit: int | None = None
+) -> list[Case]:
+    """The objects that the paper uses: neither occluded nor truncated, with known pose; grouped by
+    mesh.
 
     ``kind`` is "pascal3d", "bop" or "web"; ``limit`` uses only this many, spread evenly.
     """
     row = DATASETS[kind]
     origin = {"pixel_origin": pixel_origin} if "pixel_origin" in row.options else {}
     dataset = row.open(root, **row.whole, **origin)
-    cases = [case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None]
+    cases = [
+        case for i in range(len(dataset)) if (case := _case(row, dataset.annotation(i))) is not None
+    ]
     if not cases:
         raise InvalidInputError(f"{root}: holds no whole object with a known pose")
     if limit is not None and limit < len(cases):
@@ -92,7 +103,9 @@ def _case(kind: Any, s: dict[str, Any]) -> Case | None:
         return None
     mesh = str(s[kind.scored.mesh])
     camera = s.get("camera_matrix")
-    return Case(kind.category.format_map(s), s["image_path"], mesh, kind.scored.unit, s["box"], pose, camera)
+    return Case(
+        kind.category.format_map(s), s["image_path"], mesh, kind.scored.unit, s["box"], pose, camera
+    )
 
 
 def by_mesh(cases: list[Case]) -> Iterator[list[Case]]:

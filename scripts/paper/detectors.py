@@ -1,7 +1,8 @@
 """The 2D detectors that the paper compares.
 
-``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W) RGB, and returns
-the feature points, (B, 1, H, W) bool: at most the fraction of the pixels except for ties.
+``DETECTORS[name](image, fraction=0.04)`` takes (B, 1, H, W) grey levels in [0, 1], or (B, 3, H, W)
+RGB, and returns the feature points, (B, 1, H, W) bool: at most the fraction of the pixels except
+for ties.
 """
 
 import functools
@@ -59,9 +60,11 @@ def peaks(response: Tensor, fraction: float) -> Tensor:
 
 
 def sobel_gradient(image: Tensor) -> Tensor:
-    """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by 8)."""
+    """(B, 2, H, W) gradient of (B, 1, H, W) by the Sobel kernels, per px (their sums divided by
+    8)."""
     p = replicate_pad(image, 1)
-    along_x, along_y = p[..., 2:] - p[..., :-2], p[..., 2:, :] - p[..., :-2, :]
+    along_x = p[..., 2:] - p[..., :-2]
+    along_y = p[..., 2:, :] - p[..., :-2, :]
     gx = along_x[..., :-2, :] + 2.0 * along_x[..., 1:-1, :] + along_x[..., 2:, :]
     gy = along_y[..., :-2] + 2.0 * along_y[..., 1:-1] + along_y[..., 2:]
     return torch.cat([gx, gy], dim=1) / 8.0
@@ -77,14 +80,15 @@ def sobel(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
     """Zero crossings of the Laplacian of the image smoothed by 2 px (Marr and Hildreth 1980).
 
-    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the lower neighbour; the
-    larger of these steps is its strength.
+    A pixel is a crossing where the sign of the Laplacian differs from that of the right or the
+    lower neighbour; the larger of these steps is its strength.
     """
     _, _, xx, yy, _ = central_derivatives(smooth(image, 2.0))
     laplacian = F.pad(xx + yy, (0, 1, 0, 1), mode="replicate")
     here = laplacian[..., :-1, :-1]
     steps = [
-        torch.where(here * x < 0, (here - x).abs(), 0.0) for x in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1])
+        torch.where(here * x < 0, (here - x).abs(), 0.0)
+        for x in (laplacian[..., :-1, 1:], laplacian[..., 1:, :-1])
     ]
     response = torch.maximum(*steps)
     return strongest_points(response, response > 0, fraction)
@@ -92,12 +96,17 @@ def laplacian_of_gaussian(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 
 @detector
 def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels exceed the upper
-    threshold, and the lower one is 0.4 times as high."""
-    response = torch.linalg.vector_norm(sobel_gradient(smooth(image, 1.4, margin=0)), dim=1, keepdim=True)
+    """Canny (1986) by scikit-image, sigma 1.4 px; as in MATLAB's ``edge``, 30 % of the pixels
+    exceed the upper threshold, and the lower one is 0.4 times as high."""
+    response = torch.linalg.vector_norm(
+        sobel_gradient(smooth(image, 1.4, margin=0)), dim=1, keepdim=True
+    )
     points = torch.zeros_like(response, dtype=torch.bool)
-    for grey, length, mask in zip(image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True):
-        high = 4.0 * float(np.quantile(length.numpy(), 0.7))  # scikit-image divides its Sobel sums by 4
+    for grey, length, mask in zip(
+        image.double().numpy()[:, 0], response[:, 0], points[:, 0], strict=True
+    ):
+        # scikit-image divides its Sobel sums by 4
+        high = 4.0 * float(np.quantile(length.numpy(), 0.7))
         edges = skimage.feature.canny(grey, 1.4, 0.4 * high, high, mode="nearest")
         mask.copy_(torch.from_numpy(edges))
     return strongest_points(response, points, fraction)
@@ -105,27 +114,33 @@ def canny(image: Tensor, *, fraction: float = 0.04) -> Tensor:
 
 @detector
 def fuzzy_edges(image: Tensor, *, width: float = 0.1, fraction: float = 0.04) -> Tensor:
-    r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the image.
+    r"""Edges by fuzzy rules on the two derivatives, each divided by the largest derivative of the
+    image.
 
-    With "zero" as :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))` and AND as min, a pixel is uniform (0) if I_x is
-    zero and I_y is zero, and an edge (1) otherwise. Points are the maxima along the gradient of the mean of 0 and 1
-    weighted by the truth of each rule (Sugeno), :math:`1 - \min(\mu(I_x), \mu(I_y))`.
+    With "zero" as :math:`\mu(g) = \exp(-g^2 / (2\,\mathrm{width}^2))` and AND as min, a pixel is
+    uniform (0) if I_x is zero and I_y is zero, and an edge (1) otherwise. Points are the maxima
+    along the gradient of the mean of 0 and 1 weighted by the truth of each rule (Sugeno),
+    :math:`1 - \min(\mu(I_x), \mu(I_y))`.
     """
     gradient = image_gradient(image, sigma=1.0)
     peak = image_maximum(gradient.abs())
     relative = gradient / torch.where(peak > 0, peak, 1.0)
     zero = torch.exp(-0.5 * (relative / width).square()).amin(dim=1, keepdim=True)
     length = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return field_points((1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction=fraction)
+    return field_points(
+        (1.0 - zero) * gradient / torch.where(length > 0, length, 1.0), fraction=fraction
+    )
 
 
 SIDES = (9, 15, 21, 27, 39, 51, 75, 99)
-"""Sides in px of the box filters, as in Bay et al.; a side of 9 corresponds to a Gaussian of sigma 1.2 px."""
+"""Sides in px of the box filters, as in Bay et al.; a side of 9 corresponds to a Gaussian of sigma
+1.2 px."""
 
 
 @detector
 def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.04) -> Tensor:
-    """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box filters by scikit-image.
+    """Fast-Hessian (Bay et al. 2008), the detector of SURF: determinants of a Hessian of box
+    filters by scikit-image.
 
     Points are maxima above ``threshold`` > 0 over 3 x 3 px and three neighbouring sides.
     """
@@ -133,28 +148,35 @@ def fast_hessian(image: Tensor, *, threshold: float = 1e-4, fraction: float = 0.
     H, W = image.shape[-2:]
     greys = F.pad(image.double(), (50,) * 4, mode="replicate").numpy()[:, 0]
     found = [[skimage.feature.hessian_matrix_det(x, side / 3) for side in sides] for x in greys]
-    volume = torch.tensor(np.array(found), dtype=torch.float32).view(len(image), 1, len(sides), H + 100, W + 100)
-    volume = volume[..., 49 : 49 + H, 49 : 49 + W]  # scikit-image's result is one pixel too far up and left
-    inner, largest = volume[:, :, 1:-1], F.max_pool3d(volume, 3, stride=1, padding=(0, 1, 1))
+    volume = torch.tensor(np.array(found), dtype=torch.float32).view(
+        len(image), 1, len(sides), H + 100, W + 100
+    )
+    # scikit-image's result is one pixel too far up and left
+    volume = volume[..., 49 : 49 + H, 49 : 49 + W]
+    inner = volume[:, :, 1:-1]
+    largest = F.max_pool3d(volume, 3, stride=1, padding=(0, 1, 1))
     best = torch.where((inner == largest) & (inner > threshold), inner, 0.0).amax(dim=2)
     return strongest_points(best, best > 0, fraction)
 
 
 @detector
 def harris(image: Tensor, *, k: float = 0.04, fraction: float = 0.04) -> Tensor:
-    """Harris and Stephens (1988): det - k trace^2 of the structure tensor (Sobel, Gaussian window), where positive."""
+    """Harris and Stephens (1988): det - k trace^2 of the structure tensor (Sobel, Gaussian window),
+    where positive."""
     return peaks(harris_response(image, k=k), fraction)
 
 
 @detector
 def minimum_eigenvalue(image: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """Shi and Tomasi (1994): the smaller eigenvalue of the structure tensor (Sobel, Gaussian window)."""
+    """Shi and Tomasi (1994): the smaller eigenvalue of the structure tensor (Sobel, Gaussian
+    window)."""
     return peaks(gftt_response(image), fraction)
 
 
 @detector
 def sift(image: Tensor, *, fraction: float = 0.04) -> Tensor:
-    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the nearest pixel."""
+    """SIFT keypoints (Lowe 2004) by OpenCV with its defaults on the CPU, each rounded to the
+    nearest pixel."""
     points = torch.zeros(image.shape, dtype=torch.bool)
     H, W = image.shape[-2:]
     sift_detector = cv2.SIFT.create(nfeatures=max(1, int(fraction * H * W)))
@@ -171,7 +193,9 @@ def of_field(field: Callable[[Tensor], Tensor]) -> Callable[..., Tensor]:
 
 
 DETECTORS: dict[str, Callable[..., Tensor]] = {
-    "mfc": of_field(functools.partial(multiscale_focus_curves, mode="reblur-saliency", saliency_weight=0.0)),
+    "mfc": of_field(
+        functools.partial(multiscale_focus_curves, mode="reblur-saliency", saliency_weight=0.0)
+    ),
     "mfc x cs": of_field(multiscale_focus_curves),
     "mcs": of_field(multiscale_curvilinear_saliency),
     "ig": of_field(image_gradient),
@@ -185,4 +209,5 @@ DETECTORS: dict[str, Callable[..., Tensor]] = {
     "sift": sift,
     "surf": fast_hessian,
 }
-"""Every detector of the comparison by its short name, the detectors of the paper first; "mfc x cs" is ours."""
+"""Every detector of the comparison by its short name, the detectors of the paper first; "mfc x cs"
+is ours."""

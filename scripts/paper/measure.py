@@ -1,7 +1,8 @@
 """What the paper measures, for the photographs of one mesh: values that its tables are made of.
 
-Ranking is by the paper's S_hog and S_rep alone, in two variants: ``literal`` is the preset ``paper``; ``corrected`` has
-what docs/method.md corrects, with S_hog as a cosine, in perspective views of the mesh in its own frame.
+Ranking is by the paper's S_hog and S_rep alone, in two variants: ``literal`` is the preset
+``paper``; ``corrected`` has what docs/method.md corrects, with S_hog as a cosine, in perspective
+views of the mesh in its own frame.
 """
 
 import math
@@ -16,7 +17,11 @@ from kornia.color import rgb_to_grayscale
 from torch import Tensor, nn
 
 from curvireg_torch.features import field_points
-from curvireg_torch.filters import ImageGradient, MultiScaleCurvilinearSaliency, MultiScaleFocusCurves
+from curvireg_torch.filters import (
+    ImageGradient,
+    MultiScaleCurvilinearSaliency,
+    MultiScaleFocusCurves,
+)
 from curvireg_torch.geometry import pose_from_box, rotation_error, viewpoint_from_rotation
 from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.mesh import load_mesh
@@ -38,10 +43,12 @@ PHOTOS = ("MFC", "MCS", "IG")
 DEPTHS = ("CS", "ASG", "AR")
 PAIRS = tuple(f"{depth}/{photo}" for depth in DEPTHS for photo in PHOTOS)
 REPEATED_DEPTHS = ("CS", "ASG", "HFN")
-CURVE_OFFSETS = tuple(range(-100, 100, 5))  # degrees about the object's z axis: 40 views, the true one among them
+# degrees about the object's z axis: 40 views, the true one among them
+CURVE_OFFSETS = tuple(range(-100, 100, 5))
 CURVE_DETECTORS = ("MFC", "MCS", "IG", "SIFT", "SOBEL")
 SENSITIVE = ("MFC", "MCS", "IG", "SOBEL", "CANNY")
-EPS, SHARES = (1.0, 2.0, 3.0, 4.0), (0.01, 0.02, 0.04, 0.08)
+EPS = (1.0, 2.0, 3.0, 4.0)
+SHARES = (0.01, 0.02, 0.04, 0.08)
 RANKS = (1, 3, 5, 10, 20)
 BEST_PAIR = "CS/MFC"
 
@@ -50,7 +57,9 @@ def variants(pose: str) -> dict[str, Pipeline]:
     """The two variants of the paper's ranking and search."""
     literal = PRESETS["paper"]
     corrected = replace(literal, views=ViewPolicy(pose), bank=BankSettings())
-    corrected = corrected.with_term("repeatability", mode="monotone").with_term("hog", whitening="none")
+    corrected = corrected.with_term("repeatability", mode="monotone").with_term(
+        "hog", whitening="none"
+    )
     return {"literal": literal, "corrected": corrected}
 
 
@@ -69,12 +78,19 @@ class Remembered:
         self._known: dict[bytes, Tensor] = {}
 
     def render(
-        self, T_cam_from_model: Tensor, camera_matrix: Tensor, size: tuple[int, int], *, orthographic: bool = False
+        self,
+        T_cam_from_model: Tensor,
+        camera_matrix: Tensor,
+        size: tuple[int, int],
+        *,
+        orthographic: bool = False,
     ) -> Tensor:
         numbers = torch.cat([T_cam_from_model.flatten(), camera_matrix.flatten()]).numpy().tobytes()
         key = numbers + bytes(f"{size} {orthographic}", "ascii")
         if key not in self._known:
-            self._known[key] = self._inner.render(T_cam_from_model, camera_matrix, size, orthographic=orthographic)
+            self._known[key] = self._inner.render(
+                T_cam_from_model, camera_matrix, size, orthographic=orthographic
+            )
         return self._known[key].clone()
 
 
@@ -91,7 +107,9 @@ def detectors_of(share: float) -> dict[str, Callable[[Tensor], Tensor]]:
 def measure_points(cases: list[Case], settings: BankSettings) -> list[Record]:
     """Agreement of the points of photographs with those of the views at their true poses."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
-    describers = {name: ViewDescriber(mesh, replace(settings, depth_field=name)) for name in REPEATED_DEPTHS}
+    describers = {
+        name: ViewDescriber(mesh, replace(settings, depth_field=name)) for name in REPEATED_DEPTHS
+    }
     return [_points_of(case, mesh, describers, settings) for case in cases]
 
 
@@ -103,13 +121,17 @@ def _points_of(
     turned = R @ _turns_about_z()
     around = turned, torch.full((len(turned),), distance, dtype=torch.float64)
     share = settings.point_fraction
-    fields = {name: describe.fields(R[None], around[1][:1]) for name, describe in describers.items()}
+    fields = {
+        name: describe.fields(R[None], around[1][:1]) for name, describe in describers.items()
+    }
     views = {name: field_points(field, fraction=share)[0, 0] for name, field in fields.items()}
     photos = {name: detect(crop) for name, detect in detectors_of(share).items()}
     view = views["CS"]
     record: Record = {
         "ip": {name: float(intersection_percentage(photo, view)) for name, photo in photos.items()},
-        "hausdorff": {name: float(hausdorff_distance(photo, view)) for name, photo in photos.items()},
+        "hausdorff": {
+            name: float(hausdorff_distance(photo, view)) for name, photo in photos.items()
+        },
         "points": {name: int(photo.sum()) for name, photo in photos.items()},
         "repeatability": {
             f"{depth}/{name}": float(repeatability(points, photos[name]))
@@ -119,28 +141,35 @@ def _points_of(
     }
     record["ip"]["chance"] = float(intersection_percentage(torch.ones_like(view), view))
     circle = field_points(describers["CS"].fields(*around), fraction=share)[:, 0]
-    record["curve"] = {name: [float(repeatability(one, photos[name])) for one in circle] for name in CURVE_DETECTORS}
+    record["curve"] = {
+        name: [float(repeatability(one, photos[name])) for one in circle]
+        for name in CURVE_DETECTORS
+    }
     record["sensitivity"] = {}
     for share in SHARES:
         few = field_points(fields["CS"], fraction=share)[0, 0]
         detect = detectors_of(share)
         for name in SENSITIVE:
             found = points_within(detect[name](crop), few, EPS)
-            record["sensitivity"] |= {f"{name} {share:g} {eps:g}": value for eps, value in zip(EPS, found, strict=True)}
+            record["sensitivity"] |= {
+                f"{name} {share:g} {eps:g}": value for eps, value in zip(EPS, found, strict=True)
+            }
     return record
 
 
 def _turns_about_z() -> Tensor:
     """(40, 3, 3) rotations of the object about its z axis."""
     angles = torch.deg2rad(torch.tensor(CURVE_OFFSETS, dtype=torch.float64))
-    zero, one = torch.zeros_like(angles), torch.ones_like(angles)
+    zero = torch.zeros_like(angles)
+    one = torch.ones_like(angles)
     rows = [angles.cos(), -angles.sin(), zero, angles.sin(), angles.cos(), zero, zero, zero, one]
     return torch.stack(rows, dim=1).view(-1, 3, 3)
 
 
 @torch.no_grad()
 def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[Record]:
-    """Rankings of all views, and the poses that the paper's search finds, for each pair of filters."""
+    """Rankings of all views, and the poses that the paper's search finds, for each pair of
+    filters."""
     mesh = load_mesh(cases[0].mesh_path, unit=cases[0].unit)
     renderer: Any = Remembered(mesh)
     describe = ViewDescriber(mesh, settings)
@@ -148,7 +177,9 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
     truths = torch.stack([case.view(mesh)[0] for case in cases])
     records: list[Record] = [{} for _ in cases]
     for variant, pipeline in variants(pose).items():
-        bank_settings = replace(pipeline.bank, image_size=settings.image_size, margin=settings.margin)
+        bank_settings = replace(
+            pipeline.bank, image_size=settings.image_size, margin=settings.margin
+        )
         pipeline = replace(pipeline, bank=bank_settings)
         fields = photo_fields(variant)
         for depth in DEPTHS:
@@ -163,7 +194,9 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
                     records[b].setdefault(variant, {})[f"{depth}/{photo}"] = found
         limit = errors.argmin(dim=1)
         for b, case in enumerate(cases):
-            records[b][variant]["limit"] = _pose_errors(bank.rotations[limit[b]], case, truths[b], describe)
+            records[b][variant]["limit"] = _pose_errors(
+                bank.rotations[limit[b]], case, truths[b], describe
+            )
             records[b][variant]["grid 8"] = records[b][variant][BEST_PAIR]["top"][0]
         for grid in (4, 16):
             given = replace(pipeline, bank=replace(bank_settings, grid=grid))
@@ -176,7 +209,12 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
 
 
 def _ranked(
-    matcher: ViewMatcher, crop: Tensor, case: Case, truth: Tensor, errors: Tensor, describe: ViewDescriber
+    matcher: ViewMatcher,
+    crop: Tensor,
+    case: Case,
+    truth: Tensor,
+    errors: Tensor,
+    describe: ViewDescriber,
 ) -> Record:
     query = matcher.features(crop[None])
     ranking = matcher.rank(query)
@@ -192,9 +230,11 @@ def _ranked(
     }
 
 
-def _pose_errors(rotation: Tensor, case: Case, truth: Tensor, describe: ViewDescriber) -> list[float]:
-    """Absolute errors of elevation, azimuth and in-plane angle in degrees, and of the distance, at which the view fills
-    the box of the photograph, in percent."""
+def _pose_errors(
+    rotation: Tensor, case: Case, truth: Tensor, describe: ViewDescriber
+) -> list[float]:
+    """Absolute errors of elevation, azimuth and in-plane angle in degrees, and of the distance, at
+    which the view fills the box of the photograph, in percent."""
     angles = [torch.stack(viewpoint_from_rotation(R.double())) for R in (rotation, truth)]
     azimuth, elevation, theta = angle_differences(*angles).tolist()
     error = math.nan

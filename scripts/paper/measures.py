@@ -1,4 +1,5 @@
-"""Agreement of feature points, and means with their intervals, as the tables of the paper need them."""
+"""Agreement of feature points, and means with their intervals, as the tables of the paper need
+them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,14 +30,15 @@ class Estimate:
 
 
 def bootstrap(values: Sequence[float], groups: Sequence[str]) -> Estimate:
-    """Mean of the finite values, and its 95 % interval by 2000 resamples of whole groups (CADs), whose photographs are
-    not independent; the same values give the same interval."""
+    """Mean of the finite values, and its 95 % interval by 2000 resamples of whole groups (CADs),
+    whose photographs are not independent; the same values give the same interval."""
     known = np.isfinite(np.asarray(values, dtype=np.float64))
     if not known.any():
         return Estimate(np.nan, np.nan, np.nan, 0)
     x = np.asarray(values, dtype=np.float64)[known]
     _, group = np.unique(np.asarray(groups)[known], return_inverse=True)
-    sums, sizes = np.bincount(group, x), np.bincount(group)
+    sums = np.bincount(group, x)
+    sizes = np.bincount(group)
     chosen = np.random.default_rng(0).integers(len(sums), size=(RESAMPLES, len(sums)))
     means = sums[chosen].sum(axis=1) / sizes[chosen].sum(axis=1)
     low, high = np.quantile(means, (0.025, 0.975))
@@ -44,8 +46,8 @@ def bootstrap(values: Sequence[float], groups: Sequence[str]) -> Estimate:
 
 
 def points_within(photo: Tensor, view: Tensor, eps_px: Sequence[float]) -> list[float]:
-    """For each eps the fraction of the photograph's points (H, W) within eps px of a point of the view (H, W); NaN if
-    the photograph has no points, 0 where only the view has none."""
+    """For each eps the fraction of the photograph's points (H, W) within eps px of a point of the
+    view (H, W); NaN if the photograph has no points, 0 where only the view has none."""
     distances = _distances(photo.numpy(), view.numpy())
     return [float((distances <= eps).mean()) if len(distances) else np.nan for eps in eps_px]
 
@@ -56,21 +58,24 @@ def intersection_percentage(photo: Tensor, view: Tensor, *, eps_px: float = 2.0)
 
 
 def repeatability(view: Tensor, photo: Tensor, *, eps_px: float = 2.0) -> float:
-    """Fraction of the view's points (H, W) within ``eps_px`` of a point of the photograph (H, W); NaN without any."""
+    """Fraction of the view's points (H, W) within ``eps_px`` of a point of the photograph (H, W);
+    NaN without any."""
     return points_within(view, photo, (eps_px,))[0]
 
 
 def hausdorff_distance(a: Tensor, b: Tensor) -> float:
-    """Hausdorff distance of two sets of points (H, W) in px: the largest distance of a point of either to the other
-    set; ``inf`` where one set is empty and NaN where both are."""
-    x, y = a.numpy(), b.numpy()
+    """Hausdorff distance of two sets of points (H, W) in px: the largest distance of a point of
+    either to the other set; ``inf`` where one set is empty and NaN where both are."""
+    x = a.numpy()
+    y = b.numpy()
     if not (x.any() and y.any()):
         return float(np.inf) if x.any() or y.any() else float(np.nan)
     return max(float(_distances(x, y).max()), float(_distances(y, x).max()))
 
 
 def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
-    """Distance from each point of ``a`` to the nearest point of ``b``; ``inf`` if ``b`` is empty."""
+    """Distance from each point of ``a`` to the nearest point of ``b``; ``inf`` if ``b`` is
+    empty."""
     if not b.any():
         return np.full(int(a.sum()), np.inf)
     to_b: NDArray[np.float64] = distance_transform_edt(~b)
@@ -78,7 +83,8 @@ def _distances(a: Mask, b: Mask) -> NDArray[np.float64]:
 
 
 def angle_differences(a: Tensor, b: Tensor) -> Tensor:
-    """Absolute differences of (..., 3) azimuth, elevation and theta in degrees; the first and the last are circular."""
+    """Absolute differences of (..., 3) azimuth, elevation and theta in degrees; the first and the
+    last are circular."""
     difference = (a - b).abs()
     remainder = difference % 360.0
     circular = torch.tensor([True, False, True])

@@ -2,7 +2,19 @@
 
 from statistics import fmean
 
-DETECTORS = ("MFC", "MCS", "PCI", "MINEIG", "HARRIS", "SIFT", "SURF", "SOBEL", "CANNY", "LOG", "FUZZY")
+DETECTORS = (
+    "MFC",
+    "MCS",
+    "PCI",
+    "MINEIG",
+    "HARRIS",
+    "SIFT",
+    "SURF",
+    "SOBEL",
+    "CANNY",
+    "LOG",
+    "FUZZY",
+)
 
 # Rows: plane, bicycle, boat, bus, car, chair, table, train of PASCAL3D+
 _IP = """55 50 37 15  9  8 13 10 13 11 10
@@ -32,7 +44,8 @@ _WEB_IP = """59 50 46 8 4 3 3 10 18 11 5
 57 54 50 2 3 4 3 8 12 7 8
 44 39 32 4 5 9 4 7 14 8 7
 69 67 61 9 9 9 4 13 23 14 7"""
-# Rows: plane, bicycle, boat, bus, car, diningtable, motorbike, sofa, train, tvmonitor; columns: PAIRS
+# Rows: plane, bicycle, boat, bus, car, diningtable, motorbike, sofa, train, tvmonitor; columns:
+# PAIRS
 _PRECISION = """.85 .83 .62 .84 .80 .59 .78 .70 .50
 .81 .76 .60 .80 .78 .61 .74 .73 .49
 .78 .71 .58 .75 .70 .57 .71 .68 .52
@@ -57,7 +70,9 @@ POSE_ERRORS = {
 
 def _means(text: str, names: tuple[str, ...], scale: float = 1.0) -> dict[str, float]:
     rows = [[scale * float(word) for word in line.split()] for line in text.splitlines()]
-    return {name: fmean(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+    return {
+        name: fmean(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)
+    }
 
 
 IP = _means(_IP, DETECTORS, 0.01)

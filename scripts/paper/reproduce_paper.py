@@ -1,24 +1,27 @@
 """Measure the paper's tables and figures on a dataset, as CSV, Markdown and pictures.
 
     pip install 'curvireg_torch[paper]'
-    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N] [--page docs/paper.md]
+    python scripts/paper/reproduce_paper.py TABLE pascal3d|bop|web ROOT --out DIR [--jobs N] [--page
+    docs/paper.md]
 
 TABLE is one of
 
-- detectors: intersection percentage and Hausdorff distances of every detector (the paper's IP and HD tables)
+- detectors: intersection percentage and Hausdorff distances of every detector (the paper's IP and
+  HD tables)
 - repeatability: {CS, ASG, HFN} x {MFC, MCS, IG}
 - curve: repeatability in 40 views around the right one
 - sensitivity: intersection percentage by radius and share of points
 - precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected
 - ranks: precision at rank 1, 3, 5, 10, 20
-- angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the closest retrieved view
+- angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the
+  closest retrieved view
 - grids: precision with descriptors of 4, 8 and 16 cells
 - all
 
-Every table states what was measured, the number of photographs, and 95 % intervals. Only objects that are neither
-occluded nor truncated are used, as in the paper. DIR/records holds one file for each mesh: an interrupted run goes on
-where it was, and a table is written as soon as all of its records are there. --page writes all tables that DIR holds,
-with the commit, into a page.
+Every table states what was measured, the number of photographs, and 95 % intervals. Only objects
+that are neither occluded nor truncated are used, as in the paper. DIR/records holds one file for
+each mesh: an interrupted run goes on where it was, and a table is written as soon as all of its
+records are there. --page writes all tables that DIR holds, with the commit, into a page.
 """
 
 import argparse
@@ -33,7 +36,8 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY))  # with an installed wheel, scripts is not a package that Python finds
+# with an installed wheel, scripts is not a package that Python finds
+sys.path.insert(0, str(REPOSITORY))
 
 import torch
 from tqdm import tqdm
@@ -61,17 +65,31 @@ OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
     "grids": paper.grid_tables,
 }
 TABLES = (*OF_POINTS, *OF_VIEWS)
-ON_PAGE = ("detectors", "repeatability", "curve", "precision", "ranks_literal", "ranks_corrected", "angles_literal")
+ON_PAGE = (
+    "detectors",
+    "repeatability",
+    "curve",
+    "precision",
+    "ranks_literal",
+    "ranks_corrected",
+    "angles_literal",
+)
 ON_PAGE += ("angles_corrected", "grids", "sensitivity")
 PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
 
 
-def measure(phase: str, cases: list[Case], settings: BankSettings, pose: str) -> list[dict[str, Any]]:
+def measure(
+    phase: str, cases: list[Case], settings: BankSettings, pose: str
+) -> list[dict[str, Any]]:
     """Records of the cases of one mesh."""
     from scripts.paper.measure import measure_points, measure_views
 
     start = time.process_time()
-    found = measure_points(cases, settings) if phase == "points" else measure_views(cases, settings, pose)
+    found = (
+        measure_points(cases, settings)
+        if phase == "points"
+        else measure_views(cases, settings, pose)
+    )
     seconds = (time.process_time() - start) / len(cases)
     same = {"cad": cases[0].mesh_path, "seconds": seconds, "commit": commit()}
     names = [{"category": case.category, **same} for case in cases]
@@ -92,7 +110,9 @@ def run(arguments: argparse.Namespace) -> None:
             continue
         records = collect(phase, cases, settings, pose, arguments)
         if not records:
-            raise InvalidInputError(f"{arguments.out}: holds no records of {phase} yet; run it without --partial")
+            raise InvalidInputError(
+                f"{arguments.out}: holds no records of {phase} yet; run it without --partial"
+            )
         for name in chosen:
             for table in makers[name](paper.Records(records, what)):
                 table.write(arguments.out)
@@ -110,22 +130,39 @@ def collect(
     """The records of all cases; those of each mesh are stored when they are known."""
     code = code_digest(*POSE_SOURCES) + own_digest()
     # In a fixed random order: the part that an interrupted run has measured is a fair one.
-    groups = sorted(by_mesh(cases), key=lambda group: text_digest(Path(group[0].mesh_path).name + group[0].category))
+    groups = sorted(
+        by_mesh(cases),
+        key=lambda group: text_digest(Path(group[0].mesh_path).name + group[0].category),
+    )
     paths = []
     for group in groups:
-        files = [file_digest(Path(name)) for name in (group[0].mesh_path, *(case.image_path for case in group))]
-        request = json.dumps([phase, str(settings), pose, code, files, [case.key for case in group]])
+        files = [
+            file_digest(Path(name))
+            for name in (group[0].mesh_path, *(case.image_path for case in group))
+        ]
+        request = json.dumps(
+            [phase, str(settings), pose, code, files, [case.key for case in group]]
+        )
         paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
     if arguments.partial:
         paths = [path for path in paths if path.exists()]
     missing = [k for k, path in enumerate(paths) if not path.exists()]
     done = len(cases) - sum(len(groups[k]) for k in missing)
-    options = [phase] * len(missing), [groups[k] for k in missing], [settings] * len(missing), [pose] * len(missing)
-    with tqdm(total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet) as bar:
+    options = (
+        [phase] * len(missing),
+        [groups[k] for k in missing],
+        [settings] * len(missing),
+        [pose] * len(missing),
+    )
+    with tqdm(
+        total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet
+    ) as bar:
         if arguments.jobs == 1 or len(missing) < 2:
             measured = map(measure, *options)
         else:
-            pool = ProcessPoolExecutor(arguments.jobs, get_context("spawn"), torch.set_num_threads, (1,))
+            pool = ProcessPoolExecutor(
+                arguments.jobs, get_context("spawn"), torch.set_num_threads, (1,)
+            )
             measured = pool.map(measure, *options)
         for k, found in zip(missing, measured, strict=True):
             write_json(paths[k], _finite(found), indent=0)
@@ -156,7 +193,9 @@ def check_packages() -> None:
 
     for module, package in (("skimage", "scikit-image"), ("matplotlib", "matplotlib")):
         if find_spec(module) is None:
-            raise MissingDependencyError(f"{package} is not installed; pip install 'curvireg_torch[paper]'")
+            raise MissingDependencyError(
+                f"{package} is not installed; pip install 'curvireg_torch[paper]'"
+            )
 
 
 def draw_curve(records: list[dict[str, Any]], path: Path) -> None:
@@ -181,7 +220,9 @@ def write_page(folder: Path, page: Path) -> None:
     """Replace the part of a page between its markers by the tables of a folder."""
     from scripts._shared import update_page
 
-    records = [json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()]
+    records = [
+        json.loads(path.read_text(encoding="utf-8")) for path in (folder / "records").iterdir()
+    ]
     commits = sorted({record["commit"] for some in records for record in some})
     found = []
     for name in ON_PAGE:
@@ -189,7 +230,9 @@ def write_page(folder: Path, page: Path) -> None:
         if path.exists():
             found.append(path.read_text(encoding="utf-8"))
         if name == "curve" and (folder / "curve.png").exists():
-            found.append(f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n")
+            found.append(
+                f"![Repeatability in 40 views around the true one]({_picture(folder, page)})\n"
+            )
     update_page(page, "paper", "\n".join([f"Measured at commit {', '.join(commits)}.", "", *found]))
 
 
@@ -205,17 +248,29 @@ def _picture(folder: Path, page: Path) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("table", choices=(*TABLES, "all"), metavar="TABLE")
     parser.add_argument("kind", choices=DATASETS)
     parser.add_argument("root", type=Path, metavar="ROOT")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set")
-    parser.add_argument("--partial", action="store_true", help="tables of what is measured so far; measures nothing")
+    parser.add_argument(
+        "--limit", type=int, metavar="N", help="use N photographs, spread evenly over the set"
+    )
+    parser.add_argument(
+        "--partial", action="store_true", help="tables of what is measured so far; measures nothing"
+    )
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
-    parser.add_argument("--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)")
-    parser.add_argument("--pose", choices=("upright", "any"), help="corrected views (default: the dataset's)")
-    parser.add_argument("--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)")
+    parser.add_argument(
+        "--image-size", type=int, default=128, metavar="PX", help="side of crops (default: 128)"
+    )
+    parser.add_argument(
+        "--pose", choices=("upright", "any"), help="corrected views (default: the dataset's)"
+    )
+    parser.add_argument(
+        "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
+    )
     parser.add_argument("--page", type=Path, help="page of the documentation that gets the tables")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     try:

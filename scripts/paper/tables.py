@@ -14,9 +14,12 @@ from scripts.paper.measures import Estimate, bootstrap
 Cell = str | Estimate
 Value = Callable[[dict[str, Any]], float]
 
-PHOTOS, REPEATED_DEPTHS = ("MFC", "MCS", "IG"), ("CS", "ASG", "HFN")
+PHOTOS = ("MFC", "MCS", "IG")
+REPEATED_DEPTHS = ("CS", "ASG", "HFN")
 PAIRS = printed.PAIRS
-RANKS, GRIDS, RIGHT_DEG = (1, 3, 5, 10, 20), (4, 8, 16), 30.0
+RANKS = (1, 3, 5, 10, 20)
+GRIDS = (4, 8, 16)
+RIGHT_DEG = 30.0
 VARIANTS = ("literal", "corrected")
 SHOWN_OFFSETS = (-90, -45, -20, -10, -5, 0, 5, 10, 20, 45, 90)
 PARTS = ("elevation", "azimuth", "in-plane", "distance")
@@ -50,8 +53,14 @@ class Table:
         header: list[str] = []
         for k, column in enumerate(self.columns):
             wide = any(isinstance(row[k], Estimate) for row in self.rows)
-            header += [column, *([f"{column} {end}" for end in ("low", "high", "N")] if wide else [])]
-        rows = [[value for k in range(len(self.columns)) for value in self._values(row, k)] for row in self.rows]
+            header += [
+                column,
+                *([f"{column} {end}" for end in ("low", "high", "N")] if wide else []),
+            ]
+        rows = [
+            [value for k in range(len(self.columns)) for value in self._values(row, k)]
+            for row in self.rows
+        ]
         write_csv(folder / f"{self.name}.csv", [header, *rows])
         write_file(folder / f"{self.name}.md", self.markdown().encode())
 
@@ -67,7 +76,8 @@ class Records:
     """The records of photographs, with category and CAD."""
 
     def __init__(self, records: Sequence[dict[str, Any]], what: str) -> None:
-        self.records, self.what = records, what
+        self.records = records
+        self.what = what
 
     def mean(self, value: Value) -> Estimate:
         """Mean of the finite values of all photographs."""
@@ -85,13 +95,21 @@ class Records:
     def text(self) -> str:
         """What was measured, and on how many."""
         cads = len({r["cad"] for r in self.records})
-        return f"{self.what}, N = {len(self.records)} ({cads} CADs); in brackets 95 % by bootstrap of the CADs."
+        return (
+            f"{self.what}, N = {len(self.records)} ({cads} CADs); in brackets 95 % by "
+            f"bootstrap "
+            f"of the CADs."
+        )
 
 
 def by_class(name: str, title: str, records: Records, columns: dict[str, Value]) -> Table:
     """One row for each category, and one for all."""
-    groups = [(category, records.of(category)) for category in records.categories] + [("all", records)]
-    rows = [[category, *(group.mean(value) for value in columns.values())] for category, group in groups]
+    groups = [(category, records.of(category)) for category in records.categories] + [
+        ("all", records)
+    ]
+    rows = [
+        [category, *(group.mean(value) for value in columns.values())] for category, group in groups
+    ]
     return Table(f"{name}_by_class", f"{title} by class", records.text, ["class", *columns], rows)
 
 
@@ -117,15 +135,28 @@ def detector_tables(records: Records) -> list[Table]:
     for name in names:
         ours = [records.mean(at(kind, name)) for kind in ("ip", "hausdorff", "points")]
         paper = [_printed(printed.IP.get(name), 2), _printed(printed.WEB_IP.get(name), 2)]
-        rows.append([name, ours[0], *paper, ours[1], _printed(printed.HAUSDORFF.get(name), 0), ours[2]])
+        rows.append(
+            [name, ours[0], *paper, ours[1], _printed(printed.HAUSDORFF.get(name), 0), ours[2]]
+        )
     rows.append(["any pixel (chance)", records.mean(at("ip", "chance")), "-", "-", "-", "-", "-"])
     text = (
-        "IP: fraction of the photograph's points within 2 px of a point of the curvilinear saliency (CS) of the view "
-        "at the true pose. HD: Hausdorff distance of the two sets, px of the crop (paper: of unknown pictures). "
-        "At most 4 % of the pixels are points. MFC x CS is the preset `classical`'s, not the paper's. The web "
+        "IP: fraction of the photograph's points within 2 px of a point of the curvilinear "
+        "saliency (CS) of the view "
+        "at the true pose. HD: Hausdorff distance of the two sets, px of the crop (paper: of "
+        "unknown pictures). "
+        "At most 4 % of the pixels are points. MFC x CS is the preset `classical`'s, not the "
+        "paper's. The web "
         f"collection of the paper was never published. {records.text}"
     )
-    columns = ["detector", "IP", "paper, PASCAL3D+", "paper, web", "HD", "paper, PASCAL3D+ ", "points"]
+    columns = [
+        "detector",
+        "IP",
+        "paper, PASCAL3D+",
+        "paper, web",
+        "HD",
+        "paper, PASCAL3D+ ",
+        "points",
+    ]
     tables = [Table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows)]
     for kind in ("ip", "hausdorff"):
         tables.append(by_class(kind, kind, records, {name: at(kind, name) for name in names}))
@@ -134,21 +165,37 @@ def detector_tables(records: Records) -> list[Table]:
 
 def repeatability_tables(records: Records) -> list[Table]:
     """Repeatability of each depth filter's points in each photograph filter's points."""
-    rows = [[d, *(records.mean(at("repeatability", f"{d}/{p}")) for p in PHOTOS)] for d in REPEATED_DEPTHS]
+    rows = [
+        [d, *(records.mean(at("repeatability", f"{d}/{p}")) for p in PHOTOS)]
+        for d in REPEATED_DEPTHS
+    ]
     text = (
-        "Fraction of the points of the view at the true pose with a point of the photograph within 2 px (the paper "
+        "Fraction of the points of the view at the true pose with a point of the photograph "
+        "within 2 px (the paper "
         f"plots it for two objects). {records.text}"
     )
-    return [Table("repeatability", "Repeatability, depth field / field of the photograph", text, ["", *PHOTOS], rows)]
+    return [
+        Table(
+            "repeatability",
+            "Repeatability, depth field / field of the photograph",
+            text,
+            ["", *PHOTOS],
+            rows,
+        )
+    ]
 
 
 def curve_tables(records: Records, offsets: Sequence[int]) -> list[Table]:
     """Repeatability in 40 views around the true one."""
     names = list(records.records[0]["curve"])
 
-    rows = [[f"{offset}", *(records.mean(at("curve", name, k)) for name in names)] for k, offset in enumerate(offsets)]
+    rows = [
+        [f"{offset}", *(records.mean(at("curve", name, k)) for name in names)]
+        for k, offset in enumerate(offsets)
+    ]
     text = (
-        "Fraction of the points of the view with a point of the photograph within 2 px, with the object turned about "
+        "Fraction of the points of the view with a point of the photograph within 2 px, with the "
+        "object turned about "
         f"its z axis by so many degrees from the true pose. {records.text}"
     )
     shown = [row for row in rows if int(str(row[0])) in SHOWN_OFFSETS]
@@ -168,7 +215,11 @@ def sensitivity_tables(records: Records) -> list[Table]:
     for share, eps in settings:
         cells = [records.mean(at("sensitivity", f"{name} {share:g} {eps:g}")) for name in names]
         rows.append([f"{100 * share:g} %", f"{eps:g} px", *cells])
-    text = f"IP with other shares of the pixels that are points, in photograph and view, and radii. {records.text}"
+    text = (
+        f"IP with other shares of the pixels that are points, in photograph and view, and "
+        f"radii. "
+        f"{records.text}"
+    )
     return [Table("sensitivity", "Sensitivity of IP", text, ["points", "eps", *names], rows)]
 
 
@@ -183,10 +234,19 @@ def precision_tables(records: Records) -> list[Table]:
         cells = [records.mean(_right(variant, pair, 1)) for variant in VARIANTS]
         rows.append([pair, *cells, _printed(printed.PRECISION[pair], 2)])
     text = (
-        f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one (the paper does not "
+        f"Fraction of the photographs whose best view is within {RIGHT_DEG:g}° of the true one "
+        f"(the paper does not "
         f"define its precision), before the search. {records.text}"
     )
-    tables = [Table("precision", "Precision, nine pairs", text, ["depth / photograph", *VARIANTS, "paper"], rows)]
+    tables = [
+        Table(
+            "precision",
+            "Precision, nine pairs",
+            text,
+            ["depth / photograph", *VARIANTS, "paper"],
+            rows,
+        )
+    ]
     for variant in VARIANTS:
         columns = {pair: _right(variant, pair, 1) for pair in PAIRS}
         tables.append(by_class(f"precision_{variant}", "Precision", records, columns))
@@ -196,14 +256,17 @@ def precision_tables(records: Records) -> list[Table]:
 def rank_tables(records: Records) -> list[Table]:
     """Precision at rank 1, 3, 5, 10, 20."""
     text = (
-        f"Fraction of the photographs with a view within {RIGHT_DEG:g}° among the best k (the paper plots it). "
+        f"Fraction of the photographs with a view within {RIGHT_DEG:g}° among the best k (the "
+        f"paper plots it). "
         f"{records.text}"
     )
     columns = ["depth / photograph", *(f"k = {k}" for k in RANKS)]
     tables = []
     for variant in VARIANTS:
         rows = [[pair, *(records.mean(_right(variant, pair, k)) for k in RANKS)] for pair in PAIRS]
-        tables.append(Table(f"ranks_{variant}", f"Precision at rank k, {variant}", text, columns, rows))
+        tables.append(
+            Table(f"ranks_{variant}", f"Precision at rank k, {variant}", text, columns, rows)
+        )
     return tables
 
 
@@ -211,23 +274,32 @@ def angle_tables(records: Records) -> list[Table]:
     """Mean errors of elevation, azimuth, in-plane angle and distance."""
 
     text = (
-        "Mean absolute errors, angles in degrees, distance in percent (that at which the mesh fills the box, with the "
-        "camera of the annotation; the paper's centimetres are of unknown objects). Est.: after the search. Clo.: the "
-        "closest of the three retrieved views. Bank: the closest of all its views. Angles of symmetric objects count "
+        "Mean absolute errors, angles in degrees, distance in percent (that at which the mesh "
+        "fills the box, with the "
+        "camera of the annotation; the paper's centimetres are of unknown objects). Est.: after "
+        "the search. Clo.: the "
+        "closest of the three retrieved views. Bank: the closest of all its views. Angles of "
+        "symmetric objects count "
         f"in full. {records.text}"
     )
     tables = []
     for variant in VARIANTS:
         rows: list[list[Cell]] = []
         for pair in PAIRS:
-            cells = [records.mean(at(variant, pair, kind, k)) for k in range(4) for kind in ("est", "clo")]
+            cells = [
+                records.mean(at(variant, pair, kind, k))
+                for k in range(4)
+                for kind in ("est", "clo")
+            ]
             rows.append([pair, *cells])
             if pair in printed.POSE_ERRORS:
                 rows.append([f"{pair}, paper", *printed.POSE_ERRORS[pair]])
         limits = [cell for k in range(4) for cell in ("-", records.mean(at(variant, "limit", k)))]
         rows.append(["bank", *limits])
         columns = ["depth / photograph", *POSE_COLUMNS]
-        tables.append(Table(f"angles_{variant}", f"Errors of the pose, {variant}", text, columns, rows))
+        tables.append(
+            Table(f"angles_{variant}", f"Errors of the pose, {variant}", text, columns, rows)
+        )
     return tables
 
 
@@ -242,6 +314,12 @@ def grid_tables(records: Records) -> list[Table]:
     def right(variant: str, grid: int) -> Value:
         return lambda record: float(record[variant][f"grid {grid}"] < RIGHT_DEG)
 
-    rows = [[f"{g} x {g}", *(records.mean(right(variant, g)) for variant in VARIANTS)] for g in GRIDS]
-    text = f"Precision of CS/MFC by the cells of the descriptor; the paper says that 8 x 8 is best. {records.text}"
+    rows = [
+        [f"{g} x {g}", *(records.mean(right(variant, g)) for variant in VARIANTS)] for g in GRIDS
+    ]
+    text = (
+        f"Precision of CS/MFC by the cells of the descriptor; the paper says that 8 x 8 is "
+        f"best. "
+        f"{records.text}"
+    )
     return [Table("grids", "Grids", text, ["cells", *VARIANTS], rows)]

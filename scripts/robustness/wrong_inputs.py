@@ -1,12 +1,14 @@
-"""Give every command wrong inputs: each must end in a result or in one line of ours, within limits, never a traceback.
+"""Give every command wrong inputs: each must end in a result or in one line of ours, within limits,
+never a traceback.
 
-    python scripts/robustness/wrong_inputs.py                    # command lines with one mistake, then damaged files
-    python scripts/robustness/wrong_inputs.py --damaged 5000     # more damaged files
+    python scripts/robustness/wrong_inputs.py                    # command lines with one mistake,
+    then damaged files python scripts/robustness/wrong_inputs.py --damaged 5000     # more damaged
+    files
 
-wrong_inputs.txt lists command lines, and files with one mistake each, and what the message must contain. Damaged files
-are good photographs, meshes, cameras, banks and lists with bytes changed, cut, doubled or removed at random. Each runs
-in a process with limits on time and memory. The record is scripts/results/wrong_inputs.json; exit code 1 if anything
-failed.
+wrong_inputs.txt lists command lines, and files with one mistake each, and what the message must
+contain. Damaged files are good photographs, meshes, cameras, banks and lists with bytes changed,
+cut, doubled or removed at random. Each runs in a process with limits on time and memory. The record
+is scripts/results/wrong_inputs.json; exit code 1 if anything failed.
 """
 
 import argparse
@@ -32,7 +34,9 @@ from torch import Tensor
 
 from scripts._shared import RESULTS, commit, today, write_json
 
-SECONDS, MEGABYTES = 20.0, 4000  # processor seconds and memory that a command may take
+# processor seconds and memory that a command may take
+SECONDS = 20.0
+MEGABYTES = 4000
 
 GOOD_FILES = {
     "cam.yml": """%YAML:1.0
@@ -51,7 +55,8 @@ distortion_coefficients: [-0.25, 0.1, 0., 0., 0.]
 cam1:
   intrinsics: [260, 260, 119.5, 89.5]
 """,
-    "cameras.txt": "1 PINHOLE 240 180 260 260 120 90\n2 OPENCV 240 180 260 260 120 90 -0.25 0.1 0 0\n",
+    "cameras.txt": "1 PINHOLE 240 180 260 260 120 90\n2 OPENCV 240 180 260 260 120 90 -0.25 0.1 0 "
+    "0\n",
     "camera.json": '{"fx": 260, "fy": 260, "cx": 119.5, "cy": 89.5}',
     "camera.xml": "<a><camera_matrix><data>260 0 119.5 0 260 89.5 0 0 1</data></camera_matrix></a>",
     "images.txt": "1 1 0 0 0 0 0 0 1 0.png\n\n",
@@ -73,7 +78,8 @@ COMMANDS = {
 
 
 def cases(folder: Path) -> list[tuple[str, str]]:
-    """Write the inputs of wrong_inputs.txt into a folder; command lines, and what their messages must contain."""
+    """Write the inputs of wrong_inputs.txt into a folder; command lines, and what their messages
+    must contain."""
     write_files(folder)
     (folder / "good" / "scene").mkdir(parents=True)
     write_rig(folder / "good")
@@ -83,13 +89,16 @@ def cases(folder: Path) -> list[tuple[str, str]]:
         line, expected = row.split(" => ")
         if line.count("|") == 2:
             name, old, new = (part.strip() for part in line.split("|"))
-            place, file = folder / f"bad{number}", name.partition(":")[0]
+            place = folder / f"bad{number}"
+            file = name.partition(":")[0]
             shutil.copytree(folder / "good", place)
             text = (place / file).read_text()
             assert old == "*" or old in text, row
             (place / file).write_text(new if old == "*" else text.replace(old, new))
             command = COMMANDS.get(file, "register photo.png truck.ply BOX --camera {}")
-            line = command.format(f"{place.name}/{name}", folder=f"{place.name}/{Path(name).parent}")
+            line = command.format(
+                f"{place.name}/{name}", folder=f"{place.name}/{Path(name).parent}"
+            )
         if "--out" not in line and not line.startswith("view"):
             line += " --out out.safetensors" if line.startswith("bank") else " --out out"
         found.append((line.replace("BOX", "--box 30 25 210 160"), expected))
@@ -97,11 +106,16 @@ def cases(folder: Path) -> list[tuple[str, str]]:
 
 
 def write_rig(folder: Path) -> None:
-    """Write good calibrations, and a rig of photographs of the example mesh, two of which are equal."""
+    """Write good calibrations, and a rig of photographs of the example mesh, two of which are
+    equal."""
     from curvireg_torch.synthetic import demo_scene
 
     rows = ["photo,x0,y0,x1,y1,camera,qw,qx,qy,qz,tx,ty,tz"]
-    for name, seed, box in (("0.png", 2, "95,54,197,148"), ("1.png", 7, "75,59,208,155"), ("2.png", 2, ",,,")):
+    for name, seed, box in (
+        ("0.png", 2, "95,54,197,148"),
+        ("1.png", 7, "75,59,208,155"),
+        ("2.png", 2, ",,,"),
+    ):
         scene = demo_scene(seed)
         write_picture(folder / name, scene.image)
         quaternion = Rotation.from_matrix(scene.truth[:3, :3].numpy()).as_quat(scalar_first=True)
@@ -128,7 +142,9 @@ def write_files(folder: Path) -> None:
     for name in ("truck.ply", "truck.obj", "truck.stl", "truck.off", "truck.glb"):
         example_mesh().export(folder / name)
     views = cr.sample_views(azimuth_step=90, elevations=[20])
-    cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False).save(folder / "truck.safetensors")
+    cr.ViewBank.build(example_mesh(), views, image_size=32, progress=False).save(
+        folder / "truck.safetensors"
+    )
     (folder / "camera.json").write_text(GOOD_FILES["camera.json"])
     (folder / "photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.png,30,25,210,160\n")
     for name in ("text.jpg", "text.obj", "truck.step"):
@@ -137,7 +153,9 @@ def write_files(folder: Path) -> None:
     (folder / "empty").mkdir()
     for name in ("photo.png", "truck.ply", "truck.safetensors"):
         data = (folder / name).read_bytes()
-        (folder / name.replace("photo", "cut").replace("truck", "cut")).write_bytes(data[: len(data) // 2])
+        (folder / name.replace("photo", "cut").replace("truck", "cut")).write_bytes(
+            data[: len(data) // 2]
+        )
     (folder / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     trimesh.PointCloud(np.random.default_rng(0).normal(size=(5, 3))).export(folder / "points.ply")
     (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
@@ -158,11 +176,17 @@ def answer(line: str, folder: Path, expected: str | None) -> dict[str, Any]:
     command = [sys.executable, "-m", "curvireg_torch", *shlex.split(line)]
     limit: dict[str, Any] = {"timeout": 10 * SECONDS, "preexec_fn": limited}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=folder, **limit)
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", cwd=folder, **limit
+        )
     except subprocess.TimeoutExpired:
         return {"line": line, "code": "timeout", "failure": "not done in time"}
     text = done.stderr.strip()
-    found: dict[str, Any] = {"line": line, "code": done.returncode, "seconds": round(time.perf_counter() - start, 1)}
+    found: dict[str, Any] = {
+        "line": line,
+        "code": done.returncode,
+        "seconds": round(time.perf_counter() - start, 1),
+    }
     if re.search(r"Traceback|site-packages|File \"", text) or done.returncode not in (0, 1, 2):
         found["failure"] = f"code {done.returncode}: {text[-400:]}"
     elif expected is not None and (done.returncode == 0 or expected not in text):
@@ -174,7 +198,8 @@ def damage(data: bytes, rng: np.random.Generator) -> bytes:
     """Change, cut, double or remove bytes at random places."""
     out = bytearray(data)
     for _ in range(int(rng.integers(1, 6))):
-        at, length = int(rng.integers(len(out) + 1)), int(rng.integers(1, 40))
+        at = int(rng.integers(len(out) + 1))
+        length = int(rng.integers(1, 40))
         kind = rng.integers(4)
         if kind == 0:
             out[at : at + length] = rng.bytes(length)
@@ -202,7 +227,9 @@ DAMAGED = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--damaged", type=int, default=200)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=RESULTS / "wrong_inputs.json")

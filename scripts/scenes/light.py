@@ -27,7 +27,8 @@ class Light:
     Attributes:
         up: (3,) unit vector to the zenith.
         sky, tint: ambient light and the additional light from above; (3,) colour of both.
-        reflection: height of the horizon and (3,) colour above it, mirrored by glossy surfaces; None for none.
+        reflection: height of the horizon and (3,) colour above it, mirrored by glossy surfaces;
+            None for none.
     """
 
     up: Array
@@ -39,7 +40,10 @@ class Light:
     def seen_by(self, R: Array) -> "Light":
         """The light in the frame of a camera with rotation R (3, 3), scene -> camera."""
         beside = np.array([0.3, -0.4, -0.87])
-        lamps = [lamp._replace(towards=R @ lamp.towards if lamp.towards.any() else beside) for lamp in self.lamps]
+        lamps = [
+            lamp._replace(towards=R @ lamp.towards if lamp.towards.any() else beside)
+            for lamp in self.lamps
+        ]
         return replace(self, up=R @ self.up, lamps=tuple(lamps))
 
 
@@ -60,7 +64,13 @@ def random_light(rng: Rng) -> Light:
 
 
 def shade_points(
-    scene: RayScene, points: Array, normal: Array, colour: Array, gloss: Array, shininess: Array, light: Light
+    scene: RayScene,
+    points: Array,
+    normal: Array,
+    colour: Array,
+    gloss: Array,
+    shininess: Array,
+    light: Light,
 ) -> Array:
     """(N, 3) linear light that N surface points send to a camera at the origin.
 

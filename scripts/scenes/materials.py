@@ -16,10 +16,12 @@ def random_colour(rng: Rng) -> Array:
 
 
 class Material:
-    """A random pattern of colours in space, with gloss; ``plain`` is the probability of a uniform colour."""
+    """A random pattern of colours in space, with gloss; ``plain`` is the probability of a uniform
+    colour."""
 
     def __init__(self, rng: Rng, *, plain: float = 0.5) -> None:
-        self._first, self._second = random_colour(rng), random_colour(rng)
+        self._first = random_colour(rng)
+        self._second = random_colour(rng)
         kinds = ("waves", "stripes", "checks", "cells", "print", "grain")
         self._kind = "plain" if rng.random() < plain else str(rng.choice(kinds))
         self._axes = rng.normal(size=(3, 6)) * np.exp(rng.uniform(0.3, 2.5))
@@ -37,37 +39,58 @@ class Material:
         along = points @ self._axes + self._phases
         if self._kind == "cells":
             nearest = ((points[:, None] - self._seeds) ** 2).sum(axis=-1).argmin(axis=1)
-            return np.asarray(np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1))
+            return np.asarray(
+                np.clip(self._first + self._strength * (self._palette[nearest] - self._first), 0, 1)
+            )
         if self._kind == "waves":
             weight = 0.5 + 0.5 * np.sin(along).mean(axis=1)
         elif self._kind == "stripes":
             weight = (np.sin(along[:, 0]) > np.sin(self._phases[0])).astype(float)
         elif self._kind == "checks":
-            weight = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(float)
+            weight = (np.sin(along[:, 0]) * np.sin(along[:, 1]) * np.sin(along[:, 2]) > 0).astype(
+                float
+            )
         elif self._kind == "print":  # lines of dashes, like text
-            row, place = np.floor(along[:, 0]), np.floor(3 * along[:, 1])
+            row = np.floor(along[:, 0])
+            place = np.floor(3 * along[:, 1])
             letters = np.sin(12.9898 * row + 78.233 * place) * 43758.5453
-            weight = (letters - np.floor(letters) > 0.5) & (along[:, 0] - row > 0.4) & (np.sin(7.1 * row) > -0.3)
+            weight = (
+                (letters - np.floor(letters) > 0.5)
+                & (along[:, 0] - row > 0.4)
+                & (np.sin(7.1 * row) > -0.3)
+            )
         else:
-            weight = np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
-        blend: Array = self._strength * np.asarray(weight, dtype=float)[:, None] * (self._second - self._first)
+            weight = (
+                np.sin(17.0 * along).mean(axis=1) * np.sin(31.0 * along[:, ::-1]).mean(axis=1) + 0.5
+            )
+        blend: Array = (
+            self._strength * np.asarray(weight, dtype=float)[:, None] * (self._second - self._first)
+        )
         return self._first + blend
 
 
 def random_picture(rng: Rng, size: int) -> Array:
-    """(size, size, 3) float32 flat background in [0, 1]: gradients, clouds, foliage, or a clutter of shapes."""
-    top, bottom = random_colour(rng), random_colour(rng)
+    """(size, size, 3) float32 flat background in [0, 1]: gradients, clouds, foliage, or a clutter
+    of shapes."""
+    top = random_colour(rng)
+    bottom = random_colour(rng)
     if rng.random() < 0.4:
         bottom = np.clip(top + rng.normal(0, 0.1, 3), 0, 1)
     ramp = np.linspace(0, 1, size)[:, None, None]
-    picture: Array = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(np.float32)
+    picture: Array = np.broadcast_to(top + ramp * (bottom - top), (size, size, 3)).astype(
+        np.float32
+    )
     kind = rng.integers(5)
     if kind in (1, 2):  # clouds or foliage
         noise = np.zeros((size, size, 3), np.float32)
         slope = rng.uniform(0.2, 1.0)
         for octave in range(1, 8):
-            cells = rng.normal(size=(2**octave, 2**octave, 1)) + rng.normal(0, 0.3, (2**octave, 2**octave, 3))
-            layer = cv2.resize(cells.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+            cells = rng.normal(size=(2**octave, 2**octave, 1)) + rng.normal(
+                0, 0.3, (2**octave, 2**octave, 3)
+            )
+            layer = cv2.resize(
+                cells.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC
+            )
             noise += layer * 2 ** (-slope * octave)
         noise /= noise.std() + 1e-6
         picture = picture + rng.uniform(0.05, 0.35) * (noise if kind == 1 else np.tanh(4 * noise))
@@ -82,39 +105,53 @@ def random_picture(rng: Rng, size: int) -> Array:
                 cv2.line(picture, (x, y), end, colour, int(rng.integers(1, 5)), cv2.LINE_AA)
             elif rng.random() < 0.5:
                 corners = np.asarray([x, y]) + rng.normal(0, reach, (int(rng.integers(3, 6)), 2))
-                cv2.fillConvexPoly(picture, cv2.convexHull(corners.astype(np.int32)), colour, cv2.LINE_AA)
+                cv2.fillConvexPoly(
+                    picture, cv2.convexHull(corners.astype(np.int32)), colour, cv2.LINE_AA
+                )
             else:
                 a, b = rng.uniform(0.2, 1, 2) * reach
-                axes, angle = (int(a) + 1, int(b) + 1), float(rng.uniform(0, 180))
+                axes = (int(a) + 1, int(b) + 1)
+                angle = float(rng.uniform(0, 180))
                 cv2.ellipse(picture, (x, y), axes, angle, 0, 360, colour, -1, cv2.LINE_AA)
     return np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
 
 
 def random_texture(rng: Rng, size: int = 256) -> Array:
-    """(size, size, 3) float32 linear colours that repeat: wooden boards, woven cloth, or a random picture."""
+    """(size, size, 3) float32 linear colours that repeat: wooden boards, woven cloth, or a random
+    picture."""
     kind = rng.integers(3)
     if kind == 0:
         return random_picture(rng, size)
-    first, second = random_colour(rng), random_colour(rng)
+    first = random_colour(rng)
+    second = random_colour(rng)
     y, x = np.mgrid[0:size, 0:size] / size
     if kind == 1:  # cloth: threads above and below each other, in stripes or checks
-        threads, stripes = 2 * int(rng.integers(12, 32)), int(rng.integers(1, 6))
+        threads = 2 * int(rng.integers(12, 32))
+        stripes = int(rng.integers(1, 6))
         weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
-        bands = np.sin(2 * np.pi * stripes * x) * (np.sin(2 * np.pi * stripes * y) if rng.random() < 0.5 else 1.0) > 0
+        bands = (
+            np.sin(2 * np.pi * stripes * x)
+            * (np.sin(2 * np.pi * stripes * y) if rng.random() < 0.5 else 1.0)
+            > 0
+        )
         colour = np.where(bands[..., None], first, second) * (0.75 + 0.25 * weave[..., None])
         return np.ascontiguousarray(colour, dtype=np.float32)
     grain = np.zeros((size, size), np.float32)  # boards with a grain along the columns
     for rows, columns, strength in ((8, 2, 0.5), (64, 4, 0.5), (size // 2, 16, 0.3)):
         noise = np.pad(rng.normal(size=(rows, columns)).astype(np.float32), 1, mode="wrap")
-        high, wide = size // rows, size // columns
+        high = size // rows
+        wide = size // columns
         fine = cv2.resize(noise, (size + 2 * wide, size + 2 * high), interpolation=cv2.INTER_CUBIC)
         grain += strength * fine[high : high + size, wide : wide + size]
     grain += rng.normal(0, 0.5, 4)[np.floor(4 * y).astype(int)]
     gap = np.abs(4 * y - np.round(4 * y)) < 0.012
     colour = rng.uniform(0.4, 1.6) * np.array([0.42, 0.25, 0.13]) * np.exp(0.16 * grain[..., None])
-    return np.ascontiguousarray(np.where(gap[..., None], 0.35 * colour, colour).clip(0, 1), dtype=np.float32)
+    return np.ascontiguousarray(
+        np.where(gap[..., None], 0.35 * colour, colour).clip(0, 1), dtype=np.float32
+    )
 
 
 def random_rotation(rng: Rng) -> Array:
-    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no preferred direction."""
+    """(3, 3) rotation, uniformly distributed because a quaternion of normal numbers has no
+    preferred direction."""
     return Rotation.from_quat(rng.normal(size=4), scalar_first=True).as_matrix()

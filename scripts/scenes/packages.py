@@ -8,9 +8,12 @@ from scripts.scenes.materials import random_colour, random_picture
 from scripts.scenes.surfaces import Rng
 from scripts.scenes.textured import Texture, TexturedMesh
 
-WIDTH, HEIGHT = 512, 256  # size of a label in px
+# size of a label in px
+WIDTH = 512
+HEIGHT = 256
 
-SIDES, FONTS = 72, (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
+SIDES = 72
+FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_DUPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 LETTERS = "ABCDEFGHIKLMNOPRSTUVZ"
 
 
@@ -22,26 +25,39 @@ def label(rng: Rng) -> np.ndarray:
         picture[top : top + int(rng.integers(5, 60))] = 255 * random_colour(rng)
     for _ in range(rng.integers(2, 5)):
         side = int(rng.integers(50, 150))
-        x, y = int(rng.integers(WIDTH - side)), int(rng.integers(HEIGHT - side))
+        x = int(rng.integers(WIDTH - side))
+        y = int(rng.integers(HEIGHT - side))
         picture[y : y + side, x : x + side] = 255 * random_picture(rng, side)
     picture = picture.clip(0, 255).round().astype(np.uint8)
     for _ in range(rng.integers(5, 16)):
         word = "".join(rng.choice(list(LETTERS), rng.integers(2, 9)))
-        scale, place = float(rng.uniform(0.4, 2.5)), (int(rng.integers(WIDTH)), int(rng.integers(20, HEIGHT)))
-        colour, font = tuple((255 * random_colour(rng)).tolist()), FONTS[rng.integers(len(FONTS))]
+        scale = float(rng.uniform(0.4, 2.5))
+        place = (int(rng.integers(WIDTH)), int(rng.integers(20, HEIGHT)))
+        colour = tuple((255 * random_colour(rng)).tolist())
+        font = FONTS[rng.integers(len(FONTS))]
         cv2.putText(picture, word, place, font, scale, colour, 1 + int(1.5 * scale), cv2.LINE_AA)
     return picture
 
 
 def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
-    """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of height 1."""
+    """Vertices, faces and texture coordinates of a can, or of a bottle with shoulder and neck, of
+    height 1."""
     radius = rng.uniform(0.18, 0.5)
     if rng.random() < 0.5:
         profile = [(0.0, 0.0), (radius, 0.0), (radius, 1.0), (0.0, 1.0)]
     else:
-        shoulder, neck = rng.uniform(0.5, 0.75), radius * rng.uniform(0.25, 0.5)
+        shoulder = rng.uniform(0.5, 0.75)
+        neck = radius * rng.uniform(0.25, 0.5)
         waist = (radius * rng.uniform(0.8, 1.0), 0.5 * shoulder)
-        profile = [(0.0, 0.0), (radius, 0.0), waist, (radius, shoulder), (neck, 0.85), (neck, 1.0), (0.0, 1.0)]
+        profile = [
+            (0.0, 0.0),
+            (radius, 0.0),
+            waist,
+            (radius, shoulder),
+            (neck, 0.85),
+            (neck, 1.0),
+            (0.0, 1.0),
+        ]
     r, z = np.array(profile).T
     v = np.concatenate([[0.0], np.hypot(np.diff(r), np.diff(z)).cumsum()])
     angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
@@ -58,7 +74,8 @@ def solid_of_revolution(rng: Rng) -> tuple[np.ndarray, ...]:
 
 
 def carton(rng: Rng) -> tuple[np.ndarray, ...]:
-    """Vertices, faces and texture coordinates of a box of height 1, with another part of the label on each side."""
+    """Vertices, faces and texture coordinates of a box of height 1, with another part of the label
+    on each side."""
     solid = trimesh.creation.box((rng.uniform(0.3, 0.9), rng.uniform(0.15, 0.6), 1.0))
     corners = solid.triangles.reshape(6, 6, 3)  # two triangles a side
     uv = np.zeros((6, 6, 2))
@@ -71,7 +88,8 @@ def carton(rng: Rng) -> tuple[np.ndarray, ...]:
 
 
 def package(rng: Rng, print_rng: Rng | None = None) -> TexturedMesh:
-    """A printed package, 8 to 25 cm high, in metres; with another print if ``print_rng`` is given."""
+    """A printed package, 8 to 25 cm high, in metres; with another print if ``print_rng`` is
+    given."""
     vertices, faces, uv = carton(rng) if rng.random() < 0.3 else solid_of_revolution(rng)
     picture = label(rng)
     height = rng.uniform(0.08, 0.25)

@@ -1,6 +1,7 @@
 """Random scenes: objects among clutter in a room or on a shelf, and the cameras that see them.
 
-Lengths are in the scene's unit: the radius of the first object, or the mean radius of those on a shelf. z points up.
+Lengths are in the scene's unit: the radius of the first object, or the mean radius of those on a
+shelf. z points up.
 """
 
 from collections.abc import Callable
@@ -23,13 +24,16 @@ Draw: TypeAlias = Callable[[Rng], TexturedMesh]
 View: TypeAlias = tuple[Array, Array, Array]
 """Rotation (3, 3) and translation (3,), scene -> camera, and camera matrix (3, 3)."""
 
-MAX_TURN, MAX_SHIFT = 5.0, 0.05  # degrees, and fraction of the distance, between two frames of a sequence
+# degrees, and fraction of the distance, between two frames of a sequence
+MAX_TURN = 5.0
+MAX_SHIFT = 0.05
 RIG_STEP = (15.0, 45.0)  # degrees of azimuth between neighbouring cameras of a rig
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Shapes, the annotated ones with an ``obj_id``, under a light before a background, and the views of it."""
+    """Shapes, the annotated ones with an ``obj_id``, under a light before a background, and the
+    views of it."""
 
     shapes: list[Placed]
     light: Light
@@ -54,19 +58,27 @@ def single(
     occluded: bool = False,
     cameras: int = 1,
 ) -> Scene:
-    """One object of radius 1 on the floor of a room, with up to five others around it, and one in front of it."""
+    """One object of radius 1 on the floor of a room, with up to five others around it, and one in
+    front of it."""
     rotation = np.eye(3) if upright else random_rotation(rng)
     target = Placed.standing(mesh, rotation, 1.0 / mesh.radius, obj_id=obj_id)
     fill = rng.uniform(0.25, 0.65) * min(size)
     elevation = float(rng.choice([rng.uniform(-4, 25), rng.uniform(5, 60)]))
-    R, t, K = look_at(target.hull, size, rng, fill=fill, azimuth=rng.uniform(0, 360), elevation=elevation)
+    R, t, K = look_at(
+        target.hull, size, rng, fill=fill, azimuth=rng.uniform(0, 360), elevation=elevation
+    )
     eye = -R.T @ t
     shapes = [target]
     if eye[2] > 0.05 and rng.random() < 0.9:
         shapes += _room(textures, eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9), rng)
     reach = float(np.linalg.norm(target.hull[:, :2], axis=1).max())
     shapes += _clutter(clutter, 0.8 * reach, eye, int(rng.choice([0, 1, 3, 5])), occluded, rng)
-    return Scene(shapes, random_light(rng), random_picture(rng, 512), _rig((R, t, K), target.hull, cameras, rng))
+    return Scene(
+        shapes,
+        random_light(rng),
+        random_picture(rng, 512),
+        _rig((R, t, K), target.hull, cameras, rng),
+    )
 
 
 def shelf(
@@ -78,41 +90,66 @@ def shelf(
     occlusion: float = 0.6,
     cameras: int = 1,
 ) -> Scene:
-    """Objects side by side on one or two boards, two deep: the front row hides up to ``occlusion`` of the back row."""
+    """Objects side by side on one or two boards, two deep: the front row hides up to ``occlusion``
+    of the back row."""
     unit = float(np.mean([mesh.radius for _, mesh in meshes]))
     boards = 1 if len(meshes) < 10 or rng.random() < 0.3 else 2
     share = np.array_split(rng.permutation(len(meshes)), boards)
     shapes: list[Placed] = []
     board_height = 0.0
     for members in share:
-        x, edge, tallest = 0.0, [0.0, 0.0], 0.0
+        x = 0.0
+        edge = [0.0, 0.0]
+        tallest = 0.0
         for n, k in enumerate(members):
             obj_id, mesh = meshes[int(k)]
             row = n % 2  # front, back
             angle = np.radians(rng.normal(0, 35))
-            turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+            turn = np.array(
+                [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+            )
             item = Placed.standing(mesh, turn, 1.0 / unit, obj_id=obj_id)
-            low, high = item.hull.min(axis=0), item.hull.max(axis=0)
-            x = edge[row] + 0.5 * (high - low)[0] + rng.uniform(0.02, 0.2 + 1.2 * (1.0 - occlusion) * (1 - row))
+            low = item.hull.min(axis=0)
+            high = item.hull.max(axis=0)
+            x = (
+                edge[row]
+                + 0.5 * (high - low)[0]
+                + rng.uniform(0.02, 0.2 + 1.2 * (1.0 - occlusion) * (1 - row))
+            )
             y = 1.6 * row + rng.uniform(-0.15, 0.15)
             edge[row] = x + 0.5 * (high - low)[0]
             tallest = max(tallest, high[2])
-            shapes.append(Placed.standing(mesh, turn, 1.0 / unit, (x, y, board_height), obj_id=obj_id))
+            shapes.append(
+                Placed.standing(mesh, turn, 1.0 / unit, (x, y, board_height), obj_id=obj_id)
+            )
         board_height += tallest + rng.uniform(0.3, 0.8)
     points = np.concatenate([shape.hull for shape in shapes])
     (x0, _, _), (x1, _, top) = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
     wood = Texture(textures(rng))
     for z in sorted({round(float(shape.hull[:, 2].min()), 6) for shape in shapes}):
         shapes.append(_quad([(x0, -1.2, z), (x1, -1.2, z), (x1, 3.0, z), (x0, 3.0, z)], wood))
-        shapes.append(_quad([(x0, -1.2, z - 0.12), (x1, -1.2, z - 0.12), (x1, -1.2, z), (x0, -1.2, z)], wood))
-    shapes.append(_quad([(x0, 3.0, -1), (x1, 3.0, -1), (x1, 3.0, top), (x0, 3.0, top)], Texture(textures(rng))))
+        shapes.append(
+            _quad([(x0, -1.2, z - 0.12), (x1, -1.2, z - 0.12), (x1, -1.2, z), (x0, -1.2, z)], wood)
+        )
+    shapes.append(
+        _quad(
+            [(x0, 3.0, -1), (x1, 3.0, -1), (x1, 3.0, top), (x0, 3.0, top)], Texture(textures(rng))
+        )
+    )
     fill = rng.uniform(0.7, 1.0) * max(size)
-    view = look_at(points, size, rng, fill=fill, azimuth=rng.normal(0, 18), elevation=rng.uniform(0, 25))
-    return Scene(shapes, random_light(rng), random_picture(rng, 512), _rig(view, points, cameras, rng))
+    view = look_at(
+        points, size, rng, fill=fill, azimuth=rng.normal(0, 18), elevation=rng.uniform(0, 25)
+    )
+    return Scene(
+        shapes, random_light(rng), random_picture(rng, 512), _rig(view, points, cameras, rng)
+    )
 
 
-def look_at(points: Array, size: tuple[int, int], rng: Rng, *, fill: float, azimuth: float, elevation: float) -> View:
-    """A view whose box around points (P, 3) is ``fill`` px long and lies near the middle; angles in degrees."""
+def look_at(
+    points: Array, size: tuple[int, int], rng: Rng, *, fill: float, azimuth: float, elevation: float
+) -> View:
+    """A view whose box around points (P, 3) is ``fill`` px long and lies near the middle; angles in
+    degrees."""
     H, W = size
     focal = 0.5 * max(H, W) / np.tan(np.radians(rng.uniform(22, 60)) / 2)
     K = np.array([[focal, 0, (W - 1) / 2], [0, focal, (H - 1) / 2], [0, 0, 1.0]])
@@ -134,8 +171,8 @@ def look_at(points: Array, size: tuple[int, int], rng: Rng, *, fill: float, azim
 
 
 def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: Rng) -> View:
-    """The view, turned so that about ``fraction`` of the outline of points (P, 3) lies outside the picture, at one side
-    or at two."""
+    """The view, turned so that about ``fraction`` of the outline of points (P, 3) lies outside the
+    picture, at one side or at two."""
     R, t, K = view
     H, W = size
     seen = (points @ R.T + t) @ K.T
@@ -146,7 +183,8 @@ def cut(view: View, points: Array, size: tuple[int, int], fraction: float, rng: 
     side = side if side.any() else np.array([rng.choice([-1.0, 1.0]), 0.0])
     border = np.where(side > 0, [W - 0.5, H - 0.5], -0.5)
     hull = torch.from_numpy(points)
-    low, high = -0.6, 0.6
+    low = -0.6
+    high = 0.6
     for _ in range(20):
         part = 0.5 * (low + high)
         target = np.where(side == 0, middle, border + side * part * reach)
@@ -165,24 +203,31 @@ def _turn_to(ray: Array, target: Array) -> Array:
 
 
 def _rig(view: View, points: Array, cameras: int, rng: Rng) -> list[View]:
-    """The view and others around it, which look at the middle of points (P, 3) from other azimuths."""
+    """The view and others around it, which look at the middle of points (P, 3) from other
+    azimuths."""
     R, t, K = view
-    middle, views, angle = 0.5 * (points.min(axis=0) + points.max(axis=0)), [view], np.zeros(2)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    views = [view]
+    angle = np.zeros(2)
     for k in range(1, cameras):
         side = k % 2
         angle[side] += rng.uniform(*RIG_STEP)
-        turn = _rotation(np.array([rng.normal(0, 3), rng.normal(0, 3), (1 - 2 * side) * angle[side]]))
+        turn = _rotation(
+            np.array([rng.normal(0, 3), rng.normal(0, 3), (1 - 2 * side) * angle[side]])
+        )
         place = (R @ middle + t) * rng.uniform(0.85, 1.15)
         views.append((R @ turn, place - R @ turn @ middle, K))
     return views
 
 
 def camera_path(view: View, middle: Array, count: int, rng: Rng) -> list[View]:
-    """Smooth random path of ``count`` views around ``middle`` (3,); steps are at most MAX_TURN and MAX_SHIFT."""
+    """Smooth random path of ``count`` views around ``middle`` (3,); steps are at most MAX_TURN and
+    MAX_SHIFT."""
     R, t, K = view
     centre = R @ middle + t
-    # Of azimuth, small rotation (3) in degrees, logarithm of the distance, and the centre's place in px: deviation of
-    # the acceleration, and the fraction of the displacement that pulls back to the start. The azimuth is free.
+    # Of azimuth, small rotation (3) in degrees, logarithm of the distance, and the centre's place
+    # in px: deviation of the acceleration, and the fraction of the displacement that pulls back to
+    # the start. The azimuth is free.
     acceleration = np.array([1.2, 0.4, 0.4, 0.4, 0.014, 6.0, 6.0])
     pull = np.array([0.0, 0.03, 0.03, 0.03, 0.03, 0.03, 0.03])
 
@@ -192,7 +237,8 @@ def camera_path(view: View, middle: Array, count: int, rng: Rng) -> list[View]:
         place = ray / np.linalg.norm(ray) * np.linalg.norm(centre) * np.exp(distance)
         return _rotation(small) @ R @ _rotation(np.array([0.0, 0.0, azimuth])), place
 
-    state, velocity = np.zeros(7), np.zeros(7)
+    state = np.zeros(7)
+    velocity = np.zeros(7)
     path = [pose(state)]
     while len(path) < count:
         velocity = 0.9 * velocity + rng.normal(0, acceleration) - pull * state
@@ -211,33 +257,45 @@ def _rotation(degrees: Array) -> Array:
 
 def _quad(corners: list[tuple[float, ...]], paint: Texture, repeats: float = 1.0) -> Placed:
     uv = repeats * np.array([(0, 0), (1, 0), (1, 1), (0, 1.0)])
-    mesh = TexturedMesh.from_arrays(np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), [paint], uv=uv)
+    mesh = TexturedMesh.from_arrays(
+        np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), [paint], uv=uv
+    )
     return Placed(mesh, np.eye(3), np.zeros(3))
 
 
 def _room(textures: Callable[[Rng], Array], toward: Array, rng: Rng) -> list[Placed]:
-    """A floor and up to two walls on the far side; ``toward`` (2,) is the horizontal direction to the camera."""
+    """A floor and up to two walls on the far side; ``toward`` (2,) is the horizontal direction to
+    the camera."""
     r = float(rng.choice([3.0, 8.0, 40.0]))
     floor = [(-r, -r, 0.0), (r, -r, 0.0), (r, r, 0.0), (-r, r, 0.0)]
     surfaces = [_quad(floor, Texture(textures(rng)), r / rng.uniform(0.5, 3.0))]
     for _ in range(int(rng.choice([0, 1, 1, 2]))):
         back = -toward + rng.normal(0, 0.5, 2)
         back = back / np.linalg.norm(back)
-        side, far, high = np.array([-back[1], back[0]]), rng.uniform(1.2, 5.0), rng.uniform(2.0, 8.0)
-        a, b = back * far - 12 * side, back * far + 12 * side
+        side = np.array([-back[1], back[0]])
+        far = rng.uniform(1.2, 5.0)
+        high = rng.uniform(2.0, 8.0)
+        a = back * far - 12 * side
+        b = back * far + 12 * side
         wall = [(*a, 0.0), (*b, 0.0), (*b, high), (*a, high)]
         surfaces.append(_quad(wall, Texture(textures(rng)), 12 / rng.uniform(0.7, 4.0)))
     return surfaces
 
 
-def _clutter(draw: Draw, reach: float, eye: Array, count: int, occluder: bool, rng: Rng) -> list[Placed]:
-    """Other meshes on the floor; the last one, an occluder, stands between the object and the camera."""
+def _clutter(
+    draw: Draw, reach: float, eye: Array, count: int, occluder: bool, rng: Rng
+) -> list[Placed]:
+    """Other meshes on the floor; the last one, an occluder, stands between the object and the
+    camera."""
     clutter = []
     for k in range(count + occluder):
-        mesh, front = draw(rng), k >= count
+        mesh = draw(rng)
+        front = k >= count
         scale = float(np.exp(rng.uniform(-0.9, 0.4))) * (0.6 if front else 1.0) / mesh.radius
         angle = rng.uniform(0, 360)
-        turn = random_rotation(rng) if rng.random() < 0.15 else _rotation(np.array([0.0, 0.0, angle]))
+        turn = (
+            random_rotation(rng) if rng.random() < 0.15 else _rotation(np.array([0.0, 0.0, angle]))
+        )
         radius = 0.5 * scale * float(np.linalg.norm(np.ptp(mesh.hull, axis=0)[:2]))
         if front:
             direction = eye[:2] / (np.linalg.norm(eye[:2]) + 1e-9)
@@ -245,14 +303,18 @@ def _clutter(draw: Draw, reach: float, eye: Array, count: int, occluder: bool, r
             place = direction * (reach + radius + rng.uniform(0.05, 0.4)) + aside
         else:
             angle = rng.uniform(0, 2 * np.pi)
-            place = np.array([np.cos(angle), np.sin(angle)]) * (reach + radius + rng.exponential(0.7))
-        if np.linalg.norm(eye[:2] - place) > radius + (0.6 if front else 1.0):  # not around the camera
+            place = np.array([np.cos(angle), np.sin(angle)]) * (
+                reach + radius + rng.exponential(0.7)
+            )
+        # not around the camera
+        if np.linalg.norm(eye[:2] - place) > radius + (0.6 if front else 1.0):
             clutter.append(Placed.standing(mesh, turn, scale, (*place, 0.0)))
     return clutter
 
 
 def simulate_camera(picture: Array, rng: Rng) -> Array:
-    """Apply random exposure, white balance, blur, downsampling, noise and JPEG compression to a rendered picture.
+    """Apply random exposure, white balance, blur, downsampling, noise and JPEG compression to a
+    rendered picture.
 
     ``picture`` is (H, W, 3) float32 linear light; the result is uint8.
     """
@@ -272,7 +334,9 @@ def simulate_camera(picture: Array, rng: Rng) -> Array:
         picture = cv2.filter2D(picture, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
     if rng.random() < 0.35:  # low resolution
         scale = rng.uniform(0.35, 0.9)
-        few = cv2.resize(picture, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA)
+        few = cv2.resize(
+            picture, (int(width * scale), int(height * scale)), interpolation=cv2.INTER_AREA
+        )
         picture = cv2.resize(few, (width, height))
     picture = picture + rng.normal(0, np.exp(rng.uniform(-6.5, -3.0)), picture.shape)
     coded: Array = (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8)

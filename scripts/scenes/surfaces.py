@@ -18,7 +18,9 @@ class Surface(NamedTuple):
     vertices: Array
     faces: Array
 
-    def moved(self, translation: ArrayLike = 0.0, rotation: Array | None = None, scale: ArrayLike = 1.0) -> "Surface":
+    def moved(
+        self, translation: ArrayLike = 0.0, rotation: Array | None = None, scale: ArrayLike = 1.0
+    ) -> "Surface":
         """The surface after scaling, rotation and translation, in this order."""
         points = self.vertices * np.asarray(scale, dtype=float)
         points = points if rotation is None else points @ rotation.T
@@ -30,15 +32,19 @@ Part: TypeAlias = tuple[Surface, int]
 
 
 def _grid(points: Array, *, close: bool = True, caps: bool = True) -> Surface:
-    """Triangles between the rows of (M, N, 3) points; ``close`` closes each row, ``caps`` the ends."""
+    """Triangles between the rows of (M, N, 3) points; ``close`` closes each row, ``caps`` the
+    ends."""
     m, n = points.shape[:2]
     i, j = np.meshgrid(np.arange(m - 1), np.arange(n if close else n - 1), indexing="ij")
-    a, b = i * n + j, i * n + (j + 1) % n
-    c, d = a + n, b + n
+    a = i * n + j
+    b = i * n + (j + 1) % n
+    c = a + n
+    d = b + n
     faces = [np.stack(corners, -1).reshape(-1, 3) for corners in ((a, b, d), (a, d, c))]
     vertices = points.reshape(-1, 3)
     if caps and close:
-        ring, last = np.arange(n), (m - 1) * n
+        ring = np.arange(n)
+        last = (m - 1) * n
         following = (ring + 1) % n
         faces.append(np.stack([following, ring, np.full(n, m * n)], -1))
         faces.append(np.stack([last + ring, last + following, np.full(n, m * n + 1)], -1))
@@ -87,7 +93,9 @@ def superquadric(size: ArrayLike, roundness: tuple[float, float]) -> Surface:
     v = np.linspace(-0.5, 0.5, AROUND // 2 + 1) * np.pi
     ring = _power(_circle(), roundness[1])
     level = _power(np.stack([np.cos(v), np.sin(v)], -1), roundness[0])
-    points = np.concatenate([level[:, :1, None] * ring, np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))], -1)
+    points = np.concatenate(
+        [level[:, :1, None] * ring, np.broadcast_to(level[:, 1:, None], (len(v), AROUND, 1))], -1
+    )
     return Surface(*_grid(points, caps=False)).moved(scale=size)
 
 
@@ -97,16 +105,21 @@ def _power(x: Array, exponent: float) -> Array:
 
 def torus(radius: float, thickness: float) -> Surface:
     """Ring of ``radius`` about z."""
-    around, section = _circle(), thickness * _circle(10)
+    around = _circle()
+    section = thickness * _circle(10)
     around = np.concatenate([around, around[:1]])
     reach = radius + section[:, 0]
     flat = around[:, None] * reach[None, :, None]
-    return _grid(np.concatenate([flat, np.broadcast_to(section[None, :, 1:], (*flat.shape[:2], 1))], -1), caps=False)
+    return _grid(
+        np.concatenate([flat, np.broadcast_to(section[None, :, 1:], (*flat.shape[:2], 1))], -1),
+        caps=False,
+    )
 
 
 def bar(start: ArrayLike, end: ArrayLike, radius: float, *, sides: int = 10) -> Surface:
     """Straight rod between two points; ``sides=4`` makes it square."""
-    a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    a = np.asarray(start, dtype=float)
+    b = np.asarray(end, dtype=float)
     axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)

@@ -14,7 +14,8 @@ from curvireg_torch.rendering.embree import RayScene
 from scripts.scenes.light import Light, shade_points
 from scripts.scenes.surfaces import Array
 
-MAX_TEXTURE = 512  # px, longer side of textures: finer ones would only alias in pictures of this size
+# px, longer side of textures: finer ones would only alias in pictures of this size
+MAX_TEXTURE = 512
 SUPERSAMPLING = 1.25
 MAX_REPEATS = 4  # of a texture that an exported atlas keeps
 
@@ -26,7 +27,8 @@ class Paint(Protocol):
     shininess: float
 
     def colours(self, points: Array, uv: Array) -> Array:
-        """(N, 3) linear colours at points (N, 3) of the object's frame with texture coordinates (N, 2)."""
+        """(N, 3) linear colours at points (N, 3) of the object's frame with texture coordinates (N,
+        2)."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +43,12 @@ class Texture:
         h, w = self.picture.shape[:2]
         if h == w == 1:
             return np.broadcast_to(self.picture[0], points.shape)
-        x, y = np.mod(uv[:, 0], 1.0) * w, np.mod(1.0 - uv[:, 1], 1.0) * h
+        x = np.mod(uv[:, 0], 1.0) * w
+        y = np.mod(1.0 - uv[:, 1], 1.0) * h
         padded = np.pad(self.picture, ((1, 1), (1, 1), (0, 0)), mode="wrap")
-        size, out = 16384, np.empty((len(uv), 3), np.float32)  # cv2.remap takes at most 32767 rows
+        # cv2.remap takes at most 32767 rows
+        size = 16384
+        out = np.empty((len(uv), 3), np.float32)
         for k in range(0, len(uv), size):
             xy = np.stack([x, y], 1)[k : k + size, None].astype(np.float32) + 0.5
             out[k : k + size] = cv2.remap(padded, xy, None, cv2.INTER_LINEAR)[:, 0]
@@ -52,7 +57,8 @@ class Texture:
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """Triangles (F, 3, 3) in metres, z up; normals (F, 3, 3), texture coordinates (F, 3, 2), and paint numbers (F,)."""
+    """Triangles (F, 3, 3) in metres, z up; normals (F, 3, 3), texture coordinates (F, 3, 2), and
+    paint numbers (F,)."""
 
     triangles: Array
     normals: Array
@@ -65,29 +71,43 @@ class TexturedMesh:
         if self.hull is None:
             points = self.triangles.reshape(-1, 3)
             flat = np.linalg.matrix_rank(points - points[0], tol=1e-6 * np.abs(points).max()) < 3
-            object.__setattr__(self, "hull", points if flat else points[ConvexHull(points).vertices])
+            object.__setattr__(
+                self, "hull", points if flat else points[ConvexHull(points).vertices]
+            )
 
     @classmethod
-    def from_arrays(cls, vertices: Array, faces: Array, paints: Any, *, uv: Any = None, paint: Any = None) -> Any:
+    def from_arrays(
+        cls, vertices: Array, faces: Array, paints: Any, *, uv: Any = None, paint: Any = None
+    ) -> Any:
         """A mesh with flat shading; ``uv`` (V, 2) and ``paint`` (F,) may be left out."""
         corners = np.asarray(vertices, float)[faces]
         normals = np.repeat(face_normals(corners)[:, None], 3, axis=1)
         uv = np.zeros((*faces.shape, 2)) if uv is None else np.asarray(uv)[faces]
-        return cls(corners, normals, uv, np.zeros(len(faces), int) if paint is None else paint, tuple(paints))
+        return cls(
+            corners,
+            normals,
+            uv,
+            np.zeros(len(faces), int) if paint is None else paint,
+            tuple(paints),
+        )
 
     @classmethod
     def load(cls, path: Path) -> "TexturedMesh":
-        """Read any mesh file with the materials that trimesh finds; coordinates stay in the file's unit."""
+        """Read any mesh file with the materials that trimesh finds; coordinates stay in the file's
+        unit."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # faces without texture coordinates
             loaded = trimesh.load(path, process=False)
         parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
         columns: tuple[list[Array], ...] = ([], [], [], [])
         paints: list[Texture] = []
-        for number, part in enumerate(p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces)):
+        for number, part in enumerate(
+            p for p in parts if isinstance(p, trimesh.Trimesh) and len(p.faces)
+        ):
             faces = np.asarray(part.faces)
             corners = np.asarray(part.vertices)[faces]
-            normals, uv = part._cache.cache.get("vertex_normals"), getattr(part.visual, "uv", None)
+            normals = part._cache.cache.get("vertex_normals")
+            uv = getattr(part.visual, "uv", None)
             flat = np.repeat(face_normals(corners)[:, None], 3, axis=1)
             columns[0].append(corners)
             columns[1].append(flat if normals is None else np.asarray(normals)[faces])
@@ -95,9 +115,17 @@ class TexturedMesh:
             columns[3].append(np.full(len(faces), number))
             material = getattr(part.visual, "material", None)
             image = getattr(material, "image", None) if uv is not None else None
-            diffuse = np.asarray(getattr(material, "diffuse", [160, 160, 160, 255]), float)[:3] / 255
-            picture = (np.clip(diffuse, 0.01, 1) ** 2.2)[None, None] if image is None else linear_texture(image)
-            gloss = np.asarray(getattr(material, "specular", [0, 0, 0, 255]), float)[:3].mean() / 255
+            diffuse = (
+                np.asarray(getattr(material, "diffuse", [160, 160, 160, 255]), float)[:3] / 255
+            )
+            picture = (
+                (np.clip(diffuse, 0.01, 1) ** 2.2)[None, None]
+                if image is None
+                else linear_texture(image)
+            )
+            gloss = (
+                np.asarray(getattr(material, "specular", [0, 0, 0, 255]), float)[:3].mean() / 255
+            )
             paints.append(Texture(picture.astype(np.float32), float(gloss)))
         return cls(*(np.concatenate(c) for c in columns), tuple(paints))
 
@@ -116,24 +144,40 @@ class TexturedMesh:
         return 0.5 * (self.hull.min(axis=0) + self.hull.max(axis=0))
 
     def save_ply(self, path: Path, *, scale: float = 1000.0) -> None:
-        """Write a PLY file in mm, with all textures in one picture beside it, as BOP's textured models have."""
+        """Write a PLY file in mm, with all textures in one picture beside it, as BOP's textured
+        models have."""
         uv, picture = self._atlas()
-        cv2.imwrite(str(path.with_suffix(".png")), (255 * picture[..., ::-1] ** (1 / 2.2) + 0.5).astype(np.uint8))
+        cv2.imwrite(
+            str(path.with_suffix(".png")),
+            (255 * picture[..., ::-1] ** (1 / 2.2) + 0.5).astype(np.uint8),
+        )
         count = 3 * len(self.triangles)
         columns = ("x", "y", "z", "nx", "ny", "nz", "texture_u", "texture_v")
         header = ["ply", "format binary_little_endian 1.0", f"comment TextureFile {path.stem}.png"]
         header += [f"element vertex {count}", *(f"property float {name}" for name in columns)]
-        header += [f"element face {count // 3}", "property list uchar int vertex_indices", "end_header", ""]
+        header += [
+            f"element face {count // 3}",
+            "property list uchar int vertex_indices",
+            "end_header",
+            "",
+        ]
         normals = self.normals / (np.linalg.norm(self.normals, axis=2, keepdims=True) + 1e-12)
-        vertices = np.concatenate([scale * self.triangles, normals, uv], axis=2).reshape(count, 8).astype("<f4")
+        vertices = (
+            np.concatenate([scale * self.triangles, normals, uv], axis=2)
+            .reshape(count, 8)
+            .astype("<f4")
+        )
         faces = np.zeros(count // 3, [("n", "u1"), ("v", "<i4", 3)])
         faces["n"], faces["v"] = 3, np.arange(count).reshape(-1, 3)
         path.write_bytes("\n".join(header).encode() + vertices.tobytes() + faces.tobytes())
 
     def _atlas(self) -> tuple[Array, Array]:
-        """Texture coordinates (F, 3, 2) in one (h, w, 3) picture of all textures, repeated where faces need it."""
+        """Texture coordinates (F, 3, 2) in one (h, w, 3) picture of all textures, repeated where
+        faces need it."""
         uv = self.uv - np.floor(self.uv.min(axis=1, keepdims=True))
-        rows, top, width = [], [], 0
+        rows = []
+        top = []
+        width = 0
         for k, texture in enumerate(self.paints):
             here = self.paint == k
             most = float(uv[here].max(initial=1.0))
@@ -143,11 +187,15 @@ class TexturedMesh:
                 image = cv2.resize(image, (8, 8)) if image.shape[0] == 1 else image
             else:
                 side = MAX_TEXTURE // n
-                image = cv2.resize(image, (side, min(side, image.shape[0])), interpolation=cv2.INTER_AREA)
+                image = cv2.resize(
+                    image, (side, min(side, image.shape[0])), interpolation=cv2.INTER_AREA
+                )
             rows.append(np.pad(np.tile(image, (n, n, 1)), ((1, 1), (1, 1), (0, 0)), mode="edge"))
             top.append((rows[-1].shape[0] - 2, rows[-1].shape[1] - 2, n))
             width = max(width, rows[-1].shape[1])
-        picture = np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), mode="edge") for r in rows])
+        picture = np.concatenate(
+            [np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), mode="edge") for r in rows]
+        )
         first = np.cumsum([0, *(len(r) for r in rows)])
         out = np.zeros_like(uv)
         for k, (high, wide, n) in enumerate(top):
@@ -172,10 +220,19 @@ class Placed:
     obj_id: int | None = None
 
     @classmethod
-    def standing(cls, mesh: TexturedMesh, rotation: Array, scale: float, at: Any = (0.0, 0.0, 0.0), **more: Any) -> Any:
-        """The mesh rotated, scaled and put on the plane through ``at``, with its box's middle above that point."""
+    def standing(
+        cls,
+        mesh: TexturedMesh,
+        rotation: Array,
+        scale: float,
+        at: Any = (0.0, 0.0, 0.0),
+        **more: Any,
+    ) -> Any:
+        """The mesh rotated, scaled and put on the plane through ``at``, with its box's middle above
+        that point."""
         points = scale * mesh.hull @ rotation.T
-        low, high = points.min(axis=0), points.max(axis=0)
+        low = points.min(axis=0)
+        high = points.max(axis=0)
         middle = np.array([*(0.5 * (low + high)[:2]), low[2]])
         return cls(mesh, rotation, np.asarray(at) - middle, scale, **more)
 
@@ -189,7 +246,8 @@ class Placed:
         return self.points(self.mesh.hull)
 
     def pose(self, R: Array, t: Array) -> tuple[Array, Array]:
-        """Rotation and translation (in the mesh's unit), mesh -> camera, for a camera with scene -> camera R, t."""
+        """Rotation and translation (in the mesh's unit), mesh -> camera, for a camera with scene ->
+        camera R, t."""
         return R @ self.rotation, (R @ self.offset + t) / self.scale
 
 
@@ -203,12 +261,18 @@ def linear_texture(image: Any) -> Array:
     rgba = np.asarray(image.convert("RGBA"), np.float32) / 255
     rgb = (rgba[..., :3] * rgba[..., 3:] + 0.8 * (1 - rgba[..., 3:])) ** 2.2
     scale = MAX_TEXTURE / max(rgb.shape[:2])
-    return cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else rgb
+    return (
+        cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        if scale < 1
+        else rgb
+    )
 
 
 def barycentric(triangles: Array, points: Array) -> Array:
     """(N, 3) barycentric coordinates of points (N, 3) in triangles (N, 3, 3)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    a = triangles[:, 0]
+    b = triangles[:, 1]
+    c = triangles[:, 2]
     normal = np.cross(b - a, c - a)
     area = (normal * normal).sum(axis=1) + 1e-30
     u = (np.cross(c - b, points - b) * normal).sum(axis=1) / area
@@ -218,10 +282,11 @@ def barycentric(triangles: Array, points: Array) -> Array:
 
 
 class Picture(NamedTuple):
-    """A rendered picture (H, W, 3) in linear light, and what is seen of every annotated object, in their order.
+    """A rendered picture (H, W, 3) in linear light, and what is seen of every annotated object, in
+    their order.
 
-    ``seen`` and ``whole`` (A, H, W) bool: pixels that show the object, and that would without all others.
-    ``depth`` (H, W) of the first object alone, in the scene's unit, 0 = background.
+    ``seen`` and ``whole`` (A, H, W) bool: pixels that show the object, and that would without all
+    others. ``depth`` (H, W) of the first object alone, in the scene's unit, 0 = background.
     """
 
     linear: Array
@@ -231,11 +296,19 @@ class Picture(NamedTuple):
 
 
 def render(
-    shapes: list[Placed], R: Array, t: Array, K: Array, size: tuple[int, int], light: Light, background: Array
+    shapes: list[Placed],
+    R: Array,
+    t: Array,
+    K: Array,
+    size: tuple[int, int],
+    light: Light,
+    background: Array,
 ) -> Picture:
-    """Ray-trace shapes as the camera ``K [R | t]`` sees them, before a square linear picture that fills the rest."""
+    """Ray-trace shapes as the camera ``K [R | t]`` sees them, before a square linear picture that
+    fills the rest."""
     H, W = size
-    h, w = round(SUPERSAMPLING * H), round(SUPERSAMPLING * W)
+    h = round(SUPERSAMPLING * H)
+    w = round(SUPERSAMPLING * W)
     zoom = np.array([[w / W, 0, 0.5 * (w / W - 1)], [0, h / H, 0.5 * (h / H - 1)], [0, 0, 1.0]])
     v, u = np.mgrid[0:h, 0:w].reshape(2, -1)
     rays = (np.stack([u, v, np.ones(len(u))], -1) @ np.linalg.inv(zoom @ K).T).astype(np.float32)
@@ -246,19 +319,26 @@ def render(
     scene = _rays(triangles)
     triangle, _, _, depth = scene.hits(start, rays)
     hit = np.flatnonzero(np.isfinite(depth))
-    points, numbers = rays[hit] * depth[hit, None], triangle[hit]
+    points = rays[hit] * depth[hit, None]
+    numbers = triangle[hit]
     owner = np.searchsorted(first, numbers, side="right") - 1
-    colour, normal = np.zeros_like(points), np.zeros_like(points)
-    gloss, shine = np.zeros(len(hit)), np.ones(len(hit))
+    colour = np.zeros_like(points)
+    normal = np.zeros_like(points)
+    gloss = np.zeros(len(hit))
+    shine = np.ones(len(hit))
     weights = barycentric(triangles[numbers], points)
     for k in np.unique(owner):
         here = np.flatnonzero(owner == k)
-        mesh, own = shapes[k].mesh, numbers[here] - first[k]
+        mesh = shapes[k].mesh
+        own = numbers[here] - first[k]
         w3 = weights[here, :, None]
         n = (w3 * mesh.normals[own]).sum(axis=1)
-        n = np.where(np.linalg.norm(n, axis=1, keepdims=True) > 1e-9, n, face_normals(mesh.triangles[own]))
+        n = np.where(
+            np.linalg.norm(n, axis=1, keepdims=True) > 1e-9, n, face_normals(mesh.triangles[own])
+        )
         normal[here] = n @ (R @ shapes[k].rotation).T
-        local, uv = (w3 * mesh.triangles[own]).sum(axis=1), (w3 * mesh.uv[own]).sum(axis=1)
+        local = (w3 * mesh.triangles[own]).sum(axis=1)
+        uv = (w3 * mesh.uv[own]).sum(axis=1)
         for number in np.unique(mesh.paint[own]):
             part = mesh.paint[own] == number
             paint = mesh.paints[number]
@@ -271,7 +351,9 @@ def render(
     picture[hit] = shade_points(scene, points, normal, colour, np.clip(gloss, 0, 1), shine, light)
 
     def shrink(x: Array) -> Array:
-        return cv2.resize(x.reshape(h, w, -1).astype(np.float32), (W, H), interpolation=cv2.INTER_AREA)
+        return cv2.resize(
+            x.reshape(h, w, -1).astype(np.float32), (W, H), interpolation=cv2.INTER_AREA
+        )
 
     annotated = [k for k, shape in enumerate(shapes) if shape.obj_id is not None]
     seen, whole = np.zeros((2, len(annotated), H, W), bool)
@@ -285,11 +367,14 @@ def render(
         if hull[:, 2].min() > 1e-6:
             flat = hull @ (zoom @ K).T
             flat = flat[:, :2] / flat[:, 2:]
-            low, high = flat.min(axis=0) - 1, flat.max(axis=0) + 1
+            low = flat.min(axis=0) - 1
+            high = flat.max(axis=0) + 1
             near = (u >= low[0]) & (u <= high[0]) & (v >= low[1]) & (v <= high[1])
         distance = np.zeros(h * w, np.float32)
         if near.any():
-            distance[near] = np.nan_to_num(_rays(corners[k]).distance(start[near], rays[near]), posinf=0.0)
+            distance[near] = np.nan_to_num(
+                _rays(corners[k]).distance(start[near], rays[near]), posinf=0.0
+            )
         whole[i] = shrink(distance > 0) > 0.5
         alone = distance if i == 0 else alone
     flat_depth = cv2.resize(alone.reshape(h, w), (W, H), interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,5 @@
-"""Objects of which several poses look the same from most sides: what tells them apart is inside, below, or small."""
+"""Objects of which several poses look the same from most sides: what tells them apart is inside,
+below, or small."""
 
 from collections.abc import Callable
 
@@ -32,8 +33,13 @@ def hollow(rng: Rng) -> list[Part]:
     deep = h - wall
     cavity = (0.5 * w - 1.5 * wall, d - 2.0 * wall, deep)
     at = 0.25 * w
-    parts = [_without_bottom((w, d, h), (0.0, 0.0, 0.5 * h)), _without_bottom(cavity, (at, 0.0, 0.5 * deep))]
-    half = np.array([(-0.5 * w, -0.5 * d, 0), (0.0, -0.5 * d, 0), (0.0, 0.5 * d, 0), (-0.5 * w, 0.5 * d, 0)])
+    parts = [
+        _without_bottom((w, d, h), (0.0, 0.0, 0.5 * h)),
+        _without_bottom(cavity, (at, 0.0, 0.5 * deep)),
+    ]
+    half = np.array(
+        [(-0.5 * w, -0.5 * d, 0), (0.0, -0.5 * d, 0), (0.0, 0.5 * d, 0), (-0.5 * w, 0.5 * d, 0)]
+    )
     parts.append(Surface(half, np.array([[0, 2, 1], [0, 3, 2]])))
     return [(part, 0) for part in parts]
 
@@ -42,7 +48,11 @@ def footed(rng: Rng) -> list[Part]:
     """A box or a disc with a block under one end."""
     w, d, h = rng.uniform((0.7, 0.5, 0.15), (1.2, 0.7, 0.6))
     round_body = rng.random() < 0.4
-    body = lathe(np.full(2, 0.5 * w), np.array([0.0, h])) if round_body else box((w, d, h)).moved((0, 0, 0.5 * h))
+    body = (
+        lathe(np.full(2, 0.5 * w), np.array([0.0, h]))
+        if round_body
+        else box((w, d, h)).moved((0, 0, 0.5 * h))
+    )
     block = box(rng.uniform((0.1, 0.1, 0.03), (0.2, 0.25, 0.08)))
     return [(body, 0), (block.moved((0.3 * w, 0, -0.02)), 0)]
 
@@ -51,7 +61,11 @@ def marked(rng: Rng) -> list[Part]:
     """A box or a cylinder with a small cube on one end of its top."""
     w, d, h = rng.uniform((0.8, 0.4, 0.3), (1.2, 0.7, 0.7))
     round_body = rng.random() < 0.3
-    body = lathe(np.full(2, 0.4 * w), np.array([0.0, h])) if round_body else box((w, d, h)).moved((0, 0, 0.5 * h))
+    body = (
+        lathe(np.full(2, 0.4 * w), np.array([0.0, h]))
+        if round_body
+        else box((w, d, h)).moved((0, 0, 0.5 * h))
+    )
     side = rng.uniform(0.05, 0.14)
     at = 0.4 * w - 0.5 * side if not round_body else 0.3 * w
     return [(body, 0), (box(side).moved((at, 0, h + 0.5 * side)), 0)]
@@ -81,7 +95,8 @@ FAMILIES: dict[str, Callable[[Rng], list[Part]]] = {
 
 
 def tied_shape(rng: Rng, family: str) -> tuple[Array, Array]:
-    """Vertices (V, 3) of radius 1 around the origin, z up, and faces (F, 3), of a family of ``FAMILIES``."""
+    """Vertices (V, 3) of radius 1 around the origin, z up, and faces (F, 3), of a family of
+    ``FAMILIES``."""
     surface = join([part for part, _ in FAMILIES[family](rng)])
     points = surface.vertices @ rotation(2, rng.uniform(0.0, 2.0 * np.pi)).T
     points = points - 0.5 * (points.min(axis=0) + points.max(axis=0))

@@ -3,8 +3,9 @@
     python scripts/speed/compiled_layers.py                    # ten minutes on one core
     python scripts/speed/compiled_layers.py --device cuda
 
-Adds to scripts/results/compiled_layers.json and writes the table of docs/guides/layers.md after each layer.
-One thread, batches of eight images of 128 px; both run in turn, and the least time of each counts.
+Adds to scripts/results/compiled_layers.json and writes the table of docs/guides/layers.md after
+each layer. One thread, batches of eight images of 128 px; both run in turn, and the least time of
+each counts.
 """
 
 import argparse
@@ -46,7 +47,10 @@ def measure(layer: nn.Module, device: str, rounds: int, seconds: float) -> dict[
     for name, (run, image) in {"forward": (forward, x), "both": (backward, learned)}.items():
         calls = [functools.partial(run, function, image) for function in (layer, compiled)]
         eager, fast = least_times(calls, rounds, seconds, device)
-        entry |= {f"{name}_eager_ms": round(1e3 * eager, 3), f"{name}_compiled_ms": round(1e3 * fast, 3)}
+        entry |= {
+            f"{name}_eager_ms": round(1e3 * eager, 3),
+            f"{name}_compiled_ms": round(1e3 * fast, 3),
+        }
     return entry
 
 
@@ -55,17 +59,27 @@ def table(record: dict[str, Any]) -> list[str]:
     for device, layers in record["layers"].items():
         for name, entry in layers.items():
             passes = (
-                f"{entry[f'{p}_eager_ms']:.1f} to {entry[f'{p}_compiled_ms']:.1f} ms" for p in ("forward", "both")
+                f"{entry[f'{p}_eager_ms']:.1f} to {entry[f'{p}_compiled_ms']:.1f} ms"
+                for p in ("forward", "both")
             )
             rows.append([name, device, f"{entry['compile_s']:.0f} s", *passes])
     lines = _shared.table_lines(rows)
-    return [*lines, "", f"torch {record['torch']}, {record['processor']}, one thread, {record['date']}.", ""]
+    return [
+        *lines,
+        "",
+        f"torch {record['torch']}, {record['processor']}, one thread, {record['date']}.",
+        "",
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--rounds", type=int, default=8, help="rounds of which the least time counts")
+    parser.add_argument(
+        "--rounds", type=int, default=8, help="rounds of which the least time counts"
+    )
     parser.add_argument("--seconds", type=float, default=0.05, help="of each measurement")
     parser.add_argument("--only", nargs="+", default=list(LAYERS), help="names of layers")
     options = parser.parse_args()

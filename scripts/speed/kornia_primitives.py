@@ -1,10 +1,13 @@
-"""Compare primitives of the filters with kornia's: results, and processor time of forward and backward pass.
+"""Compare primitives of the filters with kornia's: results, and processor time of forward and
+backward pass.
 
     python scripts/speed/kornia_primitives.py                  # eager, a minute on one core
-    python scripts/speed/kornia_primitives.py --compiled       # also compiled, which takes several minutes
+    python scripts/speed/kornia_primitives.py --compiled       # also compiled, which takes several
+    minutes
 
-Writes scripts/results/kornia_primitives.json and the table of docs/kornia.md. Both functions run in turn in one process
-on one thread, on batches of eight images, and the least time of each counts, so that the ratio holds on a busy machine.
+Writes scripts/results/kornia_primitives.json and the table of docs/kornia.md. Both functions run in
+turn in one process on one thread, on batches of eight images, and the least time of each counts, so
+that the ratio holds on a busy machine.
 """
 
 import argparse
@@ -34,13 +37,16 @@ LARGEST_RATIO = 1.5
 TOLERANCE = 1e-5
 OUT = _shared.RESULTS / "kornia_primitives.json"
 PAGE = _shared.REPOSITORY / "docs" / "kornia.md"
-CROP, BOX = 128, (20.3, 14.6, 110.3, 104.6)  # side of crops, and the square that they enlarge
+# side of crops, and the square that they enlarge
+CROP = 128
+BOX = (20.3, 14.6, 110.3, 104.6)
 RADIUS = 5.12  # px of a dilation: eps of Repeatability at 256 px
 
 
 @dataclass(frozen=True)
 class Primitive:
-    """The same operation twice. ``difference`` is not compared where they are different functions."""
+    """The same operation twice. ``difference`` is not compared where they are different
+    functions."""
 
     name: str
     ours: Callable[[Tensor], Tensor]
@@ -61,7 +67,9 @@ def _gaussian(sigma: float) -> Primitive:
     def of_kornia(x: Tensor) -> Tensor:
         return kornia.filters.gaussian_blur2d(x, side, (sigma, sigma), "replicate")
 
-    return Primitive(f"Gaussian, sigma {sigma:g}", lambda x: cr.filters.gaussian_smooth(x, sigma), of_kornia)
+    return Primitive(
+        f"Gaussian, sigma {sigma:g}", lambda x: cr.filters.gaussian_smooth(x, sigma), of_kornia
+    )
 
 
 def _first(x: Tensor) -> Tensor:
@@ -98,7 +106,10 @@ def _crops(x: Tensor) -> Tensor:
 def _kornia_crops(x: Tensor) -> Tensor:
     """Its boxes are the centres of the outermost samples."""
     half = 0.5 * (BOX[2] - BOX[0]) / CROP
-    left, top, right, bottom = BOX[0] + half, BOX[1] + half, BOX[2] - half, BOX[3] - half
+    left = BOX[0] + half
+    top = BOX[1] + half
+    right = BOX[2] - half
+    bottom = BOX[3] - half
     corners = torch.tensor([[left, top], [right, top], [right, bottom], [left, bottom]])
     boxes = corners.expand(len(x), 4, 2)
     return kornia.geometry.transform.crop_and_resize(x, boxes, (CROP, CROP))
@@ -116,7 +127,9 @@ def _kornia_dilation(x: Tensor) -> Tensor:
 
 PRIMITIVES = (
     *(_gaussian(sigma) for sigma in (1.0, 2.0, 4.0)),
-    Primitive("first derivatives", _first, lambda x: kornia.filters.spatial_gradient(x, "diff", 1)[:, 0]),
+    Primitive(
+        "first derivatives", _first, lambda x: kornia.filters.spatial_gradient(x, "diff", 1)[:, 0]
+    ),
     Primitive("second derivatives", _second, _kornia_second),
     Primitive(
         "gradient of the smoothed image",
@@ -125,7 +138,13 @@ PRIMITIVES = (
         border=1,
         remark="ours pads before it smooths; equal but for the outermost pixel",
     ),
-    Primitive("grey levels", _grey, kornia.color.rgb_to_grayscale, channels=3, remark="ours: a sum of three products"),
+    Primitive(
+        "grey levels",
+        _grey,
+        kornia.color.rgb_to_grayscale,
+        channels=3,
+        remark="ours: a sum of three products",
+    ),
     Primitive(
         "crops, enlarged",
         _crops,
@@ -167,7 +186,9 @@ def difference_of(primitive: Primitive, x: Tensor) -> float:
     return float((a - b)[..., inner, inner].abs().max())
 
 
-def measure(primitive: Primitive, size: int, *, compiled: bool, rounds: int, seconds: float) -> dict[str, Any]:
+def measure(
+    primitive: Primitive, size: int, *, compiled: bool, rounds: int, seconds: float
+) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(BATCH, primitive.channels, size, size, generator=generator)
     entry: dict[str, Any] = {"primitive": primitive.name, "size": size, "same": primitive.same}
@@ -212,7 +233,9 @@ def table(entries: Sequence[dict[str, Any]]) -> list[str]:
         mine = [entry for entry in entries if entry["primitive"] == primitive.name]
         if not mine:
             continue
-        cells = [ratios_of(entry, name) for entry in mine for name in ("forward", "forward and backward")]
+        cells = [
+            ratios_of(entry, name) for entry in mine for name in ("forward", "forward and backward")
+        ]
         difference = max((entry["difference"] for entry in mine if entry["same"]), default=None)
         remark = f" ({primitive.remark})" if primitive.remark else ""
         shown = "-" if difference is None else f"{difference:.0e}"
@@ -222,23 +245,39 @@ def table(entries: Sequence[dict[str, Any]]) -> list[str]:
 
 def ratios_of(entry: dict[str, Any], name: str) -> str:
     """Ratio of a pass, eager and, if it was measured, compiled."""
-    measured = [entry[mode][name]["ratio"] for mode in ("eager", "compiled") if name in entry.get(mode, {})]
+    measured = [
+        entry[mode][name]["ratio"] for mode in ("eager", "compiled") if name in entry.get(mode, {})
+    ]
     return " / ".join(f"{ratio:.2f}" for ratio in measured) or "-"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--compiled", action="store_true", help="measure compiled functions as well")
-    parser.add_argument("--rounds", type=int, default=15, help="rounds of which the least time counts")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--compiled", action="store_true", help="measure compiled functions as well"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=15, help="rounds of which the least time counts"
+    )
     parser.add_argument("--seconds", type=float, default=0.03, help="of each measurement")
-    parser.add_argument("--only", nargs="+", default=[p.name for p in PRIMITIVES], help="names of primitives")
-    parser.add_argument("--out", type=Path, help="JSON file, instead of record and page of the project")
+    parser.add_argument(
+        "--only", nargs="+", default=[p.name for p in PRIMITIVES], help="names of primitives"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="JSON file, instead of record and page of the project"
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     entries = []
     for primitive in PRIMITIVES:
         for size in SIZES if primitive.name in options.only else ():
-            how = {"compiled": options.compiled, "rounds": options.rounds, "seconds": options.seconds}
+            how = {
+                "compiled": options.compiled,
+                "rounds": options.rounds,
+                "seconds": options.seconds,
+            }
             entries.append(measure(primitive, size, **how))
             print(entries[-1], flush=True)
     record = {
@@ -252,7 +291,10 @@ def main() -> None:
     }
     _shared.write_json(options.out or OUT, record)
     if options.out is None:
-        versions = f"kornia {record['kornia']}, torch {record['torch']}, {record['processor']}, {record['date']}"
+        versions = (
+            f"kornia {record['kornia']}, torch {record['torch']}, {record['processor']}, "
+            f"{record['date']}"
+        )
         _shared.update_page(PAGE, "kornia", "\n".join([*table(entries), "", f"{versions}.", ""]))
 
 

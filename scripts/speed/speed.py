@@ -2,23 +2,28 @@
 
     python scripts/speed/speed.py                                # this checkout alone
     git worktree add ../before HEAD~20
-    python scripts/speed/speed.py --against ../before            # A B A B, with the ratio of each step
-    python scripts/speed/speed.py --device cuda --steps bank one many layers --out gpu.json
+    python scripts/speed/speed.py --against ../before            # A B A B, with the ratio of each
+    step python scripts/speed/speed.py --device cuda --steps bank one many layers --out gpu.json
 
-Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every measurement has a process
-of its own; each step counts with its least time and memory over the rounds. Ratios are fair on a busy machine, times
-only on an idle one. The other checkout is of 2026-11-23 or later.
+Writes scripts/results/speed.json and, without --out, the table of docs/performance.md. Every
+measurement has a process of its own; each step counts with its least time and memory over the
+rounds. Ratios are fair on a busy machine, times only on an idle one. The other checkout is of
+2026-11-23 or later.
 
-New photographs were never registered with the cache in use: what a first registration describes may not be kept for the
-second. An earlier command has registered ten others of the same mesh, but for ``cold`` and ``fresh``.
+New photographs were never registered with the cache in use: what a first registration describes may
+not be kept for the second. An earlier command has registered ten others of the same mesh, but for
+``cold`` and ``fresh``.
 
-- cold, warm: ``curvireg register`` from process start to its files, a new photograph, without and with a cached bank
+- cold, warm: ``curvireg register`` from process start to its files, a new photograph, without and
+  with a cached bank
 - bank: ``ViewBank.build`` of all views
 - rank: a new photograph without contour fit
 - fresh: each of the first ten photographs of a mesh whose bank is cached, one by one
-- one: a new photograph; repeated: the same photograph again; many: each of many new photographs in one call
+- one: a new photograph; repeated: the same photograph again; many: each of many new photographs in
+  one call
 - follow: each frame of a video in which the photograph moves by 2 px
-- layers: forward and backward pass of three filter layers, each followed by HOG; a photograph of a batch
+- layers: forward and backward pass of three filter layers, each followed by HOG; a photograph of a
+  batch
 """
 
 import argparse
@@ -41,12 +46,16 @@ NEW = 4  # new photographs of the steps that register one after another
 SUBDIVISIONS = 6  # of an icosphere: 81,920 faces
 CAMERA = (900.0, 900.0, 319.5, 239.5)  # fx, fy, cx, cy of a photograph of 640 x 480 px
 
-HERE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed import measure, write_inputs"
+HERE = (
+    f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from speed import measure, "
+    f"write_inputs"
+)
 """Import of this file in a process that imports another checkout's package."""
 
 
 def write_inputs(folder: str, photographs: int) -> None:
-    """Write a dented sphere, photographs of it in random poses and their boxes; runs in this checkout."""
+    """Write a dented sphere, photographs of it in random poses and their boxes; runs in this
+    checkout."""
     import cv2
     import numpy as np
     import torch
@@ -74,14 +83,21 @@ def write_inputs(folder: str, photographs: int) -> None:
 
 
 def measure_layers(photographs: int, device: str) -> float:
-    """Seconds of a forward and backward pass of three filter layers, each followed by HOG, for one of a batch."""
+    """Seconds of a forward and backward pass of three filter layers, each followed by HOG, for one
+    of a batch."""
     import torch
 
     import curvireg_torch as cr
 
-    layers = [cr.ImageCurvilinearSaliency(), cr.MultiScaleCurvilinearSaliency(), cr.MultiScaleFocusCurves()]
+    layers = [
+        cr.ImageCurvilinearSaliency(),
+        cr.MultiScaleCurvilinearSaliency(),
+        cr.MultiScaleFocusCurves(),
+    ]
     hog = cr.HOG().to(device)
-    images = torch.rand(photographs, 1, 480, 640, generator=torch.Generator().manual_seed(0)).to(device)
+    images = torch.rand(photographs, 1, 480, 640, generator=torch.Generator().manual_seed(0)).to(
+        device
+    )
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
@@ -166,13 +182,16 @@ class Stopwatch:
         return {"seconds": wall, "processor_seconds": processor}
 
 
-def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str) -> dict[str, float]:
+def measured(
+    step: str, checkout: Path, folder: Path, cache: Path, photographs: int, device: str
+) -> dict[str, float]:
     """Seconds, processor seconds and MB of a step in a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
     if step not in ("cold", "warm"):
         words = [
             "-c",
-            f"{HERE}; import json; print(json.dumps(measure({step!r}, {str(folder)!r}, {photographs}, {device!r})))",
+            f"{HERE}; import json; print(json.dumps(measure({step!r}, {str(folder)!r}, "
+            f"{photographs}, {device!r})))",
         ]
         _, usage, output = _shared.run_process(words, folder, environment)
         return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
@@ -184,13 +203,17 @@ def measured(step: str, checkout: Path, folder: Path, cache: Path, photographs: 
     return {"seconds": seconds, "processor_seconds": processor, "megabytes": usage.ru_maxrss / 1024}
 
 
-def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str) -> Any:
+def compare(
+    checkouts: dict[str, Path], steps: Sequence[str], photographs: int, rounds: int, device: str
+) -> Any:
     """Least seconds and megabytes of each step in each checkout, measured in turn."""
     found: dict[str, dict[str, Any]] = {name: {} for name in checkouts}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        _shared.run_process(["-c", f"{HERE}; write_inputs({temporary!r}, {photographs})"], folder, environment)
+        _shared.run_process(
+            ["-c", f"{HERE}; write_inputs({temporary!r}, {photographs})"], folder, environment
+        )
         for name, checkout in checkouts.items():
             bank_alone = folder / f"{name}-bank"
             measured("follow", checkout, folder, bank_alone, photographs, device)  # stores the bank
@@ -201,9 +224,12 @@ def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, 
             measured("earlier", checkout, folder, used, photographs, device)
         for step in tuple(steps) * rounds:
             for name, checkout in checkouts.items():
-                cache = folder / "cache"  # a copy for each measurement: what this one stores, the next one lacks
+                # a copy for each measurement: what this one stores, the next one lacks
+                cache = folder / "cache"
                 if step != "cold":
-                    shutil.copytree(folder / f"{name}-{'bank' if step == 'fresh' else 'used'}", cache)
+                    shutil.copytree(
+                        folder / f"{name}-{'bank' if step == 'fresh' else 'used'}", cache
+                    )
                 new = measured(step, checkout, folder, cache, photographs, device)
                 shutil.rmtree(cache, ignore_errors=True)
                 old = found[name].get(step, new)
@@ -212,7 +238,8 @@ def compare(checkouts: dict[str, Path], steps: Sequence[str], photographs: int, 
 
 
 def table(record: dict[str, Any]) -> str:
-    """Seconds and memory of each step in Markdown, with the ratio of processor times if there are two checkouts."""
+    """Seconds and memory of each step in Markdown, with the ratio of processor times if there are
+    two checkouts."""
     times = record["times"]
     columns = [f"{name} ({record['commits'][name]})" for name in times]
     rows = [["step", *columns, "ratio of processor times"]]
@@ -238,22 +265,34 @@ def cell(measurement: dict[str, float]) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     import torch
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--against", type=Path, metavar="CHECKOUT", help="another checkout of this repository"
+    )
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=STEPS)
     parser.add_argument("--photographs", type=int, default=16)
-    parser.add_argument("--device", default="cpu", help="of all steps but the commands (default cpu)")
+    parser.add_argument(
+        "--device", default="cpu", help="of all steps but the commands (default cpu)"
+    )
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--out", type=Path, help="another file than scripts/results/speed.json; no page is changed")
+    parser.add_argument(
+        "--out", type=Path, help="another file than scripts/results/speed.json; no page is changed"
+    )
     options = parser.parse_args(arguments)
     checkouts = {"before": options.against.resolve()} if options.against else {}
     checkouts["now"] = ROOT
     record = {
         "date": _shared.today(),
         "commits": {name: _shared.commit(root) for name, root in checkouts.items()},
-        "processor": _shared.processor() if options.device == "cpu" else torch.cuda.get_device_name(options.device),
+        "processor": _shared.processor()
+        if options.device == "cpu"
+        else torch.cuda.get_device_name(options.device),
         "photographs": options.photographs,
-        "times": compare(checkouts, options.steps, options.photographs, options.rounds, options.device),
+        "times": compare(
+            checkouts, options.steps, options.photographs, options.rounds, options.device
+        ),
     }
     _shared.write_json(options.out or _shared.RESULTS / "speed.json", record)
     print(table(record))

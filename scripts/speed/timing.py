@@ -11,8 +11,8 @@ from torch import Tensor
 def least_times(
     functions: Sequence[Callable[[], object]], rounds: int, seconds: float, device: str = "cpu"
 ) -> list[float]:
-    """Least time in s of each function, on a CPU that of the processor, on a GPU until it has finished; the functions
-    run in turn, so that all meet the same conditions."""
+    """Least time in s of each function, on a CPU that of the processor, on a GPU until it has
+    finished; the functions run in turn, so that all meet the same conditions."""
     repeats = []
     for function in functions:
         function()

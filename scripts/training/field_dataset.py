@@ -15,7 +15,8 @@ from scripts.training.generated import GeneratedScenes
 SETTINGS = BankSettings(image_size=WORK_SIZE, sigma=0.8)
 """Settings of the depth views that the network learns to imitate."""
 
-TEMPERATURE = 0.05  # of the ranking losses: about the difference between the correlations of right and wrong views
+# of the ranking losses: about the difference between the correlations of right and wrong views
+TEMPERATURE = 0.05
 OTHER_VIEWS = 5
 
 
@@ -24,14 +25,17 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
 
     Items (a dict): ``image`` (3, S, S) uint8, and in half precision
 
-    - ``code`` (2, S/2, S/2), the field of the clean depth encoded by :func:`doubled_angle`, of length about 1 on edges;
+    - ``code`` (2, S/2, S/2), the field of the clean depth encoded by :func:`doubled_angle`, of
+      length about 1 on edges;
     - ``mask`` (1, S/2, S/2), the object's silhouette, occluded parts included;
-    - ``descriptors`` (7, D): of that field, of the true view as a bank describes it, and of five other views.
+    - ``descriptors`` (7, D): of that field, of the true view as a bank describes it, and of five
+      other views.
     """
 
     def __init__(self, scenes: GeneratedScenes) -> None:
         self.scenes = scenes
-        self._filter, self._descriptor = depth_filter(SETTINGS), hog_layer(SETTINGS)
+        self._filter = depth_filter(SETTINGS)
+        self._descriptor = hog_layer(SETTINGS)
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -44,7 +48,9 @@ class FieldDataset(Dataset[dict[str, Tensor]]):
         length = code.norm(dim=1)
         describe = ViewDescriber(self.scenes.mesh(index), SETTINGS)
         rotations = sample["rotation"] @ _view_rotations(torch.Generator().manual_seed(index))
-        views = self._filter(describe.depth(rotations, sample["distance"].expand(len(rotations)))[0])
+        views = self._filter(
+            describe.depth(rotations, sample["distance"].expand(len(rotations)))[0]
+        )
         return {
             "image": (255 * sample["image"]).round().to(torch.uint8),
             "code": (code * length.sum() / (length.square().sum() + 1e-6))[0].half(),
@@ -70,7 +76,8 @@ def mirrored_descriptors(descriptors: Tensor) -> Tensor:
 
 
 def _view_rotations(generator: torch.Generator) -> Tensor:
-    """(1 + OTHER_VIEWS, 3, 3) model rotations: identity, half and quarter turns about z, then random ones."""
+    """(1 + OTHER_VIEWS, 3, 3) model rotations: identity, half and quarter turns about z, then
+    random ones."""
     z = torch.tensor([0.0, torch.pi, 0.5 * torch.pi, -0.5 * torch.pi])
     about_z = torch.stack([torch.zeros(4), torch.zeros(4), z], dim=1)
     angles = torch.deg2rad(20.0 + 60.0 * torch.rand(OTHER_VIEWS - 3, 1, generator=generator))
@@ -79,10 +86,12 @@ def _view_rotations(generator: torch.Generator) -> Tensor:
 
 
 class ReplayBuffer:
-    """The latest ``capacity`` samples, reused so that training does not wait for the scene generator."""
+    """The latest ``capacity`` samples, reused so that training does not wait for the scene
+    generator."""
 
     def __init__(self, capacity: int) -> None:
-        self.capacity, self.added = capacity, 0
+        self.capacity = capacity
+        self.added = 0
         self._store: dict[str, Tensor] = {}
 
     def add(self, batch: dict[str, Tensor]) -> None:
@@ -95,7 +104,8 @@ class ReplayBuffer:
         self.added += len(index)
 
     def draw(self, fresh: int, count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """The ``fresh`` latest samples and random others, ``count`` in all, as float32 with images in [0, 1]."""
+        """The ``fresh`` latest samples and random others, ``count`` in all, as float32 with images
+        in [0, 1]."""
         stored = min(self.added, self.capacity)
         latest = torch.arange(self.added - fresh, self.added) % self.capacity
         index = torch.cat([latest, torch.randint(stored, (count - fresh,), generator=generator)])
@@ -104,16 +114,21 @@ class ReplayBuffer:
 
 
 def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, Tensor]:
-    """Mirror the samples and change colours, contrast and noise, each at random. Targets are mirrored with images."""
+    """Mirror the samples and change colours, contrast and noise, each at random. Targets are
+    mirrored with images."""
 
     def draw(*shape: int) -> Tensor:
         return torch.rand(len(batch["image"]), *shape, generator=generator)
 
     mirror = draw(1, 1, 1) < 0.5
     images = torch.where(mirror, batch["image"].flip(3), batch["image"])
-    code = torch.where(mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"])
+    code = torch.where(
+        mirror, batch["code"].flip(3) * torch.tensor([1.0, -1.0])[:, None, None], batch["code"]
+    )
     mask = torch.where(mirror, batch["mask"].flip(3), batch["mask"])
-    descriptors = torch.where(mirror[:, 0], mirrored_descriptors(batch["descriptors"]), batch["descriptors"])
+    descriptors = torch.where(
+        mirror[:, 0], mirrored_descriptors(batch["descriptors"]), batch["descriptors"]
+    )
     grey = images.mean(dim=1, keepdim=True)
     images = grey + (images - grey) * (1.4 * draw(1, 1, 1))
     images = torch.where(draw(1, 1, 1) < 0.3, images.flip(1), images)
@@ -126,18 +141,22 @@ def augment(batch: dict[str, Tensor], generator: torch.Generator) -> dict[str, T
 def losses(output: Tensor, batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """Terms of the training loss, to be added up.
 
-    ``field``: squared error of the code, relative to predicting no field. ``mask``: cross entropy. ``descriptor``: one
-    minus the correlation with the true view. ``ranking``: cross entropy of picking the true view among those of the
-    batch and their mirror images. ``other_views``: of picking it among other views of the same object.
+    ``field``: squared error of the code, relative to predicting no field. ``mask``: cross entropy.
+    ``descriptor``: one minus the correlation with the true view. ``ranking``: cross entropy of
+    picking the true view among those of the batch and their mirror images. ``other_views``: of
+    picking it among other views of the same object.
 
     Args:
         output: (B, 3, S/2, S/2) of :class:`FieldNetwork`.
         batch: samples of :class:`FieldDataset` as float32.
     """
-    code, target = output[:, :2], batch["code"]
+    code = output[:, :2]
+    target = batch["code"]
     predicted = hog_layer(SETTINGS)(halved_angle(code))
     true = batch["descriptors"][:, 0]
-    correlation = F.normalize(predicted) @ F.normalize(torch.cat([true, mirrored_descriptors(true)])).T
+    correlation = (
+        F.normalize(predicted) @ F.normalize(torch.cat([true, mirrored_descriptors(true)])).T
+    )
     labels = torch.arange(len(predicted), device=predicted.device)
     views = F.normalize(batch["descriptors"][:, 1:], dim=2)
     among_views = (views @ F.normalize(predicted, dim=1)[..., None])[..., 0]

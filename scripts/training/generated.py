@@ -1,4 +1,5 @@
-"""Generated scenes as a dataset: crops of procedural objects, with the depth of the object alone."""
+"""Generated scenes as a dataset: crops of procedural objects, with the depth of the object
+alone."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -31,13 +32,18 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
         image_size: side of the crops in px.
         upright: fraction of the objects that stand upright.
 
-    Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of the object, 0 =
-    background, ``rotation`` (3, 3) float32 of a camera that looks straight at the object,
-    ``distance`` () float32 in radii.
+    Items (a dict): ``image`` (3, S, S) float32 in [0, 1], ``depth`` (1, S, S) float32 in radii of
+    the object, 0 = background, ``rotation`` (3, 3) float32 of a camera that looks straight at the
+    object, ``distance`` () float32 in radii.
     """
 
-    def __init__(self, length: int, *, seed: int = 0, image_size: int = 128, upright: float = 0.6) -> None:
-        self._length, self._seed, self._size, self._upright = length, seed, image_size, upright
+    def __init__(
+        self, length: int, *, seed: int = 0, image_size: int = 128, upright: float = 0.6
+    ) -> None:
+        self._length = length
+        self._seed = seed
+        self._size = image_size
+        self._upright = upright
 
     def __len__(self) -> int:
         return self._length
@@ -53,19 +59,24 @@ class GeneratedScenes(Dataset[dict[str, Tensor]]):
             raise IndexError(index)
         rng = np.random.default_rng((self._seed, index, 1))
         shape = _painted(np.random.default_rng((self._seed, index)), rng)
-        upright, occluded = bool(rng.random() < self._upright), bool(rng.random() < 0.3)
+        upright = bool(rng.random() < self._upright)
+        occluded = bool(rng.random() < 0.3)
         options = {"size": PHOTOGRAPH, "upright": upright, "occluded": occluded}
         scene = single(shape, 1, _clutter, random_texture, rng, **options)
         (R, t, _), target = scene.views[0], scene.shapes[0]
         centre = R @ target.points(shape.centre) + t
         straight = rotation_towards(torch.from_numpy(centre)).numpy().T
-        R, t = straight @ R, straight @ t
+        R = straight @ R
+        t = straight @ t
         K, (x0, y0, x1, y1) = _crop_camera(target, R, t, rng, self._size)
         picture = scene.render((R, t, K), (self._size, self._size))
-        if picture.seen.sum() < 0.1 * picture.whole.sum():  # hidden objects are of no use for training
+        # hidden objects are of no use for training
+        if picture.seen.sum() < 0.1 * picture.whole.sum():
             picture = replace(scene, shapes=[target]).render((R, t, K), (self._size, self._size))
         image = np.pad(
-            picture.linear[y0:y1, x0:x1], ((y0, self._size - y1), (x0, self._size - x1), (0, 0)), mode="edge"
+            picture.linear[y0:y1, x0:x1],
+            ((y0, self._size - y1), (x0, self._size - x1), (0, 0)),
+            mode="edge",
         )
         return {
             "image": torch.from_numpy(simulate_camera(image, rng)).permute(2, 0, 1).float() / 255.0,
@@ -92,8 +103,11 @@ def _numbered(number: int) -> TexturedMesh:
     return _painted(rng, rng)
 
 
-def _crop_camera(target: Placed, R: Array, t: Array, rng: Rng, size: int) -> tuple[Array, tuple[int, int, int, int]]:
-    """Camera matrix of the crop around a jittered box, and the part of the crop that lies within the photograph."""
+def _crop_camera(
+    target: Placed, R: Array, t: Array, rng: Rng, size: int
+) -> tuple[Array, tuple[int, int, int, int]]:
+    """Camera matrix of the crop around a jittered box, and the part of the crop that lies within
+    the photograph."""
     placed = target.hull @ R.T + t
     flat = placed[:, :2] / np.maximum(placed[:, 2:], 0.1)
     side = np.ptp(flat, axis=0)
@@ -106,6 +120,8 @@ def _crop_camera(target: Placed, R: Array, t: Array, rng: Rng, size: int) -> tup
         border[k] = box[k]
     A = crop_transforms(square_boxes(torch.from_numpy(box), MARGIN), size).numpy()
     corners = np.where(np.isfinite(border), border, 0).reshape(2, 2) @ A[:2, :2] + A[:2, 2]
-    area = np.where(np.isfinite(border), np.round(corners.reshape(-1) + 0.5), np.array([0, 0, size, size]))
+    area = np.where(
+        np.isfinite(border), np.round(corners.reshape(-1) + 0.5), np.array([0, 0, size, size])
+    )
     x0, y0, x1, y1 = np.clip(area, 0, size).astype(int).tolist()
     return A, (x0, y0, x1, y1)

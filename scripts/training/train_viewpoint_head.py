@@ -2,8 +2,9 @@
 
     python scripts/training/train_viewpoint_head.py data/PASCAL3D+_release1.1 --out runs/head.json
 
-Crops of photographs become the learned field and its HOG, which are not trained. From these and the class, a head of
-two linear layers predicts a bin each of azimuth, elevation and theta. Every second photograph is for the evaluation.
+Crops of photographs become the learned field and its HOG, which are not trained. From these and the
+class, a head of two linear layers predicts a bin each of azimuth, elevation and theta. Every second
+photograph is for the evaluation.
 """
 
 import argparse
@@ -20,20 +21,25 @@ from curvireg_torch.data.crops import UNKNOWN_CLASS, ObjectCrops
 
 
 class ViewpointHead(nn.Module):
-    """Logits of the bins of azimuth, elevation and theta, from crops (B, 3, S, S) and class numbers (B,)."""
+    """Logits of the bins of azimuth, elevation and theta, from crops (B, 3, S, S) and class numbers
+    (B,)."""
 
     def __init__(self, classes: int, bins: tuple[int, ...], width: int = 256) -> None:
         super().__init__()
         self.layers = nn.Sequential(cr.LearnedCurvilinearSaliency(), cr.HOG()).requires_grad_(False)
         descriptor = self.layers[1].length
         self.classes = classes
-        self.hidden = nn.Sequential(nn.LayerNorm(descriptor), nn.Linear(descriptor, width), nn.ReLU(), nn.Dropout(0.2))
+        self.hidden = nn.Sequential(
+            nn.LayerNorm(descriptor), nn.Linear(descriptor, width), nn.ReLU(), nn.Dropout(0.2)
+        )
         self.logits = nn.ModuleList(nn.Linear(width + classes, count) for count in bins)
 
     def forward(self, image: Tensor, class_id: Tensor) -> list[Tensor]:
         with torch.no_grad():
             descriptors = self.layers(image)
-        known = torch.cat([self.hidden(descriptors), F.one_hot(class_id, self.classes).float()], dim=1)
+        known = torch.cat(
+            [self.hidden(descriptors), F.one_hot(class_id, self.classes).float()], dim=1
+        )
         return [layer(known) for layer in self.logits]
 
 
@@ -57,7 +63,9 @@ def rotations_of(logits: list[Tensor], bins: tuple[int, ...]) -> Tensor:
 def evaluate(head: ViewpointHead, loader: DataLoader, bins: tuple[int, ...]) -> dict[str, float]:
     """Mean loss, accuracy of the azimuth's bin, and errors of the rotation."""
     head.eval()
-    losses, right, errors = [], [], []
+    losses = []
+    right = []
+    errors = []
     for batch in loader:
         known = (batch["viewpoint_bins"] != UNKNOWN_CLASS).all(dim=1)
         batch = {name: values[known] for name, values in batch.items()}
@@ -81,12 +89,16 @@ def halves(crops: ObjectCrops) -> tuple[Subset, Subset]:
     """Objects of every second photograph to train on, and the others: no photograph is in both."""
     paths = [crops.annotation(index)["image_path"] for index in range(len(crops))]
     order = {path: number for number, path in enumerate(dict.fromkeys(paths))}
-    parts = [[index for index, path in enumerate(paths) if order[path] % 2 == part] for part in (0, 1)]
+    parts = [
+        [index for index, path in enumerate(paths) if order[path] % 2 == part] for part in (0, 1)
+    ]
     return Subset(crops, parts[0]), Subset(crops, parts[1])
 
 
 def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("root", type=Path, help="folder of PASCAL3D+")
     parser.add_argument("--split", default="val", help="whose photographs are halved")
     parser.add_argument("--epochs", type=int, default=1)
@@ -104,8 +116,12 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
         raise SystemExit(f"{crops.dataset!r}: expected at least two photographs")
     head = ViewpointHead(len(crops.classes), crops.bins)
     optimizer = torch.optim.AdamW(head.parameters(), lr=options.rate, weight_decay=0.01)
-    known, others = DataLoader(training, options.batch), DataLoader(held_out, options.batch)
-    results = {"before": evaluate(head, known, crops.bins), "held out before": evaluate(head, others, crops.bins)}
+    known = DataLoader(training, options.batch)
+    others = DataLoader(held_out, options.batch)
+    results = {
+        "before": evaluate(head, known, crops.bins),
+        "held out before": evaluate(head, others, crops.bins),
+    }
     for _ in range(options.epochs):
         head.train()
         for batch in DataLoader(training, options.batch, shuffle=True):
@@ -113,7 +129,10 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
-    results |= {"after": evaluate(head, known, crops.bins), "held out after": evaluate(head, others, crops.bins)}
+    results |= {
+        "after": evaluate(head, known, crops.bins),
+        "held out after": evaluate(head, others, crops.bins),
+    }
     for name, values in results.items():
         print(f"{name}: {json.dumps(values)}")
     if options.out is not None:

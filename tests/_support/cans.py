@@ -18,7 +18,10 @@ def can(word: str = "BEANS") -> trimesh.Trimesh:
     angle = np.linspace(0, 2 * np.pi, 49)
     ring = np.stack([np.sin(angle), np.cos(angle)], axis=1)
     side = [np.c_[ring[:, 0], np.full(49, y), ring[:, 1]] for y in (-1.3, 1.3)]
-    lids = [*(np.c_[ring[:, 0], np.full(49, y), ring[:, 1]] for y in (-1.3, 1.3)), [[0, -1.3, 0], [0, 1.3, 0]]]
+    lids = [
+        *(np.c_[ring[:, 0], np.full(49, y), ring[:, 1]] for y in (-1.3, 1.3)),
+        [[0, -1.3, 0], [0, 1.3, 0]],
+    ]
     places = [np.c_[angle / (2 * np.pi), np.full(49, v)] for v in (0.0, 1.0)]
     k = np.arange(48)
     faces = [np.c_[k, k + 1, k + 50], np.c_[k, k + 50, k + 49]]
@@ -26,7 +29,9 @@ def can(word: str = "BEANS") -> trimesh.Trimesh:
     uv = np.concatenate([*places, np.full((100, 2), (0.5, 0.02))])
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(label))
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return trimesh.Trimesh(np.concatenate([*side, *lids]), np.concatenate(faces), visual=visual, process=False)
+    return trimesh.Trimesh(
+        np.concatenate([*side, *lids]), np.concatenate(faces), visual=visual, process=False
+    )
 
 
 def photograph(mesh, T):
@@ -36,6 +41,8 @@ def photograph(mesh, T):
     room[2 * H // 3 :] = 0.75
     lit = picture * torch.linspace(0.95, 0.6, W) * torch.tensor([1.0, 0.95, 0.85])[:, None, None]
     image = torch.where(picture.amin(dim=0) < 0.999, lit, room)
-    image = torch.from_numpy(cv2.GaussianBlur(image.permute(1, 2, 0).numpy(), (0, 0), 0.8)).permute(2, 0, 1)
+    image = torch.from_numpy(cv2.GaussianBlur(image.permute(1, 2, 0).numpy(), (0, 0), 0.8)).permute(
+        2, 0, 1
+    )
     noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(0))
     return (image + 0.02 * noise).clamp(0, 1)

@@ -14,14 +14,16 @@ SHORTEST = 0.005  # seconds of processor time of the smaller input that count
 
 
 def check_linear(read: Callable[[Any], object], make: Callable[[int], Any], size: int) -> None:
-    """Assert that ``read(make(4 * size))`` takes about four times as long as ``read(make(size))``. Errors of ours are
-    results too."""
+    """Assert that ``read(make(4 * size))`` takes about four times as long as ``read(make(size))``.
+    Errors of ours are results too."""
     seconds = []
     for count in (size, FACTOR * size):
         content = make(count)
         seconds.append(min(_seconds(read, content) for _ in range(3)))
     small, large = seconds
-    assert large < MOST * max(small, SHORTEST), f"{small:.3f} s, and {large:.3f} s for {FACTOR} times the size"
+    assert large < MOST * max(small, SHORTEST), (
+        f"{small:.3f} s, and {large:.3f} s for {FACTOR} times the size"
+    )
 
 
 def _seconds(read: Callable[[Any], object], content: Any) -> float:

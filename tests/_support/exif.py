@@ -4,7 +4,8 @@ from pathlib import Path
 
 
 def exif(orientation: int, focal: int = 0, order: str = ">") -> bytes:
-    """A TIFF block with an orientation and, in its EXIF directory at byte 38, a 35 mm focal length."""
+    """A TIFF block with an orientation and, in its EXIF directory at byte 38, a 35 mm focal
+    length."""
     start = {">": b"MM", "<": b"II"}[order] + struct.pack(order + "HI", 42, 8)
     main = struct.pack(order + "HHHIHHHHIII", 2, 274, 3, 1, orientation, 0, 0x8769, 4, 1, 38, 0)
     return start + main + struct.pack(order + "HHHIHHI", 1, 0xA405, 3, 1, focal, 0, 0)
@@ -15,7 +16,9 @@ def with_exif(path: Path, block: bytes) -> None:
     data = path.read_bytes()
     if path.suffix == ".jpg":
         body = b"Exif\0\0" + block
-        path.write_bytes(data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:])
+        path.write_bytes(
+            data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:]
+        )
     else:
         chunk = b"eXIf" + block
         chunk = struct.pack(">I", len(block)) + chunk + struct.pack(">I", zlib.crc32(chunk))

@@ -1,5 +1,5 @@
-"""The contract of every layer, as one base class of tests: a test module defines ``cases`` and inherits the tests; it
-disables one that does not apply with ``test_gradcheck = None``."""
+"""The contract of every layer, as one base class of tests: a test module defines ``cases`` and
+inherits the tests; it disables one that does not apply with ``test_gradcheck = None``."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -52,7 +52,9 @@ def degenerate_images() -> dict[str, Tensor]:
         "one pixel": torch.full((1, 1, 1, 1), 0.5),
         "one bright pixel": bright,
         "checkerboard": ((x[:, None] + x) % 2)[None, None],
-        "saturated": torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(1)).mul(3.0).clamp(max=1.0),
+        "saturated": torch.rand(1, 1, 16, 16, generator=torch.Generator().manual_seed(1))
+        .mul(3.0)
+        .clamp(max=1.0),
         "two levels": (x >= 8).float().expand(1, 1, 16, 16).contiguous(),
         "row": torch.rand(1, 1, 1, 16, generator=torch.Generator().manual_seed(0)),
     }
@@ -69,20 +71,26 @@ class LayerContract:
             metafunc.parametrize("case", self.cases, ids=[case.name for case in self.cases])
 
     def agrees(self, got: Any, want: Any) -> bool:
-        """Equality of compiled results: another order of summation flips single pixels at a threshold or a sign."""
+        """Equality of compiled results: another order of summation flips single pixels at a
+        threshold or a sign."""
         for a, b in zip(tensors(got), tensors(want), strict=True):
-            a, b = a.detach(), b.detach()
+            a = a.detach()
+            b = b.detach()
             error = (a.float() - b.float()).abs()
             if b.ndim == 4 and b.shape[1] == 2:
                 error = torch.minimum(error, (a + b).abs()).amax(dim=1)
-            if a.shape != b.shape or float((error > 1e-3 * float(b.abs().max())).float().mean()) >= 0.005:
+            if (
+                a.shape != b.shape
+                or float((error > 1e-3 * float(b.abs().max())).float().mean()) >= 0.005
+            ):
                 return False
         return True
 
     def test_function_equals_module(self, case: LayerCase) -> None:
         x = case.inputs(2, SIZE)
         before = x.clone()
-        want, twin = case(x), case.twin()
+        want = case(x)
+        twin = case.twin()
         torch.testing.assert_close(tensors(twin(x)), tensors(want), rtol=0.0, atol=0.0)
         assert torch.equal(x, before)
         assert type(twin).__name__ in repr(twin)
@@ -91,10 +99,14 @@ class LayerContract:
             assert torch.isfinite(y).all()
 
     def test_batched_equals_one_by_one(self, case: LayerCase) -> None:
-        """The images differ in contrast and depth range, so that a normalisation over the batch is detected."""
+        """The images differ in contrast and depth range, so that a normalisation over the batch is
+        detected."""
         scale = torch.tensor([1.0, 0.1, 0.0], dtype=torch.float64).view(-1, 1, 1, 1)
         x = case.inputs(3, SIZE, dtype=torch.float64) * scale
-        parts = [torch.cat(part) for part in zip(*(tensors(case(image[None])) for image in x), strict=True)]
+        parts = [
+            torch.cat(part)
+            for part in zip(*(tensors(case(image[None])) for image in x), strict=True)
+        ]
         torch.testing.assert_close(tensors(case(x)), tuple(parts), **self.batch_tolerance)
 
     def test_empty_batch(self, case: LayerCase) -> None:
@@ -126,7 +138,8 @@ class LayerContract:
             assert all(float(t.detach().float().abs().max()) < 1e-6 for t in y)
 
     def test_gradcheck(self, case: LayerCase) -> None:
-        """At generic points, where no maximum, threshold or suppression switches within the step."""
+        """At generic points, where no maximum, threshold or suppression switches within the
+        step."""
         x = case.inputs(1, 9, seed=3, dtype=torch.float64)
         generator = torch.Generator().manual_seed(0)
         x = x + 0.05 * torch.rand(x.shape, generator=generator, dtype=torch.float64) * (x > 0)
@@ -135,11 +148,16 @@ class LayerContract:
         weights = self.gradcheck_weights(case, x)
 
         def function(values: Tensor) -> Tensor:
-            return case.function(x.index_put(index, values), **case.options, **case.gradcheck_options) * weights
+            return (
+                case.function(x.index_put(index, values), **case.options, **case.gradcheck_options)
+                * weights
+            )
 
         assert float(function(x[index]).abs().max()) > 0.0
         values = x[index].requires_grad_()
-        assert torch.autograd.gradcheck(function, values, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
+        assert torch.autograd.gradcheck(
+            function, values, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True
+        )
 
     def gradcheck_weights(self, case: LayerCase, x: Tensor) -> float | Tensor:
         """Factor on the output that excludes pixels where it is not differentiable."""
@@ -147,7 +165,9 @@ class LayerContract:
 
     @pytest.mark.filterwarnings("ignore:There is a performance drop")
     @pytest.mark.parametrize("block", [None, SIZE**2])
-    def test_function_transforms(self, case: LayerCase, block: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_function_transforms(
+        self, case: LayerCase, block: int | None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """vmap, reverse and forward derivatives; also of batches that are processed in blocks."""
         x = case.inputs(2, SIZE, dtype=torch.float64)
         halved = case(0.5 * x)
@@ -155,12 +175,15 @@ class LayerContract:
         def loss(x: Tensor) -> Tensor:
             return case(x).square().sum()
 
-        want, y = torch.autograd.grad(loss(x.requires_grad_()), x)[0], case(x).detach()
+        want = torch.autograd.grad(loss(x.requires_grad_()), x)[0]
+        y = case(x).detach()
         x = x.detach()
         direction = torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
         if block is not None:
             monkeypatch.setattr("curvireg_torch.filters.operations.BLOCK_PIXELS", block)
-        torch.testing.assert_close(torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved]))
+        torch.testing.assert_close(
+            torch.func.vmap(case)(torch.stack([x, 0.5 * x])), torch.stack([y, halved])
+        )
         torch.testing.assert_close(torch.func.grad(loss)(x), want)
         _, slope = torch.func.jvp(loss, (x,), (direction,))
         torch.testing.assert_close(slope, (want * direction).sum())
@@ -170,7 +193,10 @@ class LayerContract:
 
     def test_bad_input_is_rejected(self, case: LayerCase) -> None:
         x = case.inputs(1, SIZE)
-        wrong = [(x[0], "expected shape"), (x.byte(), r"expected a floating dtype, got torch\.uint8")]
+        wrong = [
+            (x[0], "expected shape"),
+            (x.byte(), r"expected a floating dtype, got torch\.uint8"),
+        ]
         if case.accepts_colour:
             wrong.append((x.repeat(1, 4, 1, 1), "got"))
         for bad, message in wrong:
@@ -191,7 +217,9 @@ class LayerContract:
     @pytest.mark.slow
     def test_export_with_any_batch(self, case: LayerCase) -> None:
         batch = torch.export.Dim("batch", min=1, max=64)
-        program = torch.export.export(case.twin(), (case.inputs(3, SIZE),), dynamic_shapes=({0: batch},))
+        program = torch.export.export(
+            case.twin(), (case.inputs(3, SIZE),), dynamic_shapes=({0: batch},)
+        )
         for n in (2, 5):
             x = case.inputs(n, SIZE, seed=7)
             assert self.agrees(program.module()(x), case(x))

@@ -14,12 +14,16 @@ from tests._support.scenes import learned_registrar, scene, truck_bank, write_ph
 from tests.registration.test_several import EASY, rig_of
 
 CAMERA = ["260", "260", "119.5", "89.5"]
-RESULTS = [*("status", "message", "confidence", "reliable"), *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
+RESULTS = [
+    *("status", "message", "confidence", "reliable"),
+    *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+]
 RESULTS += ["tx", "ty", "tz"]
 
 
 def write_files(folder):
-    """Three photographs, files that are none, a mesh, and two banks: "truck", without confidence, and "learned"."""
+    """Three photographs, files that are none, a mesh, and two banks: "truck", without confidence,
+    and "learned"."""
     (folder / "photos").mkdir()
     for seed in range(3):
         write_photo(folder / "photos" / f"{seed}.png", scene(seed)[0])
@@ -52,31 +56,45 @@ def bop_poses(path):
     for row in rows:
         row |= {name: int(row[name]) for name in ("scene_id", "im_id", "obj_id")}
         row |= {name: float(row[name]) for name in ("score", "time")}
-        row |= {"R": np.array(row["R"].split(), float).reshape(3, 3), "t": np.array(row["t"].split(), float)}
+        row |= {
+            "R": np.array(row["R"].split(), float).reshape(3, 3),
+            "t": np.array(row["t"].split(), float),
+        }
     return rows
 
 
 def check_pose(document, T, degrees, share):
-    """Check the pose of a result, or of a row of results.csv: its rotation error, and that of the translation, as a
-    share of the distance."""
+    """Check the pose of a result, or of a row of results.csv: its rotation error, and that of the
+    translation, as a share of the distance."""
     if "r11" in document:
         R = [[float(document[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)]
-        document = {"rotation": R, "translation": [float(document[name]) for name in ("tx", "ty", "tz")]}
-    R, t = (torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation"))
+        document = {
+            "rotation": R,
+            "translation": [float(document[name]) for name in ("tx", "ty", "tz")],
+        }
+    R, t = (
+        torch.tensor(document[name], dtype=torch.float64) for name in ("rotation", "translation")
+    )
     assert float(rotation_error(R, T[:3, :3])) < degrees
     assert float((t - T[:3, 3]).norm() / T[:3, 3].norm()) < share
 
 
 def lines(folder):
-    return [json.loads(line) for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()]
+    return [
+        json.loads(line)
+        for line in (folder / "results.jsonl").read_text(encoding="utf-8").splitlines()
+    ]
 
 
 def write_rig_photos(folder):
-    """Write 0.png to 2.png; returns the rows of their rig: photo, box, camera, rotation and translation."""
+    """Write 0.png to 2.png; returns the rows of their rig: photo, box, camera, rotation and
+    translation."""
     rows = []
     for k, (image, box, T) in enumerate(zip(*rig_of(EASY), strict=True)):
         write_photo(folder / f"{k}.png", image)
-        rows.append([f"{k}.png", *box.tolist(), *CAMERA, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()])
+        rows.append(
+            [f"{k}.png", *box.tolist(), *CAMERA, *T[:3, :3].flatten().tolist(), *T[:3, 3].tolist()]
+        )
     return rows
 
 
@@ -96,9 +114,12 @@ def write_colmap(folder, rows, points=""):
 
 
 def write_bop_scene(folder, rows, objects, boxes):
-    """Write the three files of a scene, with the objects of each photograph and the boxes of all."""
+    """Write the three files of a scene, with the objects of each photograph and the boxes of
+    all."""
     K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
-    cameras = {k: {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]} for k, row in enumerate(rows)}
+    cameras = {
+        k: {"cam_K": K, "cam_R_w2c": row[9:18], "cam_t_w2c": row[18:]} for k, row in enumerate(rows)
+    }
     truth = {k: [{"obj_id": number} for number in some] for k, some in enumerate(objects)}
     info = {k: [{"bbox_obj": box} for box in boxes] for k in range(len(rows))}
     for name, content in (("camera", cameras), ("gt", truth), ("gt_info", info)):

@@ -1,4 +1,5 @@
-"""Tiny dataset trees of the real shape, with every defect that a real tree may have. Nothing here is photographed."""
+"""Tiny dataset trees of the real shape, with every defect that a real tree may have. Nothing here
+is photographed."""
 
 import json
 from pathlib import Path
@@ -15,7 +16,9 @@ HALF = 0.25  # half the edge of the cube that all meshes are
 def write_image(path: Path, size: tuple[int, int] = (60, 80), seed: int = 0) -> None:
     """A photograph of noise, ``size`` = (H, W)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8))
+    assert cv2.imwrite(
+        str(path), np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+    )
 
 
 def write_mesh(path: Path, half: float = HALF) -> None:
@@ -26,9 +29,28 @@ def write_mesh(path: Path, half: float = HALF) -> None:
 
 def pascal_object(category: str, **changes: Any) -> dict[str, Any]:
     """One entry of ``record.objects``; ``viewpoint`` is merged, other changes replace."""
-    view = {"azimuth_coarse": 45.0, "elevation_coarse": 15.0, "azimuth": 30.0, "elevation": 10.0, "distance": 40.0}
-    view |= {"focal": 1.0, "px": 41.0, "py": 31.0, "theta": -5.0, "error": np.nan, "viewport": 3000.0}
-    entry: dict[str, Any] = {"class": category, "view": "", "truncated": 0, "occluded": 0, "difficult": 0}
+    view = {
+        "azimuth_coarse": 45.0,
+        "elevation_coarse": 15.0,
+        "azimuth": 30.0,
+        "elevation": 10.0,
+        "distance": 40.0,
+    }
+    view |= {
+        "focal": 1.0,
+        "px": 41.0,
+        "py": 31.0,
+        "theta": -5.0,
+        "error": np.nan,
+        "viewport": 3000.0,
+    }
+    entry: dict[str, Any] = {
+        "class": category,
+        "view": "",
+        "truncated": 0,
+        "occluded": 0,
+        "difficult": 0,
+    }
     entry |= {"bbox": np.array([[11.0, 6.0, 71.0, 56.0]]), "cad_index": 1}
     entry["anchors"] = {"left_front": {"location": np.empty((0, 0)), "status": 1}}
     viewpoint = changes.pop("viewpoint", {})
@@ -55,8 +77,10 @@ def write_record(path: Path, objects: list[dict[str, Any]]) -> None:
 
 
 def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
-    """A tree of cars and sofas in the layout of release 1.1; returns how often each reason must be counted."""
-    annotations, images = root / "Annotations" / f"car_{part}", root / "Images" / f"car_{part}"
+    """A tree of cars and sofas in the layout of release 1.1; returns how often each reason must be
+    counted."""
+    annotations = root / "Annotations" / f"car_{part}"
+    images = root / "Images" / f"car_{part}"
     suffix = ".jpg" if part == "pascal" else ".JPEG"
     unset = {"azimuth": 0.0, "elevation": 0.0, "distance": 0.0, "theta": 0.0}
     empty = np.empty((0, 0))
@@ -65,11 +89,15 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
         "2008_000002": [
             pascal_object("sofa"),
             pascal_object("car", truncated=1, viewpoint={"azimuth": 200.0}),
-            pascal_object("car", occluded=1, difficult=1, viewpoint={"azimuth": 300.0, "theta": 12.0}),
+            pascal_object(
+                "car", occluded=1, difficult=1, viewpoint={"azimuth": 300.0, "theta": 12.0}
+            ),
         ],
         "2008_000003": [
             pascal_object("car", viewpoint=unset),
-            pascal_object("car", viewpoint={"azimuth": empty, "elevation": empty, "distance": empty}),
+            pascal_object(
+                "car", viewpoint={"azimuth": empty, "elevation": empty, "distance": empty}
+            ),
             pascal_object("car", viewpoint=empty),
             pascal_object("car", bbox=np.array([[20.0, 20.0, 20.0, 40.0]])),
             pascal_object("car", bbox=np.array([[20.0, 20.0, np.nan, 40.0]])),
@@ -83,7 +111,8 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
     for seed, (name, objects) in enumerate(records.items()):
         write_record(annotations / f"{name}.mat", objects)
         write_image(images / (name + suffix), seed=seed)
-    for name in ("2008_000005", "2008_000006", "2008_000007", "2008_000008"):  # 6: without annotation
+    # 6: without annotation
+    for name in ("2008_000005", "2008_000006", "2008_000007", "2008_000008"):
         write_image(images / (name + suffix))
     annotations.joinpath("2008_000005.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(200, b"\xff"))
     whole = annotations.joinpath("2008_000001.mat").read_bytes()
@@ -107,14 +136,25 @@ def write_pascal3d(root: Path, part: str = "pascal") -> dict[str, int]:
         lists.joinpath("car_imagenet_val.txt").write_text("\n".join(cars) + "\n")
         lists.joinpath("sofa_imagenet_val.txt").write_text("2008_000002\n")
     reasons = {"other_class": 3, "coarse_viewpoint": 2, "no_viewpoint": 1, "bad_box": 3}
-    return reasons | {"missing_mesh": 2, "corrupt_annotation": 3, "missing_annotation": 1, "missing_image": 1}
+    return reasons | {
+        "missing_mesh": 2,
+        "corrupt_annotation": 3,
+        "missing_annotation": 1,
+        "missing_image": 1,
+    }
 
 
 def write_bop(root: Path) -> dict[str, int]:
-    """Two scenes (rgb and grey) of cubes in the BOP layout; returns how often each reason must be counted."""
+    """Two scenes (rgb and grey) of cubes in the BOP layout; returns how often each reason must be
+    counted."""
     R = [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0]
     pose = {"cam_R_m2c": R, "cam_t_m2c": [1.0, 2.0, 400.0], "obj_id": 1}
-    info = {"bbox_obj": [-5, 4, 30, 20], "bbox_visib": [0, 4, 25, 20], "px_count_all": 500, "visib_fract": 0.8}
+    info = {
+        "bbox_obj": [-5, 4, 30, 20],
+        "bbox_visib": [0, 4, 25, 20],
+        "px_count_all": 500,
+        "visib_fract": 0.8,
+    }
     K = {"cam_K": [300.0, 0.0, 40.0, 0.0, 310.0, 30.0, 0.0, 0.0, 1.0], "depth_scale": 1.0}
     hidden = {**info, "bbox_visib": [-1, -1, -1, -1], "visib_fract": 0.0}
     one = root / "test" / "000001"
@@ -123,7 +163,11 @@ def write_bop(root: Path) -> dict[str, int]:
     three = [pose, {**pose, "obj_id": 2}, {**pose, "cam_t_m2c": [9.0, 2.0, 400.0]}]
     ground_truth = {"0": three, "3": bad, **{key: [pose] for key in "45x"}}
     outside = {**info, "bbox_obj": [-1, -1, -1, -1]}
-    infos = {"0": [info, hidden, {**info, "visib_fract": 0.9}], "3": [info] * 5 + [outside, info], "4": [info]}
+    infos = {
+        "0": [info, hidden, {**info, "visib_fract": 0.9}],
+        "3": [info] * 5 + [outside, info],
+        "4": [info],
+    }
     cameras = dict.fromkeys(("0", "3", "4"), K)  # 5: without camera
     for name, content in (("gt", ground_truth), ("camera", cameras), ("gt_info", infos)):
         _write_json(one / f"scene_{name}.json", content)
@@ -140,9 +184,15 @@ def write_bop(root: Path) -> dict[str, int]:
     root.joinpath("test", "000004").mkdir()
     for obj_id in (1, 2, 9):
         write_mesh(root / "models" / f"obj_{obj_id:06d}.ply", half=25.0)
-    entry = {"diameter": 86.6, "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+    entry = {
+        "diameter": 86.6,
+        "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]],
+    }
     _write_json(root / "models" / "models_info.json", {"1": entry, "2": {"diameter": 86.6}})
-    _write_json(root / "camera.json", {"fx": 300.0, "fy": 310.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60})
+    _write_json(
+        root / "camera.json",
+        {"fx": 300.0, "fy": 310.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60},
+    )
     targets = [(1, 0, 1), (2, 7, 1), (1, 6, 1)]  # the last is nowhere
     _write_json(
         root / "test_targets_bop19.json",
@@ -153,14 +203,15 @@ def write_bop(root: Path) -> dict[str, int]:
 
 
 def write_web(root: Path) -> dict[str, int]:
-    """Two usable objects and two defective folders; returns how often each reason must be counted."""
+    """Two usable objects and two defective folders; returns how often each reason must be
+    counted."""
     header = "image,x0,y0,x1,y1,azimuth,elevation,theta,distance\n"
     write_mesh(root / "cup" / "mesh.off")
     for i, size in enumerate([(60, 80), (50, 50)]):
         write_image(root / "cup" / f"{i}.jpg", size, seed=i)
     lines = """0.jpg,10,5,70,55,30,10,-5,3 1.jpg,10,5,40,45,,,, 1.jpg,10,5,40,45,90,0,, 2.jpg,10,5,40,45,,,,
         0.jpg,10,5,10,45,,,, 0.jpg,,,,,,,, 0.jpg,a,5,10,45,,,, 0.jpg,1,5,10,45,30,,, 0.jpg,1,5
-        ../cup/0.jpg,10,5,40,45,,,, 0.jpg,1,5,inf,45,,,,"""
+        ../cup/0.jpg,10,5,40,45,,,, 0.jpg,1,5,inf,45,,,,"""  # noqa: E501
     table = header + "\n".join(lines.split()) + "\n"
     root.joinpath("cup", "views.csv").write_text("\ufeff" + table, encoding="utf-8")
     write_mesh(root / "shoe" / "mesh.ply")
@@ -170,7 +221,13 @@ def write_web(root: Path) -> dict[str, int]:
     write_mesh(root / "no_table" / "mesh.off")
     write_mesh(root / "other_table" / "mesh.off")
     root.joinpath("other_table", "views.csv").write_text("image,x,y\n")
-    return {"missing_image": 1, "bad_box": 2, "corrupt_annotation": 6, "missing_mesh": 1, "missing_annotation": 1}
+    return {
+        "missing_image": 1,
+        "bad_box": 2,
+        "corrupt_annotation": 6,
+        "missing_mesh": 1,
+        "missing_annotation": 1,
+    }
 
 
 def _write_json(path: Path, content: Any) -> None:

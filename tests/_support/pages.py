@@ -25,16 +25,22 @@ STEP = re.compile(
 
 
 def steps(page: Path) -> list[tuple[str, str]]:
-    """The steps of a page in order: ("python", a block) and ("command", a line): lines of bash blocks, lines of plain
-    blocks that start with a program, and inline commands that have an ``--out`` or run a script."""
+    """The steps of a page in order: ("python", a block) and ("command", a line): lines of bash
+    blocks, lines of plain blocks that start with a program, and inline commands that have an
+    ``--out`` or run a script."""
     found: list[tuple[str, str]] = []
     for block in STEP.finditer(page.read_text(encoding="utf-8")):
-        kind, code = block["kind"], block["code"]
+        kind = block["kind"]
+        code = block["code"]
         if kind == "python":
             found.append(("python", re.sub(rf"^{block['indent']}", "", code, flags=re.MULTILINE)))
         elif kind in ("bash", "", None):
             lines = (code or block["inline"]).replace("\\\n", " ").splitlines()
-            found += [("command", s.strip()) for s in lines if split_command(s) and (kind or re.match(PROGRAM, s))]
+            found += [
+                ("command", s.strip())
+                for s in lines
+                if split_command(s) and (kind or re.match(PROGRAM, s))
+            ]
     return found
 
 

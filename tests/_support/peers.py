@@ -15,7 +15,8 @@ from curvireg_torch import render_depth
 
 
 def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: Tensor) -> None:
-    """Write ``megapose``, ``foundationpose``, ``bop``, detections and masks of a photograph into ``folder``.
+    """Write ``megapose``, ``foundationpose``, ``bop``, detections and masks of a photograph into
+    ``folder``.
 
     Args:
         folder: for the folders.
@@ -41,7 +42,10 @@ def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: 
     in_mm.export(megapose / "meshes" / "truck" / "truck.ply")
     cv2.imwrite(str(megapose / "image_rgb.png"), picture)
     _write(megapose / "camera_data.json", {"K": K.tolist(), "resolution": [H, W]})
-    _write(megapose / "inputs" / "object_data.json", [{"label": "truck", "bbox_modal": [x0, y0, x1, y1]}])
+    _write(
+        megapose / "inputs" / "object_data.json",
+        [{"label": "truck", "bbox_modal": [x0, y0, x1, y1]}],
+    )
     pose = [quaternion, T[:3, 3].tolist()]
     _write(megapose / "outputs" / "object_data.json", [{"label": "truck", "TWO": pose}])
 
@@ -57,13 +61,22 @@ def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: 
     scene = folder / "bop" / "test" / "000001"
     (scene / "rgb").mkdir(parents=True)
     (folder / "bop" / "models").mkdir()
-    shutil.copy(megapose / "meshes" / "truck" / "truck.ply", folder / "bop" / "models" / "obj_000001.ply")
+    shutil.copy(
+        megapose / "meshes" / "truck" / "truck.ply", folder / "bop" / "models" / "obj_000001.ply"
+    )
     cv2.imwrite(str(scene / "rgb" / "000003.png"), picture)
-    entry = {"cam_R_m2c": T[:3, :3].flatten().tolist(), "cam_t_m2c": (1000 * T[:3, 3]).tolist(), "obj_id": 1}
+    entry = {
+        "cam_R_m2c": T[:3, :3].flatten().tolist(),
+        "cam_t_m2c": (1000 * T[:3, 3]).tolist(),
+        "obj_id": 1,
+    }
     _write(scene / "scene_gt.json", {"3": [entry]})
     _write(scene / "scene_camera.json", {"3": {"cam_K": K.flatten().tolist(), "depth_scale": 1.0}})
     found = {"scene_id": 1, "image_id": 3, "category_id": 1, "bbox": bbox, "score": 0.9}
-    _write(folder / "bop" / "detections.json", [found, {**found, "category_id": 2, "bbox": [0, 0, 40, 40]}])
+    _write(
+        folder / "bop" / "detections.json",
+        [found, {**found, "category_id": 2, "bbox": [0, 0, 40, 40]}],
+    )
 
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
     in_opengl = flip @ T.numpy()
@@ -77,7 +90,10 @@ def write_peers(folder: Path, photo: Path, mesh: trimesh.Trimesh, T: Tensor, K: 
     names = ("1", "2")
     for name in names:
         (labels / f"{name}.txt").write_text(f"0 {line}\n")
-    _write(folder / "boxes.json", [{"image_id": name, "category_id": 1, "bbox": bbox, "score": 0.8} for name in names])
+    _write(
+        folder / "boxes.json",
+        [{"image_id": name, "category_id": 1, "bbox": bbox, "score": 0.8} for name in names],
+    )
 
 
 def _write(path: Path, content: Any) -> None:

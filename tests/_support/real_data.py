@@ -8,7 +8,11 @@ import pytest
 
 def real_data(name: str) -> Path:
     """The folder ``name`` of the shared data; skips the test where it is absent."""
-    root = Path(os.environ.get("CURVIREG_SHARED_DATA") or Path(__file__).parents[3] / "shared" / "data")
+    root = Path(
+        os.environ.get("CURVIREG_SHARED_DATA") or Path(__file__).parents[3] / "shared" / "data"
+    )
     if not (root / name).is_dir():
-        pytest.skip(f"no real photographs: {name} is neither in $CURVIREG_SHARED_DATA nor in ../shared/data")
+        pytest.skip(
+            f"no real photographs: {name} is neither in $CURVIREG_SHARED_DATA nor in ../shared/data"
+        )
     return root / name

@@ -21,7 +21,9 @@ CAMERA = camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
 @cache
 def truck_bank() -> ViewBank:
     views = sample_views(azimuth_step=15, elevations=[0, 15, 30, 45, 60])
-    return ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=96, progress=False)
+    return ViewBank.build(
+        example_mesh(), views, pipeline=PRESETS["classical"], image_size=96, progress=False
+    )
 
 
 @cache
@@ -47,7 +49,8 @@ def errors(result: Any, T: Tensor) -> tuple[float, float]:
 
 
 def sequence(count: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to frame."""
+    """Photographs, boxes and poses: 4 degrees about a vertical axis and 2 % nearer from frame to
+    frame."""
     T = scene(0)[2]
     step = rotation_from_axis_angle(torch.tensor([0.0, 0.07, 0.0], dtype=torch.float64))
     frames = []

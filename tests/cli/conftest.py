@@ -14,7 +14,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def refused(capsys):
-    """Check that a command was refused with code 2 and one line that contains these texts; returns the line."""
+    """Check that a command was refused with code 2 and one line that contains these texts; returns
+    the line."""
 
     def check(code, *messages):
         (error,) = capsys.readouterr().err.splitlines()
@@ -28,13 +29,16 @@ def refused(capsys):
 
 @pytest.fixture
 def register_one(folder, tmp_path):
-    """Run ``curvireg register`` on one photograph, by default with its box; results go to ``tmp_path / "out"``."""
+    """Run ``curvireg register`` on one photograph, by default with its box; results go to
+    ``tmp_path / "out"``."""
 
     def run(*words, photo="photos/0.png", mesh="truck.safetensors", box=None):
         box = box_of(0) if box is None else box
         boxes = ["--box", *box] if box else []
         out = ["--out", str(tmp_path / "out"), "--quiet"]
-        return main(["register", str(folder / photo), str(folder / mesh), *boxes, *out, *map(str, words)])
+        return main(
+            ["register", str(folder / photo), str(folder / mesh), *boxes, *out, *map(str, words)]
+        )
 
     return run
 
@@ -50,6 +54,8 @@ def register(tmp_path):
     """Run ``curvireg register`` without refinement; results go to ``tmp_path / out``."""
 
     def run(*words, out="out"):
-        return main(["register", *map(str, words), "--out", str(tmp_path / out), "--quiet", "--no-refine"])
+        return main(
+            ["register", *map(str, words), "--out", str(tmp_path / out), "--quiet", "--no-refine"]
+        )
 
     return run

@@ -18,7 +18,8 @@ from tests.registration.test_cameras_and_masks import distorted
 
 @pytest.fixture(scope="module", autouse=True)
 def _exif_photographs(folder):
-    """The scenes have a focal length of 260 px at 240 x 180: 37.5 mm over the diagonal, 49.55 degrees across."""
+    """The scenes have a focal length of 260 px at 240 x 180: 37.5 mm over the diagonal, 49.55
+    degrees across."""
     cv2.imwrite(str(folder / "exif.png"), cv2.imread(str(folder / "photos" / "0.png")))
     with_exif(folder / "exif.png", exif(1, 38))
 
@@ -36,7 +37,9 @@ def register(folder, capsys):
     return run
 
 
-def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_the_focal_length(register):
+def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_the_focal_length(
+    register,
+):
     known, _ = register("photos/0.png", "--camera", *CAMERA)
     assert known["inputs"]["camera_source"] == "given"
     assert known["covariance"] is not None
@@ -45,14 +48,23 @@ def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_th
     assert guessed["inputs"]["camera"] == pytest.approx([focal, focal, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "exif"
     assert (guessed["camera_source"], known["camera_source"]) == ("exif", "given")
-    assert guessed["standard_deviations"]["translation"][2] > known["standard_deviations"]["translation"][2]
+    assert (
+        guessed["standard_deviations"]["translation"][2]
+        > known["standard_deviations"]["translation"][2]
+    )
     assert 0.0 < guessed["camera"]["focal_deviation"] <= 0.05
     assert guessed["camera"]["matrix"][0][0] == pytest.approx(focal, rel=0.2)
     assert "camera: from the file's EXIF, 38 mm" in printed
     unasked, _ = register("exif.png")
-    assert (unasked["camera"], unasked["translation"]) == (guessed["camera"], guessed["translation"])
+    assert (unasked["camera"], unasked["translation"]) == (
+        guessed["camera"],
+        guessed["translation"],
+    )
     check_pose(guessed, scene(0)[2], 15.0, 0.1)
-    guessed, printed = register("photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260))))  # horizontal
+    # horizontal
+    guessed, printed = register(
+        "photos/0.png", "--fov", str(2 * math.degrees(math.atan(120 / 260)))
+    )
     assert guessed["inputs"]["camera"] == pytest.approx([260, 260, 119.5, 89.5])
     assert guessed["inputs"]["camera_source"] == "fov"
     assert "camera: field of view given, focal length 1." in printed
@@ -61,14 +73,20 @@ def test_guessed_cameras_give_a_translation_whose_covariance_has_the_error_of_th
 
 def test_without_a_camera_the_focal_length_is_estimated(register):
     found, printed = register("photos/0.png")
-    assert (found["camera_source"], found["inputs"]["camera_source"], found["inputs"]["camera"]) == (
+    assert (
+        found["camera_source"],
+        found["inputs"]["camera_source"],
+        found["inputs"]["camera"],
+    ) == (
         "estimated",
         None,
         None,
     )
     assert len(found["translation"]) == 3
     camera = found["camera"]
-    assert found["camera"]["matrix"][0][0] == pytest.approx(260.0, rel=3 * camera["focal_deviation"])
+    assert found["camera"]["matrix"][0][0] == pytest.approx(
+        260.0, rel=3 * camera["focal_deviation"]
+    )
     assert "camera: focal length estimated" in printed
     assert "the distance is proportional to it" in printed
     similar, _ = register("photos/0.png", "--mesh-is", "similar")
@@ -77,8 +95,19 @@ def test_without_a_camera_the_focal_length_is_estimated(register):
 
 def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
     rows = [["exif.png", *CAMERA], ["exif.png", *[""] * 4], ["photos/0.png", *[""] * 4]]
-    path = written(folder / "cameras.csv", "photo,fx,fy,cx,cy,x0,y0,x1,y1", *[[*row, *box_of(0)] for row in rows])
-    words = ["register", "--list", str(path), str(folder / "truck.safetensors"), "--quiet", "--no-refine"]
+    path = written(
+        folder / "cameras.csv",
+        "photo,fx,fy,cx,cy,x0,y0,x1,y1",
+        *[[*row, *box_of(0)] for row in rows],
+    )
+    words = [
+        "register",
+        "--list",
+        str(path),
+        str(folder / "truck.safetensors"),
+        "--quiet",
+        "--no-refine",
+    ]
     assert main([*words, "--out", str(tmp_path), "--camera", "exif"]) == 0
     capsys.readouterr()
     known, guessed, failed = lines(tmp_path)
@@ -92,9 +121,16 @@ def test_guesses_apply_to_rows_without_a_camera(folder, tmp_path, capsys):
 
 @pytest.fixture(scope="module")
 def lens(folder):
-    """A photograph that a lens with distortion took, its calibration and mask; returns its box and the true pose."""
-    camera = Camera(camera_matrix(260.0, 260.0, 20.0, 30.0), (-0.25, 0.1, 0.0, 0.0, 0.0), size=(180, 240))
-    calibration = {"mtx": camera.matrix.tolist(), "dist": camera.distortion, "image_size": [240, 180]}
+    """A photograph that a lens with distortion took, its calibration and mask; returns its box and
+    the true pose."""
+    camera = Camera(
+        camera_matrix(260.0, 260.0, 20.0, 30.0), (-0.25, 0.1, 0.0, 0.0, 0.0), size=(180, 240)
+    )
+    calibration = {
+        "mtx": camera.matrix.tolist(),
+        "dist": camera.distortion,
+        "image_size": [240, 180],
+    }
     _, photo, box, mask, T = distorted(camera, 1)
     write_photo(folder / "distorted.png", photo)
     cv2.imwrite(str(folder / "mask.png"), (255 * mask).round().byte().numpy())
@@ -112,7 +148,11 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys)
     check_pose(document, T, 3.0, 0.03)
     camera = document["camera"]
     assert document["covariance"] is not None
-    assert (camera["distortion"][0], camera["size"], document["inputs"]["camera_source"]) == (-0.25, [180, 240], "file")
+    assert (camera["distortion"][0], camera["size"], document["inputs"]["camera_source"]) == (
+        -0.25,
+        [180, 240],
+        "file",
+    )
     assert document["inputs"]["box"] != [float(v) for v in box]
     assert np.array(document["T_cam_from_model"])[:3, 3].tolist() == document["translation"]
     assert "frame_id: camera_optical_frame" in (out / "pose.yaml").read_text()
@@ -120,10 +160,21 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys)
 
 def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
     box, T = lens
-    rows = [["distorted.png", *box, "cam.json", ""], ["distorted.png", *[""] * 4, "cam.json", "mask.png"]]
+    rows = [
+        ["distorted.png", *box, "cam.json", ""],
+        ["distorted.png", *[""] * 4, "cam.json", "mask.png"],
+    ]
     rows += [["distorted.png", *box, "none.yaml", ""], ["distorted.png", *box, "", "none.png"]]
     path = written(folder / "calibrated.csv", "photo,x0,y0,x1,y1,camera,mask", *rows)
-    words = ["register", "--list", str(path), str(folder / "learned.safetensors"), "--quiet", "--out", str(tmp_path)]
+    words = [
+        "register",
+        "--list",
+        str(path),
+        str(folder / "learned.safetensors"),
+        "--quiet",
+        "--out",
+        str(tmp_path),
+    ]
     assert main([*words, "--strict"]) == SOME_FAILED
     boxed, masked, *failed = lines(tmp_path)
     for row in (boxed, masked):
@@ -135,5 +186,15 @@ def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):
 
 @pytest.mark.parametrize(("bank", "code"), [("learned", 0), ("truck", NONE_RELIABLE)])
 def test_strict_tells_by_the_exit_code_whether_a_result_is_reliable(folder, tmp_path, bank, code):
-    files = [str(folder / "photos" / "0.png"), str(folder / f"{bank}.safetensors"), "--box", *box_of(0)]
-    assert main(["register", *files, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet", "--strict"]) == code
+    files = [
+        str(folder / "photos" / "0.png"),
+        str(folder / f"{bank}.safetensors"),
+        "--box",
+        *box_of(0),
+    ]
+    assert (
+        main(
+            ["register", *files, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet", "--strict"]
+        )
+        == code
+    )

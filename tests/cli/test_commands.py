@@ -1,4 +1,5 @@
-"""``curvireg demo``, ``bank``, ``cache`` and ``plot``; and the wrong inputs of scripts/robustness/wrong_inputs.txt."""
+"""``curvireg demo``, ``bank``, ``cache`` and ``plot``; and the wrong inputs of
+scripts/robustness/wrong_inputs.txt."""
 
 import gc
 import json
@@ -38,14 +39,19 @@ def test_the_process_seldom_looks_for_cycles_and_leaves_them_at_exit(monkeypatch
 
 def test_bank_is_registered_to(folder, register_one, tmp_path, capsys):
     out = tmp_path / "new.safetensors"
-    assert main(["bank", str(folder / "truck.ply"), "--out", str(out), "--pose", "upright", "--quiet"]) == 0
+    assert (
+        main(["bank", str(folder / "truck.ply"), "--out", str(out), "--pose", "upright", "--quiet"])
+        == 0
+    )
     assert "288 views" in capsys.readouterr().out
     assert register_one("--no-refine", mesh=out) == 0
 
 
 def test_cache_names_meshes_and_clears_banks(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
-    pipeline = replace(PRESETS["fast"], views=ViewPolicy(pose="upright", azimuth_step=180.0, elevations=(10.0,)))
+    pipeline = replace(
+        PRESETS["fast"], views=ViewPolicy(pose="upright", azimuth_step=180.0, elevations=(10.0,))
+    )
     cached_bank(load_mesh(folder / "truck.ply"), pipeline=pipeline, progress=False)
     (tmp_path / "banks" / f"bank-{'0' * 32}.safetensors").write_bytes(b"cut")
     assert main(["cache"]) == 0
@@ -83,12 +89,18 @@ def test_main_prints_our_warnings_and_not_those_of_numpy(monkeypatch, capsys):
 def test_demo_files_agree_with_its_truth(tmp_path, monkeypatch, capsys):
     """The true pose projects the mesh into the box, and the errors are those of the result."""
     options = {}
-    monkeypatch.setattr("curvireg_torch.matching.cached_bank", lambda _, **given: options.update(given) or truck_bank())
+    monkeypatch.setattr(
+        "curvireg_torch.matching.cached_bank",
+        lambda _, **given: options.update(given) or truck_bank(),
+    )
     monkeypatch.setattr(RegisterOptions, "open_pipeline", lambda _: truck_bank().pipeline)
     assert main(["demo", "--out", str(tmp_path), "--quiet"]) == 0
     assert options["progress"] is False
     result = json.loads((tmp_path / "result.json").read_text())
-    R, t = (torch.tensor(result["truth"][name], dtype=torch.float64) for name in ("rotation", "translation"))
+    R, t = (
+        torch.tensor(result["truth"][name], dtype=torch.float64)
+        for name in ("rotation", "translation")
+    )
     estimate = torch.tensor(result["rotation"], dtype=torch.float64)
     assert result["rotation_error_deg"] == pytest.approx(float(rotation_error(estimate, R)))
     error = (torch.tensor(result["translation"], dtype=torch.float64) - t).norm() / t.norm()
@@ -125,7 +137,12 @@ def test_wrong_inputs_are_named(tmp_path, monkeypatch, capsys):
     wrong = []
     for line, expected in cases(tmp_path):
         try:
-            code = main([*shlex.split(line), *([] if line.startswith(("view", "frobnicate")) else ["--quiet"])])
+            code = main(
+                [
+                    *shlex.split(line),
+                    *([] if line.startswith(("view", "frobnicate")) else ["--quiet"]),
+                ]
+            )
         except SystemExit as stop:  # of argparse
             code = stop.code
         printed = capsys.readouterr().err.splitlines()

@@ -26,7 +26,12 @@ from tests._support.lists import CAMERA, box_of, table, written
 def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     hostile = "<script>alert(1)</script>.png"
     shutil.copy(folder / "photos" / "0.png", folder / "a&b.png")
-    rows = [[hostile, *[""] * 4], ["photos/1.png", *box_of(1)], ["a&b.png", *box_of(0)], ["photos/2.png", *box_of(2)]]
+    rows = [
+        [hostile, *[""] * 4],
+        ["photos/1.png", *box_of(1)],
+        ["a&b.png", *box_of(0)],
+        ["photos/2.png", *box_of(2)],
+    ]
     path = written(folder / "list.csv", "photo,x0,y0,x1,y1", *rows)
     assert register("--list", path, folder / "truck.safetensors") == 0
     out = tmp_path / "out"
@@ -42,27 +47,46 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
         pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', text)
         assert len(pictures) == (row["status"] == "ok")
         for picture in pictures:
-            pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
+            pixels = cv2.imdecode(
+                np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR
+            )
             assert max(pixels.shape) <= sheet.SIDE
     assert "no such file" in figures[-1][1]
 
 
 def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkeypatch):
-    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
+    words = [
+        folder / "photos" / "0.png",
+        folder / "truck.safetensors",
+        "--box",
+        *box_of(0),
+        "--camera",
+        *CAMERA,
+    ]
     assert register(*words) == 0
     found = json.loads((tmp_path / "out" / "result.json").read_text())
-    T = np.diag([1.0, -1.0, -1.0, 1.0]) @ trimesh.load(tmp_path / "out" / "pose.glb").graph["object"][0]
+    T = (
+        np.diag([1.0, -1.0, -1.0, 1.0])
+        @ trimesh.load(tmp_path / "out" / "pose.glb").graph["object"][0]
+    )
     np.testing.assert_allclose(T[:3], np.c_[found["rotation"], found["translation"]], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
     assert register(*words, "--format", "ros") == 0
-    assert {"pose.yaml"} == {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"pose.yaml"} == {"pose.glb", "pose.yaml"} & {
+        path.name for path in (tmp_path / "out").iterdir()
+    }
     assert register(*words) == 0
     assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
 def test_pose_for_ros_is_in_metres(tmp_path):
-    document = {"translation": [1000.0, -2000.0, 500.0], "quaternion": [0.5, 0.1, 0.2, 0.3], "unit": "mm", "views": 9}
+    document = {
+        "translation": [1000.0, -2000.0, 500.0],
+        "quaternion": [0.5, 0.1, 0.2, 0.3],
+        "unit": "mm",
+        "views": 9,
+    }
     write_pose_stamped(tmp_path / "pose.yaml", document)
     text = (tmp_path / "pose.yaml").read_text()
     assert "position: {x: 1, y: -2, z: 0.5}" in text
@@ -77,18 +101,31 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     os.close(reader)
     command = [sys.executable, "-m", "curvireg_torch", "cache"]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment, check=False, timeout=120)
+    done = subprocess.run(
+        command, stdout=writer, stderr=subprocess.PIPE, env=environment, check=False, timeout=120
+    )
     os.close(writer)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
 
 
 @pytest.mark.parametrize("n", [1, 2], ids=["one thread", "two threads"])
-@pytest.mark.parametrize(("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")])
-def test_a_file_that_cannot_be_drawn_costs_no_other(folder, register, tmp_path, monkeypatch, threads, draws, file, n):
+@pytest.mark.parametrize(
+    ("draws", "file"), [("pose_glb", "pose.glb"), ("registration_sheet", "overlay.png")]
+)
+def test_a_file_that_cannot_be_drawn_costs_no_other(
+    folder, register, tmp_path, monkeypatch, threads, draws, file, n
+):
     threads(n)
     fail = Mock(side_effect=InvalidInputError("it cannot be drawn"))
     monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
-    words = [folder / "photos" / "0.png", folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA]
+    words = [
+        folder / "photos" / "0.png",
+        folder / "truck.safetensors",
+        "--box",
+        *box_of(0),
+        "--camera",
+        *CAMERA,
+    ]
     assert register(*words) == 2
     written = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
     assert written == {"result.json", "overlay.png", "pose.glb"} - {file}

@@ -22,7 +22,9 @@ def frames(tmp_path_factory):
     learned_registrar().bank.save(folder / "truck.safetensors")
     (folder / "shots").mkdir()
     scenes = sequence(3)
-    writer = cv2.VideoWriter(str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180))
+    writer = cv2.VideoWriter(
+        str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (240, 180)
+    )
     for k, (image, _, _) in enumerate(scenes):
         pixels = (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy()
         cv2.imwrite(str(folder / "shots" / f"{k}.png"), pixels)
@@ -64,31 +66,49 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     assert "3.png" in rows[3]["message"]
     pictures = [image.int() for _, image in Video(tmp_path / "overlay.mp4")]
     assert [tuple(image.shape) for image in pictures] == [(3, 180, 240)] * 4
-    assert 2 < (pictures[2] - (scenes[2][0] * 255).int()).abs().float().mean() < 30  # contours and codec
+    # contours and codec
+    assert 2 < (pictures[2] - (scenes[2][0] * 255).int()).abs().float().mean() < 30
 
 
-def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(frames, follow, tmp_path, monkeypatch, capsys):
-    boxes, call = [], Follower.__call__
-    monkeypatch.setattr(Follower, "__call__", lambda self, image, box=None: boxes.append(box) or call(self, image, box))
+def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
+    frames, follow, tmp_path, monkeypatch, capsys
+):
+    boxes = []
+    call = Follower.__call__
+    monkeypatch.setattr(
+        Follower,
+        "__call__",
+        lambda self, image, box=None: boxes.append(box) or call(self, image, box),
+    )
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
     assert boxes == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
     assert "3 of 3 believed" in printed.err
-    lines, rows = [json.loads(line) for line in printed.out.splitlines()], table(tmp_path)
-    assert [row["photo"] for row in rows] == [line["frame"] for line in lines] == [f"turn-00000{k}" for k in range(3)]
+    lines = [json.loads(line) for line in printed.out.splitlines()]
+    rows = table(tmp_path)
+    assert (
+        [row["photo"] for row in rows]
+        == [line["frame"] for line in lines]
+        == [f"turn-00000{k}" for k in range(3)]
+    )
     for line, row in zip(lines, rows, strict=True):
         assert (line["status"], line["confidence"]) == (row["status"], float(row["confidence"]))
         assert line["translation"] == [float(row[name]) for name in ("tx", "ty", "tz")]
         assert len(line["quaternion"]) == 4
     assert [line["seconds"] for line in lines] == sorted(line["seconds"] for line in lines)
     assert Video(tmp_path / "overlay.mp4").fps == 25.0
-    assert sorted(path.name for path in tmp_path.iterdir()) == [MARKER, "overlay.mp4", "results.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        MARKER,
+        "overlay.mp4",
+        "results.csv",
+    ]
 
 
 @pytest.mark.parametrize("source", ["0", "rtsp://camera/stream"])
 def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkeypatch, source):
     """A video file in the place of a camera, which delivers as fast as it can."""
-    opened, capture = [], cv2.VideoCapture
+    opened = []
+    capture = cv2.VideoCapture
     file = str(frames[0] / "turn.avi")
     monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or capture(file))
     assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == 0
@@ -106,13 +126,30 @@ def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path
 
 
 @pytest.mark.parametrize(("confidence", "status"), [(None, "ok"), (0.2, "unsure")])
-def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_path, monkeypatch, confidence, status):
+def test_follow_starts_from_a_known_pose_and_its_confidence(
+    frames, follow, tmp_path, monkeypatch, confidence, status
+):
     """No registration confirms a doubtful one here."""
     T = frames[1][0][2]
-    pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist(), "confidence": confidence}
+    pose = {
+        "rotation": T[:3, :3].tolist(),
+        "translation": T[:3, 3].tolist(),
+        "confidence": confidence,
+    }
     (tmp_path / "start.json").write_text(json.dumps(pose))
     monkeypatch.setattr("curvireg_torch.registration.following.RELIABLE", 2.0)
-    assert follow("--camera", *CAMERA, "--start", tmp_path / "start.json", "--out", tmp_path / "out", box=False) == 0
+    assert (
+        follow(
+            "--camera",
+            *CAMERA,
+            "--start",
+            tmp_path / "start.json",
+            "--out",
+            tmp_path / "out",
+            box=False,
+        )
+        == 0
+    )
     rows = table(tmp_path / "out")
     for row, (_, _, T) in zip(rows, frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)
@@ -120,16 +157,20 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(frames, follow, tmp_
 
 
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
-def test_follow_keeps_the_poses_before_an_interruption(frames, follow, tmp_path, monkeypatch, source, code):
+def test_follow_keeps_the_poses_before_an_interruption(
+    frames, follow, tmp_path, monkeypatch, source, code
+):
     """Ctrl-C is the usual end of a live video."""
-    drawn, add = [] if source == "shots" else ["nothing"], OverlayVideo.add
+    drawn = [] if source == "shots" else ["nothing"]
+    add = OverlayVideo.add
 
     def interrupted(*arguments):
         if drawn:
             raise KeyboardInterrupt
         drawn.append(add(*arguments))
 
-    capture, file = cv2.VideoCapture, str(frames[0] / "turn.avi")
+    capture = cv2.VideoCapture
+    file = str(frames[0] / "turn.avi")
     if source == "0":
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
@@ -157,7 +198,9 @@ def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path
     for number in range(1000):
         tally.add({"status": "ok", "rotation": [number]}, 0.5)
     assert len(pickle.dumps(tally)) < 300
-    assert str(tally).startswith("1000 frames: 1000 of 1000 believed, 0 unsure, 0 lost, 0 failed, 2.0 frames per")
+    assert str(tally).startswith(
+        "1000 frames: 1000 of 1000 believed, 0 unsure, 0 lost, 0 failed, 2.0 frames per"
+    )
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
     assert rows == [1, 2, 3, 4]
 

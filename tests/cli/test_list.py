@@ -1,4 +1,5 @@
-"""``curvireg register`` of lists, of photographs that are named in other ways, and of several meshes."""
+"""``curvireg register`` of lists, of photographs that are named in other ways, and of several
+meshes."""
 
 import json
 import sys
@@ -35,14 +36,17 @@ def register_list(folder, register):
 
 
 def test_instances_are_those_of_each_row_without_a_box(register_list, monkeypatch):
-    asked, detect = [], photograph.detect
+    asked = []
+    detect = photograph.detect
 
     def watched(*arguments, instances, **options):
         asked.append(instances)
         return detect(*arguments, instances=instances, **options)
 
     monkeypatch.setattr(photograph, "detect", watched)
-    assert register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
+    assert (
+        register_list("all.csv", HEADER, ["photos/2.png", *EMPTY], words=["--instances", "2"]) == 0
+    )
     assert asked == [2]
 
 
@@ -56,7 +60,10 @@ ROWS = [
     (["NaN box", "photos/0.png", "nan", "1", "95", "9", *EMPTY], "finite"),
     (["no number", "photos/0.png", "1", "1", "9o", "9", *EMPTY], "x1: expected a number, got '9o'"),
     (["part of a box", "photos/0.png", "1", "1", "", "9", *EMPTY], "nothing for x1"),
-    (["part of a camera", "photos/0.png", *box_of(0), "260", "", "119.5", "89.5"], "nothing for fy"),
+    (
+        ["part of a camera", "photos/0.png", *box_of(0), "260", "", "119.5", "89.5"],
+        "nothing for fy",
+    ),
     (["NaN camera", "photos/0.png", *box_of(0), "260", "260", "nan", "89.5"], "finite"),
     (["one colour", "flat.png", *EMPTY, *EMPTY], "one colour"),
     (["short", "photos/0.png"], "2 cells"),
@@ -66,20 +73,33 @@ ROWS = [
 
 
 def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
-    """Columns come in any order and others are passed through; an unusable row does not affect the others."""
+    """Columns come in any order and others are passed through; an unusable row does not affect the
+    others."""
     header = "note,photo,x0,y0,x1,y1,fx,fy,cx,cy"
     names = header.split(",")
     assert register_list("all.csv", header, *(cells for cells, _ in ROWS)) == 0
     out = tmp_path / "out"
     assert (out / "results.csv").read_text().splitlines()[0].split(",") == [*names, *RESULTS]
-    rows, documents = table(out), lines(out)
-    for number, ((cells, expected), row, document) in enumerate(zip(ROWS, rows, documents, strict=True), start=1):
+    rows = table(out)
+    documents = lines(out)
+    for number, ((cells, expected), row, document) in enumerate(
+        zip(ROWS, rows, documents, strict=True), start=1
+    ):
         assert [row[name] for name in names][: len(cells)] == cells
-        assert (document["row"], document["status"], document["message"]) == (number, row["status"], row["message"])
+        assert (document["row"], document["status"], document["message"]) == (
+            number,
+            row["status"],
+            row["message"],
+        )
         if isinstance(expected, str):
             (message,) = row["message"].splitlines()
             assert expected in message
-            assert [row[name] for name in ("status", *RESULTS[2:])] == ["failed", "", "false", *[""] * 12]
+            assert [row[name] for name in ("status", *RESULTS[2:])] == [
+                "failed",
+                "",
+                "false",
+                *[""] * 12,
+            ]
         else:
             assert (row["status"], row["message"]) == ("ok", "")
             assert (row["confidence"], row["reliable"]) == ("", "false"), "not calibrated"
@@ -91,32 +111,64 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
-    assert printed.splitlines()[-1] == f"14 photographs: 4 ok, 10 failed, {reliable} reliable; see {out}/results.csv"
+    assert (
+        printed.splitlines()[-1]
+        == f"14 photographs: 4 ok, 10 failed, {reliable} reliable; see {out}/results.csv"
+    )
 
 
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
     """A mesh that is missing or broken fails only its rows."""
-    opened, load = [], ViewBank.load
-    monkeypatch.setattr(ViewBank, "load", lambda path, **options: opened.append(path.name) or load(path, **options))
+    opened = []
+    load = ViewBank.load
+    monkeypatch.setattr(
+        ViewBank, "load", lambda path, **options: opened.append(path.name) or load(path, **options)
+    )
     content = (folder / "truck.safetensors").read_bytes()
     (folder / "other.safetensors").write_bytes(content)
     (folder / "cut.safetensors").write_bytes(content[:1000])
-    meshes = ["", "other.safetensors", "", "none.ply", "cut.safetensors", "other.safetensors", "cut.safetensors"]
+    meshes = [
+        "",
+        "other.safetensors",
+        "",
+        "none.ply",
+        "cut.safetensors",
+        "other.safetensors",
+        "cut.safetensors",
+    ]
     rows = [[mesh, "photos/0.png", *box_of(0)] for mesh in meshes]
     assert register_list("meshes.csv", f"mesh,{HEADER}", *rows) == 0
     found = table(tmp_path / "out")
-    assert [row["status"] for row in found] == ["ok", "ok", "ok", "failed", "failed", "ok", "failed"]
+    assert [row["status"] for row in found] == [
+        "ok",
+        "ok",
+        "ok",
+        "failed",
+        "failed",
+        "ok",
+        "failed",
+    ]
     assert "none.ply" in found[3]["message"]
     assert "build" in found[4]["message"]
     assert opened == ["truck.safetensors", "other.safetensors", "cut.safetensors"]
     assert register_list("meshes.csv", f"mesh,{HEADER}", *rows, mesh=None, out="no mesh") == 0
     found = table(tmp_path / "no mesh")
-    assert [row["status"] for row in found] == ["failed", "ok", "failed", "failed", "failed", "ok", "failed"]
+    assert [row["status"] for row in found] == [
+        "failed",
+        "ok",
+        "failed",
+        "failed",
+        "failed",
+        "ok",
+        "failed",
+    ]
     assert "no MESH" in found[0]["message"]
 
 
 def test_list_without_any_result_ends_with_code_2(register_list, refused, tmp_path):
-    refused(register_list("none.csv", HEADER, ["none.png", *EMPTY]), "no photograph could be registered")
+    refused(
+        register_list("none.csv", HEADER, ["none.png", *EMPTY]), "no photograph could be registered"
+    )
     assert "no such file" in table(tmp_path / "out")[0]["message"]
 
 
@@ -125,7 +177,11 @@ LIMITED = [
     ("azimuth", "140 220", {"azimuth": [140.0, 220.0], "elevation": [-10.0, 80.0]}),
     ("elevation", "0 60", {"elevation": [0.0, 60.0]}),
     ("side", "front", {"azimuth": [315.0, 45.0], "elevation": [-10.0, 80.0]}),
-    ("near", "180 20", {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]}),
+    (
+        "near",
+        "180 20",
+        {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]},
+    ),
     ("", "", {"elevation": [-10.0, 80.0]}),
     ("distance", "1 2", "distance: needs the camera"),
     ("azimuth", "140", "azimuth: expected LOW HIGH"),
@@ -142,7 +198,8 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
     names = ["azimuth", "elevation", "side", "near", "within", "distance", "front"]
     rows = [[cell if name == column else "" for name in names] for column, cell, _ in LIMITED]
     words = ["--elevation", "-10", "80", "--no-refine"]
-    photo, header = ["photos/0.png", *box_of(0)], f"{HEADER},{','.join(names)}"
+    photo = ["photos/0.png", *box_of(0)]
+    header = f"{HEADER},{','.join(names)}"
     assert register_list("limited.csv", header, *([*photo, *row] for row in rows), words=words) == 0
     for (*_, expected), row in zip(LIMITED, lines(tmp_path / "out"), strict=True):
         if isinstance(expected, str):
@@ -154,15 +211,23 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
 
 
 def test_register_files_folders_and_patterns(folder, register, document, refused, tmp_path, capsys):
-    photos, bank = folder / "photos", folder / "truck.safetensors"
+    photos = folder / "photos"
+    bank = folder / "truck.safetensors"
     assert register(photos / "2.png", photos, photos / "[01].png", folder / "none.png", bank) == 0
     rows = table(tmp_path / "out")
     assert list(rows[0])[:9] == ["photo", "x0", "y0", "x1", "y1", "fx", "fy", "cx", "cy"]
     names = ["2.png", "0.png", "1.png", "2.png", "0.png", "1.png"]
-    assert [row["photo"] for row in rows] == [*(str(photos / name) for name in names), str(folder / "none.png")]
-    assert ([row["status"] for row in rows], capsys.readouterr().err) == (["ok"] * 6 + ["failed"], "")
+    assert [row["photo"] for row in rows] == [
+        *(str(photos / name) for name in names),
+        str(folder / "none.png"),
+    ]
+    assert ([row["status"] for row in rows], capsys.readouterr().err) == (
+        ["ok"] * 6 + ["failed"],
+        "",
+    )
     assert register(photos / "2.png", bank, out="one") == 0
-    alone, listed = document("one"), lines(tmp_path / "out")[0]
+    alone = document("one")
+    listed = lines(tmp_path / "out")[0]
     for key in ("rotation", "score", "confidence", "top", "pipeline"):
         assert alone[key] == listed[key], key
     assert not (tmp_path / "one" / "results.csv").exists()
@@ -171,14 +236,21 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
 
 def test_register_uses_box_and_camera_for_all_photographs(folder, register, tmp_path, capsys):
     photos = [folder / "photos" / "0.png", folder / "photos" / "1.png"]
-    assert register(*photos, folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA) == 0
+    assert (
+        register(*photos, folder / "truck.safetensors", "--box", *box_of(0), "--camera", *CAMERA)
+        == 0
+    )
     assert "--box and --camera: used for all 2 photographs" in capsys.readouterr().err
     for line in lines(tmp_path / "out"):
-        assert (line["inputs"]["box"], len(line["translation"])) == ([float(v) for v in box_of(0)], 3)
+        assert (line["inputs"]["box"], len(line["translation"])) == (
+            [float(v) for v in box_of(0)],
+            3,
+        )
 
 
 def test_register_chooses_among_meshes(folder, register, document, tmp_path, capsys):
-    box, truck = folder / "box.safetensors", folder / "truck.safetensors"
+    box = folder / "box.safetensors"
+    truck = folder / "truck.safetensors"
     views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
     ViewBank.build(trimesh.creation.box((1.0, 0.2, 0.1)), **views, progress=False).save(box)
     meshes = ["--mesh", box, "--mesh", truck]
@@ -189,12 +261,19 @@ def test_register_chooses_among_meshes(folder, register, document, tmp_path, cap
     path = written(folder / "which.csv", "photo,x0,y0,x1,y1", *rows)
     assert register("--list", path, *meshes) == 0
     found = table(tmp_path / "out")
-    assert (list(found[0])[-1], [row["found_mesh"] for row in found]) == ("found_mesh", [str(truck), ""])
-    assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [str(v) for v in document("one")["rotation"][0]]
+    assert (list(found[0])[-1], [row["found_mesh"] for row in found]) == (
+        "found_mesh",
+        [str(truck), ""],
+    )
+    assert [found[0][f"r1{j}"] for j in (1, 2, 3)] == [
+        str(v) for v in document("one")["rotation"][0]
+    ]
 
 
 def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path):
-    video = cv2.VideoWriter(str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (240, 180))
+    video = cv2.VideoWriter(
+        str(folder / "turn.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (240, 180)
+    )
     frames = [cv2.imread(str(folder / "photos" / f"{seed}.png")) for seed in range(3)]
     for seed in (0, 1, 2, 2, 1):
         video.write(frames[seed])
@@ -215,20 +294,26 @@ def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path
 
 def test_boxes_of_a_detector_are_found_by_the_name_of_each_photograph(folder, register, tmp_path):
     x0, y0, x1, y1 = map(float, box_of(0))
-    boxes = [{"image_id": str(seed), "bbox": [x0, y0, x1 - x0, y1 - y0], "score": 0.5} for seed in (0, 1)]
+    boxes = [
+        {"image_id": str(seed), "bbox": [x0, y0, x1 - x0, y1 - y0], "score": 0.5} for seed in (0, 1)
+    ]
     (tmp_path / "boxes.json").write_text(json.dumps(boxes))
     words = "--boxes", tmp_path / "boxes.json", "--no-refine"
     assert register(folder / "photos", folder / "truck.safetensors", *words, out="boxes") == 0
     rows = lines(tmp_path / "boxes")
     assert [row["status"] for row in rows] == ["ok", "ok", "failed"]
-    assert rows[0]["inputs"]["box"] == pytest.approx([x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5], abs=1e-3)
+    assert rows[0]["inputs"]["box"] == pytest.approx(
+        [x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5], abs=1e-3
+    )
     assert "no box in" in rows[2]["message"]
 
 
 def test_paths_of_windows_and_boxes_in_fractions_in_lists(folder):
     x0, y0, x1, y1 = map(float, box_of(0))
     fractions = [(x0 + 0.5) / 240, (y0 + 0.5) / 180, (x1 + 0.5) / 240, (y1 + 0.5) / 180]
-    path = written(folder / "windows.csv", HEADER, ["photos\\0.png", *fractions], ["photos\\9.png", *fractions])
+    path = written(
+        folder / "windows.csv", HEADER, ["photos\\0.png", *fractions], ["photos\\9.png", *fractions]
+    )
     options = RegisterOptions(meshes=(folder / "truck.ply",), box_format="fractions")
     good, missing = read_list(path, options)
     assert good.photo == folder / "photos" / "0.png"
@@ -251,7 +336,8 @@ def test_photographs_of_telephones_in_folders_and_alone(folder, register, tmp_pa
         ("/IMG_1.JPG", "ok"),
         ("IMG_2.HEIC", "ok"),
     ]
-    monkeypatch.setitem(sys.modules, "pi_heif", None)  # counted, not left out, where there is no decoder
+    # counted, not left out, where there is no decoder
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
     assert register(shots, folder / "truck.safetensors", "--box", *box_of(0), out="without") == 0
     jpeg, missing = lines(tmp_path / "without")
     assert jpeg["status"] == "ok"

@@ -22,7 +22,11 @@ def write_video(path, seeds):
     return path
 
 
-VIDEOS = [("left/cam.avi", "right/cam.avi"), ("a.avi", "a.mkv"), ("x/shots/cam.avi", "y/shots/cam.avi")]
+VIDEOS = [
+    ("left/cam.avi", "right/cam.avi"),
+    ("a.avi", "a.mkv"),
+    ("x/shots/cam.avi", "y/shots/cam.avi"),
+]
 
 
 @pytest.mark.parametrize("names", VIDEOS)
@@ -33,9 +37,14 @@ def test_two_videos_of_one_name_keep_their_own_results(folder, register, tmp_pat
     assert [row["photo"] for row in rows] == [f"{video}:000000" for video in videos]
     together = lines(tmp_path / "out")
     for number, video in enumerate(videos):
-        assert register(video, folder / "truck.safetensors", "--box", *box_of(0), out=str(number)) == 0
+        assert (
+            register(video, folder / "truck.safetensors", "--box", *box_of(0), out=str(number)) == 0
+        )
         (alone,) = lines(tmp_path / str(number))
-        assert (alone["rotation"], alone["score"]) == (together[number]["rotation"], together[number]["score"])
+        assert (alone["rotation"], alone["score"]) == (
+            together[number]["rotation"],
+            together[number]["score"],
+        )
     assert together[0]["rotation"] != together[1]["rotation"]
     assert register(*videos[::-1], folder / "truck.safetensors", "--box", *box_of(0)) == 0
     assert [row["r11"] for row in table(tmp_path / "out")] == [row["r11"] for row in rows[::-1]]
@@ -59,20 +68,28 @@ def test_frames_are_in_the_order_of_their_numbers(folder, register, tmp_path):
     for name in names:
         shutil.copy(folder / "flat.png", shots / name)
     register(shots, folder / "truck.safetensors")
-    assert [row["photo"] for row in table(tmp_path / "out")] == [str(shots / name) for name in names]
+    assert [row["photo"] for row in table(tmp_path / "out")] == [
+        str(shots / name) for name in names
+    ]
 
 
 THEIRS = ("result.json", "overlay.png", "pose.glb", "pose.yaml")
 LISTS = ("results.csv", "results.jsonl", "index.html")
 
 
-@pytest.mark.parametrize(("name", "several"), [*((name, False) for name in THEIRS), *((name, True) for name in LISTS)])
-def test_register_removes_no_file_of_others(folder, register, refused, tmp_path, monkeypatch, name, several):
+@pytest.mark.parametrize(
+    ("name", "several"), [*((name, False) for name in THEIRS), *((name, True) for name in LISTS)]
+)
+def test_register_removes_no_file_of_others(
+    folder, register, refused, tmp_path, monkeypatch, name, several
+):
     (tmp_path / name).write_text("of others")
     (tmp_path / "predictions.csv").write_text("of others")
     monkeypatch.chdir(tmp_path)
     photos = [folder / "photos" / "0.png", *([folder / "photos" / "1.png"] if several else [])]
-    code = register(*photos, folder / "truck.safetensors", *([] if several else ["--box", *box_of(0)]), out=".")
+    code = register(
+        *photos, folder / "truck.safetensors", *([] if several else ["--box", *box_of(0)]), out="."
+    )
     refused(code, f"{name}: not written by this command")
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(
         [name, "predictions.csv"], "of others"
@@ -86,12 +103,20 @@ def test_register_overwrites_no_input(folder, register, refused, tmp_path, capsy
     capsys.readouterr()
     before = {path: path.read_bytes() for path in out.iterdir()}
     start = ["--camera", *CAMERA, "--start", out / "result.json"]
-    refused(register(folder / "photos" / "0.png", words[0], *start), "result.json: an input of this command")
+    refused(
+        register(folder / "photos" / "0.png", words[0], *start),
+        "result.json: an input of this command",
+    )
     refused(register(out / "overlay.png", *words), "overlay.png: an input of this command")
-    refused(register(folder / "photos" / "0.png", out / "pose.glb", *words[1:]), "pose.glb: an input of this command")
+    refused(
+        register(folder / "photos" / "0.png", out / "pose.glb", *words[1:]),
+        "pose.glb: an input of this command",
+    )
     start[-1] = f"{out / 'result.json'}:0"
     refused(register(folder / "photos" / "0.png", words[0], *start), "result.json")
-    listed = written(out / "results.csv", "photo,x0,y0,x1,y1", [folder / "photos" / "0.png", *box_of(0)])
+    listed = written(
+        out / "results.csv", "photo,x0,y0,x1,y1", [folder / "photos" / "0.png", *box_of(0)]
+    )
     before[listed] = listed.read_bytes()
     refused(register("--list", listed, words[0]), "results.csv: an input of this command")
     assert {path: path.read_bytes() for path in out.iterdir()} == before
@@ -100,11 +125,20 @@ def test_register_overwrites_no_input(folder, register, refused, tmp_path, capsy
 def test_a_second_list_does_not_remove_the_rows_of_the_first(folder, register, refused, tmp_path):
     bank = folder / "truck.safetensors"
     rows = [[f"photos/{seed}.png", *box_of(seed)] for seed in (0, 1)]
-    lists = [written(folder / f"{seed}.csv", "photo,x0,y0,x1,y1", row) for seed, row in enumerate(rows)]
+    lists = [
+        written(folder / f"{seed}.csv", "photo,x0,y0,x1,y1", row) for seed, row in enumerate(rows)
+    ]
     assert register("--list", lists[0], bank) == 0
     before = (tmp_path / "out" / "results.csv").read_bytes()
-    refused(register("--list", lists[1], bank), "out/index.html: holds results of", "0.csv, which would be lost")
-    refused(register(*(folder / "photos" / f"{seed}.png" for seed in (0, 1)), bank), "0.csv, which would be lost")
+    refused(
+        register("--list", lists[1], bank),
+        "out/index.html: holds results of",
+        "0.csv, which would be lost",
+    )
+    refused(
+        register(*(folder / "photos" / f"{seed}.png" for seed in (0, 1)), bank),
+        "0.csv, which would be lost",
+    )
     assert (tmp_path / "out" / "results.csv").read_bytes() == before
     written(lists[0], "photo,x0,y0,x1,y1", *rows)
     assert register("--list", lists[0], bank) == 0
@@ -114,16 +148,31 @@ def test_a_second_list_does_not_remove_the_rows_of_the_first(folder, register, r
 def test_demo_plot_and_bank_overwrite_no_file_of_others(folder, refused, tmp_path):
     for name in ("mesh.ply", "photo.png", "plot.png", "plot.svg", "bank.safetensors"):
         (tmp_path / name).write_text("of others")
-    refused(main(["demo", "--out", str(tmp_path), "--quiet"]), "mesh.ply: not written by this command")
+    refused(
+        main(["demo", "--out", str(tmp_path), "--quiet"]), "mesh.ply: not written by this command"
+    )
     files = [str(folder / "photos" / "0.png"), str(folder / "truck.safetensors")]
     for name in ("plot.png", "plot.svg"):
         out = ["--out", str(tmp_path / name), "--quiet"]
         refused(main(["plot", "overlay", *files, "--box", *box_of(0), *out]), f"{name}: exists")
-    mine = ["plot", "viewpoints", *files, "--box", *box_of(0), "--out", str(tmp_path / "mine.png"), "--quiet"]
+    mine = [
+        "plot",
+        "viewpoints",
+        *files,
+        "--box",
+        *box_of(0),
+        "--out",
+        str(tmp_path / "mine.png"),
+        "--quiet",
+    ]
     assert (main(mine), main(mine)) == (0, 0)
     photo = tmp_path / "shot.png"
     shutil.copy(files[0], photo)
-    refused(main(["plot", "overlay", str(photo), files[1], "--out", str(photo)]), "shot.png: an input")
+    refused(
+        main(["plot", "overlay", str(photo), files[1], "--out", str(photo)]), "shot.png: an input"
+    )
     bank = ["bank", str(folder / "truck.ply"), "--quiet", "--out"]
     refused(main([*bank, str(tmp_path / "bank.safetensors")]), "bank.safetensors: exists")
-    assert {path.read_text() for path in tmp_path.glob("[bp]*") if path.name != "mine.png"} == {"of others"}
+    assert {path.read_text() for path in tmp_path.glob("[bp]*") if path.name != "mine.png"} == {
+        "of others"
+    }

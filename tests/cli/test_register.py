@@ -19,13 +19,16 @@ from tests._support.scenes import scene, truck_bank
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
     assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
     result = document()
-    check_pose(result, scene(0)[2], 15.0, 0.05)  # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
+    # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
+    check_pose(result, scene(0)[2], 15.0, 0.05)
     assert len(result["top"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 3)
     assert sum(result["probabilities"]) + result["none"] == pytest.approx(1.0)
     deviations = result["standard_deviations"]
-    assert deviations["translation"] == pytest.approx([result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)])
+    assert deviations["translation"] == pytest.approx(
+        [result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)]
+    )
     assert all(0 < v < 30 for v in deviations["rotation_deg"])
     printed = capsys.readouterr().out
     assert "viewpoint" in printed
@@ -33,7 +36,13 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
 
 
 def test_register_without_box_and_camera(folder, register_one, document, capsys):
-    words = ["register", str(folder / "photos/0.png"), str(folder / "truck.safetensors"), "--no-refine", "--json"]
+    words = [
+        "register",
+        str(folder / "photos/0.png"),
+        str(folder / "truck.safetensors"),
+        "--no-refine",
+        "--json",
+    ]
     assert main([*words, "--box", *box_of(0)]) == 0
     assert "detecting" not in capsys.readouterr().err
     assert main(words) == 0
@@ -45,8 +54,12 @@ def test_register_without_box_and_camera(folder, register_one, document, capsys)
     assert document()["pipeline"]["contours"] is False
 
 
-@pytest.mark.parametrize(("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")])
-def test_register_upright_mesh_with_another_up_axis(folder, register_one, document, monkeypatch, name, options, up):
+@pytest.mark.parametrize(
+    ("name", "options", "up"), [("y.glb", [], "y"), ("x.ply", ["--up=-x"], "-x")]
+)
+def test_register_upright_mesh_with_another_up_axis(
+    folder, register_one, document, monkeypatch, name, options, up
+):
     monkeypatch.setenv("CURVIREG_CACHE", str(folder / "cache"))
     T = np.eye(4)
     T[:3, :3] = up_rotation(up).numpy().T
@@ -57,7 +70,9 @@ def test_register_upright_mesh_with_another_up_axis(folder, register_one, docume
 
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
-    monkeypatch.setattr("curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr(
+        "curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened")
+    )
     refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
     refused(register_one("--camera", "exif"), "0.png", "no focal length")
 
@@ -70,9 +85,13 @@ def test_register_warns_of_a_questionable_camera(register_one, document, capsys)
     assert document()["reliable"] is False
 
 
-def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(folder, register_one, document, capsys):
+def test_register_takes_views_from_the_bank_unless_a_pipeline_file_is_given(
+    folder, register_one, document, capsys
+):
     views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
-    bank = ViewBank.build(example_mesh(), pipeline=replace(PRESETS["fast"], views=views), progress=False)
+    bank = ViewBank.build(
+        example_mesh(), pipeline=replace(PRESETS["fast"], views=views), progress=False
+    )
     bank.save(folder / "upright.safetensors")
     assert register_one("--preset", "fast", mesh="upright.safetensors") == 0
     assert document()["pipeline"]["views"]["azimuth_step"] == 120.0
@@ -87,45 +106,68 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     # The views of every preset, thinned out: 12 instead of 7200.
     views = ViewPolicy(directions=12, theta_step=360.0)
     (folder / "pipeline.json").write_text(replace(PRESETS[preset], views=views).to_json())
-    assert register_one("--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply") == 0
+    assert (
+        register_one("--pipeline", folder / "pipeline.json", "--camera", *CAMERA, mesh="truck.ply")
+        == 0
+    )
     written = document()
-    registrar = Registrar(str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json"))
-    photo, box = folder / "photos/0.png", torch.tensor([[float(v) for v in box_of(0)]])
+    registrar = Registrar(
+        str(folder / "truck.ply"), pipeline=Pipeline.read(folder / "pipeline.json")
+    )
+    photo = folder / "photos/0.png"
+    box = torch.tensor([[float(v) for v in box_of(0)]])
     result = registrar([photo], box, camera_matrix(*map(float, CAMERA)))[0]
     for name in ("rotation", "translation"):
         assert written[name] == getattr(result, name).tolist()
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
-    assert [top["rotation"] for top in written["top"]] == [h.rotation.tolist() for h in result.hypotheses]
+    assert [top["rotation"] for top in written["top"]] == [
+        h.rotation.tolist() for h in result.hypotheses
+    ]
     assert written["pipeline"] == registrar.pipeline.describe()
 
 
 def test_register_limits_the_pose(register_one, document):
     azimuth = viewpoint_from_rotation(scene(0)[2][:3, :3])[0]
-    low, high = float(azimuth + 140) % 360, float(azimuth + 220) % 360
-    assert register_one("--no-refine", "--azimuth", f"{low},{high}", "--elevation", "-90", "90") == 0
+    low = float(azimuth + 140) % 360
+    high = float(azimuth + 220) % 360
+    assert (
+        register_one("--no-refine", "--azimuth", f"{low},{high}", "--elevation", "-90", "90") == 0
+    )
     result = document()
-    assert result["prior"] == {"azimuth": [low, high], "elevation": [-90, 90], "contradiction": "better outside"}
+    assert result["prior"] == {
+        "azimuth": [low, high],
+        "elevation": [-90, 90],
+        "contradiction": "better outside",
+    }
     for pose in result["top"]:
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
 
 
-def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(folder, register_one, document, refused):
+def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
+    folder, register_one, document, refused
+):
     mesh = example_mesh()
     mesh.units = "mm"
     views = {"views": truck_bank().views, "pipeline": PRESETS["classical"], "image_size": 96}
     ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
     bank = {"mesh": "mm.safetensors"}
     refused(
-        register_one("--unit", "m", "--no-refine", **bank), "mm.safetensors: built with --unit mm, not with --unit m"
+        register_one("--unit", "m", "--no-refine", **bank),
+        "mm.safetensors: built with --unit mm, not with --unit m",
     )
-    refused(register_one("--up=-x", "--no-refine", **bank), "mm.safetensors: built with --up=z, not with --up=-x")
+    refused(
+        register_one("--up=-x", "--no-refine", **bank),
+        "mm.safetensors: built with --up=z, not with --up=-x",
+    )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
     assert register_one(*words, **bank) == 0
     assert document()["unit"] == "mm"
     assert register_one("--no-refine", **bank) == 0
     mesh.units = None
     ViewBank.build(mesh, **views, progress=False).save(folder / "mm.safetensors")
-    refused(register_one("--unit", "mm", "--no-refine", **bank), "mm.safetensors: built without a unit")
+    refused(
+        register_one("--unit", "mm", "--no-refine", **bank), "mm.safetensors: built without a unit"
+    )
 
 
 IGNORED = [
@@ -142,19 +184,29 @@ IGNORED = [
     ("a.png m.ply --front x", "--front limits nothing"),
 ]
 OF_OTHERS = [
-    *(f"{command} --camera 1 1 1 1 --fov 50" for command in ("plot overlay a.png m.ply", "follow v.mp4 m.ply", "view")),
+    *(
+        f"{command} --camera 1 1 1 1 --fov 50"
+        for command in ("plot overlay a.png m.ply", "follow v.mp4 m.ply", "view")
+    ),
     *(
         f"{command} --preset fast --pipeline p.json"
         for command in ("plot overlay a.png m.ply", "view", "demo", "bank m.ply")
     ),
     *(f"evaluate {name} . --preset fast --pipeline p.json" for name in ("bop", "web", "pascal3d")),
-    *("follow v.mp4 m.ply --box 1 2 3 4 --start s.json", "plot overlay a.png m.ply --front x", "view --front x"),
+    *(
+        "follow v.mp4 m.ply --box 1 2 3 4 --start s.json",
+        "plot overlay a.png m.ply --front x",
+        "view --front x",
+    ),
 ]
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
-    [*((f"register {words}", message) for words, message in IGNORED), *((line, "") for line in OF_OTHERS)],
+    [
+        *((f"register {words}", message) for words, message in IGNORED),
+        *((line, "") for line in OF_OTHERS),
+    ],
 )
 def test_options_that_would_be_ignored_are_refused(line, message, capsys):
     with pytest.raises(SystemExit) as stop:
@@ -164,7 +216,11 @@ def test_options_that_would_be_ignored_are_refused(line, message, capsys):
 
 
 def test_options_of_videos_and_processes_are_taken():
-    for words in ("a.png v.mp4 m.ply --every 2", "shots/* m.ply --jobs 2", "a.png m.ply --every 1 --jobs 1"):
+    for words in (
+        "a.png v.mp4 m.ply --every 2",
+        "shots/* m.ply --jobs 2",
+        "a.png m.ply --every 1 --jobs 1",
+    ):
         assert parse(["register", *words.split(), "--out", "out"]).every in (1, 2)
     words = ["--list", "l.csv", "m.ply", "--front", "x", "--out", "out"]
     assert parse(["register", *words]).front == "x", "of the limits in its rows"
@@ -174,10 +230,15 @@ def test_the_pose_in_the_world_of_a_rig_is_no_start(folder, register_one, refuse
     pose = {"frame": "world", "rotation": [1, 0, 0, 0, 1, 0, 0, 0, 1], "translation": [0, 0, 3]}
     (folder / "rig.json").write_text(json.dumps(pose))
     words = "--start", str(folder / "rig.json"), "--camera", *CAMERA
-    refused(register_one(*words, box=()), "rig.json: a result of several photographs, whose pose is in the world")
+    refused(
+        register_one(*words, box=()),
+        "rig.json: a result of several photographs, whose pose is in the world",
+    )
 
 
-def test_starts_of_other_tools_have_their_convention_and_unit(folder, register_one, refused, document):
+def test_starts_of_other_tools_have_their_convention_and_unit(
+    folder, register_one, refused, document
+):
     T = scene(0)[2].double()
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     path = folder / "gl.json"
@@ -189,22 +250,33 @@ def test_starts_of_other_tools_have_their_convention_and_unit(folder, register_o
     )
     assert register_one(*words, "--start-convention", "opengl", box=()) == 0
     assert float(rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3])) < 3.0
-    entry = {"cam_R_m2c": T[:3, :3].flatten().tolist(), "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(), "obj_id": 1}
+    entry = {
+        "cam_R_m2c": T[:3, :3].flatten().tolist(),
+        "cam_t_m2c": (1000.0 * T[:3, 3]).tolist(),
+        "obj_id": 1,
+    }
     path.write_text(json.dumps({"4": [entry]}))  # mm, of a mesh in m
     assert register_one("--start", f"{path}:4", "--camera", *CAMERA, box=()) == 0
-    torch.testing.assert_close(torch.tensor(document()["translation"]).double(), T[:3, 3], rtol=0.1, atol=0.05)
+    torch.testing.assert_close(
+        torch.tensor(document()["translation"]).double(), T[:3, 3], rtol=0.1, atol=0.05
+    )
     with pytest.raises(SystemExit):
         register_one("--start-convention", "opengl")
 
 
-def test_register_refines_a_start_or_writes_that_the_object_is_lost(folder, register_one, document, capsys):
-    T, path = scene(0)[2], folder / "start.json"
+def test_register_refines_a_start_or_writes_that_the_object_is_lost(
+    folder, register_one, document, capsys
+):
+    T = scene(0)[2]
+    path = folder / "start.json"
     pose = {"rotation": T[:3, :3].tolist(), "translation": T[:3, 3].tolist()}
     path.write_text(json.dumps(pose))
     words = "--start", str(path), "--camera", *CAMERA
     assert register_one(*words, box=()) == 0
     result = document()
-    assert float(rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3])) < 3.0
+    assert (
+        float(rotation_error(torch.tensor(result["rotation"]).double(), scene(0)[2][:3, :3])) < 3.0
+    )
     assert set(result["confidence_features"]) == {"similarity", "edge_support"}
     pose["translation"][0] += 100.0
     path.write_text(json.dumps(pose))

@@ -1,4 +1,5 @@
-"""``curvireg register --views``: rigs as CSV, COLMAP models and BOP scenes, and the files of one pose."""
+"""``curvireg register --views``: rigs as CSV, COLMAP models and BOP scenes, and the files of one
+pose."""
 
 import json
 from pathlib import Path
@@ -11,7 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
 from curvireg_torch.evaluation.rigs import read_rig
-from tests._support.lists import check_pose, quaternion, write_bop_scene, write_colmap, write_rig_photos, written
+from tests._support.lists import (
+    check_pose,
+    quaternion,
+    write_bop_scene,
+    write_colmap,
+    write_rig_photos,
+    written,
+)
 from tests.registration.test_several import WORLD
 
 SHARE = 0.1 / float(WORLD[:3, 3].norm())
@@ -26,7 +34,15 @@ def rig(tmp_path_factory):
 
 
 def register(folder, rig, out, *words):
-    command = ["register", "--views", str(rig), str(folder / "learned.safetensors"), "--quiet", "--out", str(out)]
+    command = [
+        "register",
+        "--views",
+        str(rig),
+        str(folder / "learned.safetensors"),
+        "--quiet",
+        "--out",
+        str(out),
+    ]
     return main([*command, *words])
 
 
@@ -37,7 +53,9 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     document = json.loads((tmp_path / "result.json").read_text())
     check_pose(document, WORLD, 1.5, SHARE)
     assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
-    assert [view["photo"] for view in document["views"]] == [str(place / row[0]) for row in [*rows, ["none.png"]]]
+    assert [view["photo"] for view in document["views"]] == [
+        str(place / row[0]) for row in [*rows, ["none.png"]]
+    ]
     assert [view["failure"] is None for view in document["views"]] == [True, True, True, False]
     assert "no such file" in document["views"][3]["failure"]
     assert document["views"][0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
@@ -75,13 +93,23 @@ def test_read_rig_reads_colmap_and_bop(rig, tmp_path):
     bop.mkdir()
     objects = [[7, 5], [7, 5], [5, 5]]  # twice in the last photograph
     write_bop_scene(bop, rows, objects, [[1, 2, 3, 4], [5, 6, 20, 30]])
-    for path, mesh, box in ((tmp_path, None, None), (bop, Path("obj_000005.ply"), (5.0, 6.0, 25.0, 36.0))):
+    for path, mesh, box in (
+        (tmp_path, None, None),
+        (bop, Path("obj_000005.ply"), (5.0, 6.0, 25.0, 36.0)),
+    ):
         views = read_rig(path, mesh)
         assert [view.box for view in views] == [box, box, None]
         for view, R, row in zip(views, expected, rows, strict=True):
             torch.testing.assert_close(view.T_cam_from_world[:3, :3], R, atol=1e-6, rtol=0)
             assert view.T_cam_from_world[:3, 3].tolist() == pytest.approx(row[18:], abs=1e-6)
-            assert view.camera.matrix[:2].flatten().tolist() == [260.0, 0.0, 119.5, 0.0, 260.0, 89.5]
+            assert view.camera.matrix[:2].flatten().tolist() == [
+                260.0,
+                0.0,
+                119.5,
+                0.0,
+                260.0,
+                89.5,
+            ]
     model = tmp_path / "sparse" / "0"  # where COLMAP writes it
     model.mkdir(parents=True)
     for name in ("images.txt", "cameras.txt"):

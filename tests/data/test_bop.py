@@ -34,11 +34,30 @@ def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
     assert dataset.skipped_items["missing_image"] == ["test/000001/4 #0"]
     sample = dataset[0]
     assert set(sample) == {
-        *("image", "image_path", "box", "box_visible", "camera_matrix", "rotation", "translation", "T_cam_from_world"),
-        *("obj_id", "scene_id", "image_id", "instance_index", "visib_fract", "model_path", "model_info"),
+        *(
+            "image",
+            "image_path",
+            "box",
+            "box_visible",
+            "camera_matrix",
+            "rotation",
+            "translation",
+            "T_cam_from_world",
+        ),
+        *(
+            "obj_id",
+            "scene_id",
+            "image_id",
+            "instance_index",
+            "visib_fract",
+            "model_path",
+            "model_info",
+        ),
     }
     assert sample["image"].shape == (3, 60, 80)
-    assert sample["box"].tolist() == [-5, 4, 25, 24], "x, y, width, height become corners, and may leave the image"
+    assert sample["box"].tolist() == [-5, 4, 25, 24], (
+        "x, y, width, height become corners, and may leave the image"
+    )
     assert sample["box_visible"].tolist() == [0, 4, 25, 24]
     assert sample["camera_matrix"].tolist() == [[300, 0, 40], [0, 310, 30], [0, 0, 1]]
     assert sample["rotation"].tolist() == [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "row by row"
@@ -50,7 +69,8 @@ def test_bop_dataset_counts_skipped_items_and_returns_documented_samples(tree):
 
 def test_bop_dataset_reads_hidden_instances_and_grey_images_without_scene_gt_info(tree):
     dataset = BOPDataset(tree[0], targets=False)
-    hidden, sample = dataset[1], dataset[3]
+    hidden = dataset[1]
+    sample = dataset[3]
     assert hidden["visib_fract"] == 0
     assert hidden["box"].isfinite().all()
     assert hidden["box_visible"].isnan().all()
@@ -101,7 +121,10 @@ def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(
         (lambda info: info["1"].update(diameter="100"), "diameter"),
         (lambda info: info["1"].update(diameter=0), "diameter"),
         (lambda info: info.update({"1": "text"}), "entry '1'"),
-        (lambda info: info["1"].update(symmetries_discrete=None), "symmetries_discrete: expected a list"),
+        (
+            lambda info: info["1"].update(symmetries_discrete=None),
+            "symmetries_discrete: expected a list",
+        ),
         (lambda info: info["1"].update(symmetries_discrete=[[0] * 16]), "expected rigid"),
         (lambda info: info["1"].update(symmetries_continuous=[{}]), "axis: expected"),
         (lambda info: info["1"].update(symmetries_continuous=[7]), "symmetries_continuous"),
@@ -131,7 +154,11 @@ def test_bop_dataset_counts_invalid_rotations(tree, value):
 @pytest.mark.parametrize(("place", "value"), [(0, 0.0), (4, -500.0), (1, 2.0), (8, 2.0)])
 def test_bop_dataset_skips_invalid_cameras(tree, place, value):
     before = BOPDataset(tree[0], targets=False)
-    edit(tree, "scene_camera.json", lambda content: operator.setitem(content["0"]["cam_K"], place, value))
+    edit(
+        tree,
+        "scene_camera.json",
+        lambda content: operator.setitem(content["0"]["cam_K"], place, value),
+    )
     after = BOPDataset(tree[0], targets=False)
     lost = len(before) - len(after)
     assert lost > 0
@@ -144,14 +171,17 @@ def test_bop_dataset_prefers_colour_to_grey_and_instances_of_known_visibility(tr
     (scene / "gray" / "000000.tif").write_bytes(b"")
     assert "/rgb/" in BOPDataset(tree[0], targets=False).annotation(0)["image_path"]
     edit(tree, "scene_gt_info.json", lambda content: content["0"][2].pop("visib_fract"))
-    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)  # of two instances, the one that is 0.8 visible
+    # of two instances, the one that is 0.8 visible
+    assert ids(BOPDataset(tree[0]))[0] == (1, 0, 1, 0)
 
 
 def test_bop_dataset_measures_models_without_models_info(tree):
     (tree[0] / "models" / "models_info.json").unlink()
     dataset = BOPDataset(tree[0], targets=False)
     assert dataset.models_info[1]["diameter"] == pytest.approx(50 * 3**0.5)
-    assert [dataset.models_info[1][key] for key in ("min_x", "size_z")] == pytest.approx([-25.0, 50.0])
+    assert [dataset.models_info[1][key] for key in ("min_x", "size_z")] == pytest.approx(
+        [-25.0, 50.0]
+    )
     assert ids(dataset) == [(1, 0, 1, 0), (1, 0, 2, 1), (1, 0, 1, 2), (1, 3, 9, 4), (2, 7, 1, 0)]
 
 
@@ -187,7 +217,9 @@ def test_bop_dataset_refuses_models_in_metres_without_models_info(tree):
     (tree[0] / "models" / "models_info.json").unlink()
     for number in (1, 2, 9):
         write_mesh(tree[0] / "models" / f"obj_{number:06d}.ply", half=0.025)
-    with pytest.raises(InvalidInputError, match=r"the mesh is 0\.065 px wide: in metres\? scale it to mm"):
+    with pytest.raises(
+        InvalidInputError, match=r"the mesh is 0\.065 px wide: in metres\? scale it to mm"
+    ):
         BOPDataset(tree[0])
 
 
@@ -203,4 +235,7 @@ def test_bop_dataset_skips_boxes_without_area(tree, box):
     before = BOPDataset(tree[0], targets=False)
     edit(tree, "scene_gt_info.json", lambda content: content["0"][0].update(bbox_obj=box))
     after = BOPDataset(tree[0], targets=False)
-    assert (len(after), after.skipped["bad_box"]) == (len(before) - 1, before.skipped["bad_box"] + 1)
+    assert (len(after), after.skipped["bad_box"]) == (
+        len(before) - 1,
+        before.skipped["bad_box"] + 1,
+    )

@@ -37,7 +37,8 @@ def test_formats_of_four_numbers():
     assert pixel_box((0.25, 0.25, 0.75, 0.75), "fractions", SIZE) == BOX
     assert pixel_box((0.5, 0.5, 0.5, 0.5), "yolo", SIZE) == BOX
     with pytest.raises(
-        InvalidInputError, match="expected fractions of the picture from 0 to 1; of px, give another format"
+        InvalidInputError,
+        match="expected fractions of the picture from 0 to 1; of px, give another format",
     ):
         pixel_box((16.0, 12.0, 47.0, 35.0), "yolo", SIZE)
     with pytest.raises(InvalidInputError, match="not of a video"):
@@ -75,7 +76,9 @@ def item(image, score, box=(16, 12, 32, 24), **more):
 
 @pytest.mark.parametrize("image", ["000012", "000012.png", 12])
 def test_results_of_coco(tmp_path, photo, image):
-    file = written(tmp_path / "boxes.json", [item(image, 0.2, (0, 0, 9, 9)), item(image, 0.8), item(7, 1.0)])
+    file = written(
+        tmp_path / "boxes.json", [item(image, 0.2, (0, 0, 9, 9)), item(image, 0.8), item(7, 1.0)]
+    )
     assert BoxFile(file).box(photo) == BOX
     assert BoxFile(f"{file}:3").box(photo) == BOX
     with pytest.raises(InvalidInputError, match="no box of label '4'"):
@@ -105,7 +108,10 @@ def test_megapose_writes_corners_of_the_only_photograph(tmp_path, photo):
 
 
 def test_what_is_no_file_of_boxes_is_refused(tmp_path):
-    for content, words in (({"a": 1}, "expected detections of COCO"), ([{"image_id": 1}], "entry 0: expected bbox")):
+    for content, words in (
+        ({"a": 1}, "expected detections of COCO"),
+        ([{"image_id": 1}], "entry 0: expected bbox"),
+    ):
         with pytest.raises(InvalidInputError, match=words):
             BoxFile(written(tmp_path / "a.json", content))
     with pytest.raises(MissingFileError, match="no such file or folder"):
@@ -115,7 +121,10 @@ def test_what_is_no_file_of_boxes_is_refused(tmp_path):
 def test_messages_name_the_format_that_is_suspected():
     pictures = torch.rand(1, 3, 48, 64)
     for box, words in (
-        ([0.3, 0.2, 0.7, 0.8], "in px, not fractions of the photograph; .* --box-format fractions, or yolo"),
+        (
+            [0.3, 0.2, 0.7, 0.8],
+            "in px, not fractions of the photograph; .* --box-format fractions, or yolo",
+        ),
         ([40.0, 30.0, 20.0, 15.0], "corners, not width and height, or --box-format xywh"),
         ([5.0, 5.0, 10.0, 40.0], "the part of the photograph in the box has 5.0 px"),
     ):

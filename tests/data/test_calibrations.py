@@ -117,12 +117,22 @@ def test_opencv_with_other_keys_and_bop(tmp_path):
     file = tmp_path / "python.json"
     file.write_text(json.dumps({"mtx": K.tolist(), "dist": D.tolist(), "image_size": [640, 480]}))
     check(load_camera(file), tuple(D[0]))
-    bop = {"cx": 321.25, "cy": 238.5, "depth_scale": 1.0, "fx": 520.5, "fy": 522.0, "height": 480, "width": 640}
+    bop = {
+        "cx": 321.25,
+        "cy": 238.5,
+        "depth_scale": 1.0,
+        "fx": 520.5,
+        "fy": 522.0,
+        "height": 480,
+        "width": 640,
+    }
     file.write_text(json.dumps(bop))
     check(load_camera(file), ())
 
 
-@pytest.mark.parametrize("text", [ROS, ROS_MESSAGE, ROS.replace("\n", "\r\n")], ids=["file", "message", "windows"])
+@pytest.mark.parametrize(
+    "text", [ROS, ROS_MESSAGE, ROS.replace("\n", "\r\n")], ids=["file", "message", "windows"]
+)
 def test_ros_camera_info(tmp_path, text):
     file = tmp_path / "camera_info.yaml"
     file.write_bytes(text.encode())
@@ -132,8 +142,11 @@ def test_ros_camera_info(tmp_path, text):
 def test_other_models_of_ros(tmp_path):
     models = ("rational_polynomial", 8, "radial-tangential"), ("equidistant", 4, "fisheye")
     for ros_model, count, model in models:
-        file, numbers = tmp_path / f"{ros_model}.yaml", tuple(0.01 * k for k in range(count))
-        file.write_text(ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers))))
+        file = tmp_path / f"{ros_model}.yaml"
+        numbers = tuple(0.01 * k for k in range(count))
+        file.write_text(
+            ROS.replace("plumb_bob", ros_model).replace(str(D[0].tolist()), str(list(numbers)))
+        )
         check(load_camera(file), numbers, model=model)
 
 
@@ -158,7 +171,11 @@ def test_colmap_counts_from_the_corner_of_the_picture(tmp_path):
 
 def test_malicious_files_are_refused(tmp_path):
     for name, content, words in (
-        ("a.yaml", ROS.replace("plumb_bob", "double_sphere"), "'double_sphere' is not supported; choose from none"),
+        (
+            "a.yaml",
+            ROS.replace("plumb_bob", "double_sphere"),
+            "'double_sphere' is not supported; choose from none",
+        ),
         ("a.json", '{"K": ' + "[" * 100_000 + "]" * 100_000 + "}", "damaged|nested too deeply"),
         ("a.xml", "<a>" * 100_000 + "</a>" * 100_000, "damaged|nested too deeply"),
         ("a.yaml", " " * (MAX_CAMERA_BYTES + 1), "larger than 4,194,304 bytes"),
@@ -173,7 +190,8 @@ def test_malicious_files_are_refused(tmp_path):
 FLAT = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5}
 FIVE = {"k1": -0.31, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": 0.03}
 FOUR = {key: value for key, value in FIVE.items() if key != "k3"}
-LENS, MATRIX = D[0].tolist(), K.tolist()
+LENS = D[0].tolist()
+MATRIX = K.tolist()
 TRANSPOSED = K.T.flatten().tolist()
 SIZE = {"width": 640, "height": 480}
 CORNER = {"fl_x": 520.5, "fl_y": 522.0, "cx": 321.75, "cy": 239.0, "w": 640, "h": 480}
@@ -188,13 +206,29 @@ JSON = {
     "single keys in a dict": ({**FLAT, "distortion_parameters": FIVE}, tuple(LENS), None),
     "camera in a dict": ({"dist": LENS, "intrinsics": FLAT, **SIZE}, tuple(LENS), (480, 640)),
     "radial and tangential": (
-        {"K": MATRIX, "RadialDistortion": [-0.31, 0.12, 0.03], "TangentialDistortion": [0.001, -0.002]},
+        {
+            "K": MATRIX,
+            "RadialDistortion": [-0.31, 0.12, 0.03],
+            "TangentialDistortion": [0.001, -0.002],
+        },
         tuple(LENS),
         None,
     ),
-    "radial alone": ({"K": MATRIX, "radial_distortion": [-0.31, 0.12]}, (-0.31, 0.12, 0.0, 0.0), None),
+    "radial alone": (
+        {"K": MATRIX, "radial_distortion": [-0.31, 0.12]},
+        (-0.31, 0.12, 0.0, 0.0),
+        None,
+    ),
     "realsense": (
-        {"ppx": 321.25, "ppy": 238.5, "fx": 520.5, "fy": 522.0, "coeffs": LENS, "model": "brown_conrady", **SIZE},
+        {
+            "ppx": 321.25,
+            "ppy": 238.5,
+            "fx": 520.5,
+            "fy": 522.0,
+            "coeffs": LENS,
+            "model": "brown_conrady",
+            **SIZE,
+        },
         tuple(LENS),
         (480, 640),
     ),
@@ -203,7 +237,11 @@ JSON = {
         (0.0,) * 5,
         (480, 640),
     ),
-    "nerfstudio": ({**CORNER, **FOUR, "camera_model": "OPENCV", "frames": [FRAME]}, tuple(LENS[:4]), (480, 640)),
+    "nerfstudio": (
+        {**CORNER, **FOUR, "camera_model": "OPENCV", "frames": [FRAME]},
+        tuple(LENS[:4]),
+        (480, 640),
+    ),
     "own camera": (OWN, tuple(LENS[:4]), (480, 640)),
     "own result": (
         {"rotation": [1], "model": 0, "camera": OWN, "inputs": {"camera": [1]}},
@@ -241,19 +279,46 @@ def test_distortion_by_the_names_that_tools_give_it(tmp_path, key):
 
 
 REFUSED = {
-    "another name": ({"K": MATRIX, "my_distortion": LENS}, "'my_distortion': looks like distortion"),
-    "beside a nested camera": ({"a": {"K": MATRIX}, "b": {"radial_terms": [0.1]}}, "'radial_terms': looks like"),
+    "another name": (
+        {"K": MATRIX, "my_distortion": LENS},
+        "'my_distortion': looks like distortion",
+    ),
+    "beside a nested camera": (
+        {"a": {"K": MATRIX}, "b": {"radial_terms": [0.1]}},
+        "'radial_terms': looks like",
+    ),
     "inside an unknown dict": ({"K": MATRIX, "lens": {"k1": -0.3}}, "'k1': looks like distortion"),
-    "a coefficient too much": ({**FLAT, "distortion": {**FOUR, "k9": 1}}, "'k9': looks like distortion"),
-    "two lists": ({"K": MATRIX, "dist": LENS, "distortion": [1.0, *LENS[1:]]}, "'dist': looks like distortion"),
+    "a coefficient too much": (
+        {**FLAT, "distortion": {**FOUR, "k9": 1}},
+        "'k9': looks like distortion",
+    ),
+    "two lists": (
+        {"K": MATRIX, "dist": LENS, "distortion": [1.0, *LENS[1:]]},
+        "'dist': looks like distortion",
+    ),
     "text": ({"K": MATRIX, "distortion_b": "-0.3 0.1"}, "'distortion_b': looks like distortion"),
-    "inverse model": ({**FLAT, "coeffs": LENS, "model": "inverse_brown_conrady"}, "'inverse_brown_conrady' is not"),
-    "projection": ({"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]}, "also moves the camera"),
-    "mei": ({"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}}, "'MEI' is not supported"),
-    "field of view": ({"camera_angle_x": 0.7, "frames": []}, "no fl_x; without it, give .* --fov DEG"),
+    "inverse model": (
+        {**FLAT, "coeffs": LENS, "model": "inverse_brown_conrady"},
+        "'inverse_brown_conrady' is not",
+    ),
+    "projection": (
+        {"K": [[520, 0, 321, 5], [0, 520, 238, 0], [0, 0, 1, 0]]},
+        "also moves the camera",
+    ),
+    "mei": (
+        {"model_type": "MEI", "projection_parameters": {"gamma1": 1.0}},
+        "'MEI' is not supported",
+    ),
+    "field of view": (
+        {"camera_angle_x": 0.7, "frames": []},
+        "no fl_x; without it, give .* --fov DEG",
+    ),
     "no centre": ({"fl_x": 520.5, "w": 640, "h": 480}, "no cx and cy"),
     "a polynomial of nerfstudio": ({**CORNER, "k4": 0.1}, "k4 of nerfstudio"),
-    "fisheye with tangential": ({**FLAT, **FOUR, "is_fisheye": True}, "a fisheye has k1, k2, k3, k4 alone"),
+    "fisheye with tangential": (
+        {**FLAT, **FOUR, "is_fisheye": True},
+        "a fisheye has k1, k2, k3, k4 alone",
+    ),
     "radial and tangential of a fisheye": (
         {**FLAT, "camera_model": "fisheye", "radial": [0.1, 0.2], "tangential": [0.1, 0.0]},
         "coefficients of the model 'fisheye'",
@@ -286,7 +351,9 @@ def test_zero_distortion_and_distances_are_no_distortion(tmp_path):
 def test_four_coefficients_without_a_model_are_noted(tmp_path):
     file = tmp_path / "camera.json"
     file.write_text(json.dumps({"K": MATRIX, "D": [[0.02], [-0.01], [0.003], [-0.001]]}))
-    with pytest.warns(CurviregWarning, match="read as k1, k2, p1, p2; write distortion_model: fisheye"):
+    with pytest.warns(
+        CurviregWarning, match="read as k1, k2, p1, p2; write distortion_model: fisheye"
+    ):
         camera = load_camera(file)
     check(camera, (0.02, -0.01, 0.003, -0.001), size=None)
 
@@ -295,7 +362,14 @@ def test_numbers_alone_are_the_matrix(tmp_path):
     file = tmp_path / "cam_K.txt"
     homogeneous = np.eye(4)
     homogeneous[:3, :3] = K
-    for matrix in (K, homogeneous, homogeneous[:3], K.T, homogeneous.T, np.array([[520.5, 522.0, 321.25, 238.5]])):
+    for matrix in (
+        K,
+        homogeneous,
+        homogeneous[:3],
+        K.T,
+        homogeneous.T,
+        np.array([[520.5, 522.0, 321.25, 238.5]]),
+    ):
         np.savetxt(file, matrix, header="camera matrix")
         check(load_camera(file), (), size=None)
     file.write_text(str(K.tolist()))
@@ -308,18 +382,26 @@ def test_numbers_alone_are_the_matrix(tmp_path):
 def test_yaml_of_pyyaml_and_of_other_tools(tmp_path):
     yaml = pytest.importorskip("yaml")
     file = tmp_path / "camera.yaml"
-    content = {"camera_matrix": MATRIX, "dist_coeff": D.tolist(), "image_width": 640, "image_height": 480}
+    content = {
+        "camera_matrix": MATRIX,
+        "dist_coeff": D.tolist(),
+        "image_width": 640,
+        "image_height": 480,
+    }
     for flow in (False, True, None):
         file.write_text(yaml.dump(content, default_flow_style=flow))
         check(load_camera(file), tuple(LENS))
     file.write_text(
-        "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: 480\ndistortion_parameters:\n"
+        "%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 640\nimage_height: "
+        "480\ndistortion_parameters:\n"
         "   k1: -3.1e-01\n   k2: 0.12\n   p1: 1.0e-03\n   p2: -2e-3\nprojection_parameters:\n"
         "   fx: 520.5\n   fy: 522.0\n   cx: 321.25\n   cy: 238.5\n"
     )
     check(load_camera(file), tuple(LENS[:4]))
     fisheye = (
-        "   k2: 0.02\n   k3: -0.01\n   k4: 0.003\n   k5: -0.001\n   mu: 520.5\n   mv: 522\n   u0: 321.25\n   v0: 238.5"
+        "   k2: 0.02\n   k3: -0.01\n   k4: 0.003\n   k5: -0.001\n   mu: 520.5\n   mv: "
+        "522\n   u0: "
+        "321.25\n   v0: 238.5"
     )
     file.write_text(
         f"%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
@@ -327,8 +409,10 @@ def test_yaml_of_pyyaml_and_of_other_tools(tmp_path):
     )
     check(load_camera(file), (0.02, -0.01, 0.003, -0.001), model="fisheye")
     file.write_text(
-        "T_BS:\n  cols: 4\n  data: [1, 0, 0, 0,\n         0, 1, 0, 0]\nresolution: [640, 480]\ncamera_model: pinhole\n"
-        "intrinsics: [520.5, 522.0, 321.25, 238.5] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+        "T_BS:\n  cols: 4\n  data: [1, 0, 0, 0,\n         0, 1, 0, 0]\nresolution: [640, "
+        "480]\ncamera_model: pinhole\n"
+        "intrinsics: [520.5, 522.0, 321.25, 238.5] #fu, fv, cu, cv\ndistortion_model: "
+        "radial-tangential\n"
         "distortion_coefficients: [-0.31, 0.12, 0.001, -0.002]\n"
     )
     check(load_camera(file), tuple(LENS[:4]))
@@ -371,10 +455,16 @@ def test_stereo_calibrations_name_two_cameras(tmp_path):
     second = load_camera(f"{file}:2")
     assert second.distortion == tuple(2 * D[0])
     assert second.matrix[0, 0] == 1041.0
-    with pytest.raises(InvalidInputError, match="several cameras; choose one as FILE:NAME from 1, 2"):
+    with pytest.raises(
+        InvalidInputError, match="several cameras; choose one as FILE:NAME from 1, 2"
+    ):
         load_camera(file)
     file = tmp_path / "stereo.json"
-    file.write_text(json.dumps({"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]}))
+    file.write_text(
+        json.dumps(
+            {"K_left": MATRIX, "D_left": LENS, "K_right": MATRIX, "D_right": LENS[:4], "R": [1]}
+        )
+    )
     check(load_camera(f"{file}:left"), tuple(LENS), size=None)
 
 
@@ -385,7 +475,9 @@ def test_bop_scene_cameras_are_named_by_image(tmp_path):
     file.write_text(json.dumps({"3": {"cam_K": flat, "depth_scale": 1.0}, "12": {"cam_K": other}}))
     for name in ("3", "000003"):
         check(load_camera(f"{file}:{name}"), (), size=None)
-    with pytest.raises(InvalidInputError, match="several cameras; choose one as FILE:NAME from 3, 12"):
+    with pytest.raises(
+        InvalidInputError, match="several cameras; choose one as FILE:NAME from 3, 12"
+    ):
         load_camera(file)
     file.write_text(json.dumps({str(number): {"cam_K": flat} for number in range(9)}))
     check(load_camera(file), (), size=None)  # all the same
@@ -395,7 +487,7 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
     file = tmp_path / "calibration.xml"
     lens = "<k1>-0.31</k1><k2>0.12</k2><k3>0.03</k3><p1>-0.002</p1><p2>0.001</p2>"
     text = (
-        "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width><height>480</height>"
+        "<?xml version='1.0'?><calibration><projection>frame</projection><width>640</width><height>480</height>"  # noqa: E501
         f"<f>522</f><cx>1.75</cx><cy>-1</cy><b1>-1.5</b1>{lens}<date>2026-01-01T00:00:00Z</date></calibration>"
     )
     file.write_text(text)
@@ -404,19 +496,26 @@ def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(
         "<width>640</width><height>480</height>", '<resolution width="640" height="480"/>'
     )
     other = sensor.replace("<f>522", "<f>999")
-    file.write_text(f"<document><sensor label='a'>{sensor}</sensor><sensor label='b'>{other}</sensor></document>")
+    file.write_text(
+        f"<document><sensor label='a'>{sensor}</sensor><sensor "
+        f"label='b'>{other}</sensor></document>"
+    )
     check(load_camera(f"{file}:0"), tuple(LENS))
     for wrong in ("<b2>0.1</b2>", "<k4>0.1</k4>", "<p3>0.1</p3>"):
         file.write_text(text.replace("<date>", f"{wrong}<date>"))
         with pytest.raises(InvalidInputError, match="of Metashape have no counterpart in OpenCV"):
             load_camera(file)
-    file.write_text(text.replace("frame", "fisheye").replace("<p1>-0.002</p1><p2>0.001</p2>", "<k4>-0.001</k4>"))
+    file.write_text(
+        text.replace("frame", "fisheye").replace("<p1>-0.002</p1><p2>0.001</p2>", "<k4>-0.001</k4>")
+    )
     check(load_camera(file), (-0.31, 0.12, 0.03, -0.001), model="fisheye")
 
 
 def test_nerfstudio_fisheye(tmp_path):
     file = tmp_path / "transforms.json"
-    file.write_text(json.dumps({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001}))
+    file.write_text(
+        json.dumps({**CORNER, "camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k4": -0.001})
+    )
     check(load_camera(file), (0.02, 0.0, 0.0, -0.001), model="fisheye")
 
 
@@ -424,22 +523,30 @@ def test_more_models_of_colmap(tmp_path):
     file = tmp_path / "cameras.txt"
     file.write_text(
         "7 FULL_OPENCV 640 480 520.5 522 321.75 239 -0.31 0.12 0.001 -0.002 0.03 0.5 0.6 0.7\n"
-        "8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01\n9 FOV 640 480 520.5 522 321.75 239 0.1\n"
+        "8 RADIAL_FISHEYE 640 480 520.5 321.75 239 0.02 -0.01\n9 FOV 640 480 520.5 522 321.75 239 "
+        "0.1\n"
     )
     check(load_camera(f"{file}:7"), (*LENS, 0.5, 0.6, 0.7))
     check(load_camera(f"{file}:8"), (0.02, -0.01, 0.0, 0.0), fy=520.5, model="fisheye")
-    with pytest.raises(InvalidInputError, match=r"line 3: expected CAMERA_ID MODEL .* FULL_OPENCV \(12\)"):
+    with pytest.raises(
+        InvalidInputError, match=r"line 3: expected CAMERA_ID MODEL .* FULL_OPENCV \(12\)"
+    ):
         load_camera(f"{file}:9")
 
 
 def test_ros_region_and_binning_are_applied(tmp_path):
     file = tmp_path / "info.yaml"
-    file.write_text(ROS + "binning_x: 2\nbinning_y: 4\nroi: {x_offset: 100, y_offset: 40, width: 400, height: 200}\n")
+    file.write_text(
+        ROS + "binning_x: 2\nbinning_y: 4\nroi: {x_offset: 100, y_offset: 40, width: 400, height: "
+        "200}\n"
+    )
     camera = load_camera(file)
     assert camera.size == (50, 200)
     assert camera.distortion == tuple(LENS)
-    # The pixel (101, 40) of the sensor has its left edge at 100.5: the binned one at (0, 0) covers it from 99.5 on.
-    x, y = (321.25 - 99.5) / 2 - 0.5, (238.5 - 39.5) / 4 - 0.5
+    # The pixel (101, 40) of the sensor has its left edge at 100.5: the binned one at (0, 0) covers
+    # it from 99.5 on.
+    x = (321.25 - 99.5) / 2 - 0.5
+    y = (238.5 - 39.5) / 4 - 0.5
     expected = torch.tensor([[260.25, 0, x], [0, 130.5, y], [0, 0, 1]], dtype=torch.float64)
     torch.testing.assert_close(camera.matrix, expected)
     file.write_text(ROS + "roi:\n  x_offset: 100\n  y_offset: 40\n")
@@ -482,7 +589,13 @@ def test_yaml_cannot_blow_up_or_run_code(tmp_path):
 
 def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
     file = tmp_path / "secrets"
-    for text in ("TOKEN=abc123\nroot:x:0:0:root:/root\n", "abc123: [", '{"abc123": ', "<abc123>", "abc123\n"):
+    for text in (
+        "TOKEN=abc123\nroot:x:0:0:root:/root\n",
+        "abc123: [",
+        '{"abc123": ',
+        "<abc123>",
+        "abc123\n",
+    ):
         file.write_text(text)
         with pytest.raises(InvalidInputError) as error:
             load_camera(file)
@@ -491,7 +604,8 @@ def test_messages_quote_nothing_of_a_foreign_file(tmp_path):
 
 def test_both_coordinates_of_the_principal_point_decide_the_order_of_the_sides(tmp_path):
     file = tmp_path / "camera.json"
-    for cx, cy, size in ((262.0, 238.5, (480, 640)), (238.5, 262.0, (640, 480))):  # 262 alone would say the other order
+    # 262 alone would say the other order
+    for cx, cy, size in ((262.0, 238.5, (480, 640)), (238.5, 262.0, (640, 480))):
         for written in ([480, 640], [640, 480]):
             matrix = [[520.5, 0, cx], [0, 522.0, cy], [0, 0, 1]]
             file.write_text(json.dumps({"K": matrix, "resolution": written}))

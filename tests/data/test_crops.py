@@ -1,4 +1,5 @@
-"""Crops of datasets in batches of torch's own loader, their targets, and habits of the datasets that they wrap."""
+"""Crops of datasets in batches of torch's own loader, their targets, and habits of the datasets
+that they wrap."""
 
 import math
 import pickle
@@ -52,7 +53,8 @@ def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> No
     cropped = crops(dataset, 24, margin=0.25, bins=(8, 6, 4))
     assert cropped.classes == ["car", "sofa"]
     for index in range(len(dataset)):
-        sample, crop = dataset[index], cropped[index]
+        sample = dataset[index]
+        crop = cropped[index]
         expected, _ = crop_images(sample["image"][None], sample["box"][None], size=24, margin=0.25)
         assert torch.equal(crop["image"], expected[0])
         assert torch.equal(crop["rotation"], sample["rotation"])
@@ -62,7 +64,9 @@ def test_crops_show_the_boxes_with_their_poses_and_classes(tmp_path: Path) -> No
         assert crop["viewpoint_bins"].tolist() == bins
 
 
-def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(tmp_path: Path) -> None:
+def test_objects_of_bop_sets_are_classes_and_those_without_a_box_are_counted(
+    tmp_path: Path,
+) -> None:
     write_bop(tmp_path)
     # One scene has no boxes: they are those of the mesh, if it can be read.
     tmp_path.joinpath("models", "obj_000001.ply").write_text("ply")
@@ -118,7 +122,9 @@ def test_viewpoint_bins(viewpoint: tuple[float, float, float], expected: list[in
     rotation = rotation_from_viewpoint(*viewpoint)
     assert rotation.dtype == torch.float32
     if abs(viewpoint[1]) < 90.0:  # there azimuth and theta are one angle
-        assert viewpoint_bins(_viewpoint_of({"rotation": rotation}), (24, 12, 24)).tolist() == expected
+        assert (
+            viewpoint_bins(_viewpoint_of({"rotation": rotation}), (24, 12, 24)).tolist() == expected
+        )
 
 
 def test_crops_transform_and_split(tmp_path: Path) -> None:
@@ -141,7 +147,11 @@ def test_crops_refuse_wrong_options(tmp_path: Path) -> None:
         (([1, 2],), {}, "dataset: expected one of curvireg_torch.data, got list"),
         ((dataset, 0), {}, "size: expected an integer >= 1"),
         ((dataset, 16), {"margin": -0.1}, "margin"),
-        ((dataset, 16), {"bins": (24, 12)}, "bins: expected a number for each of azimuth, elevation, theta"),
+        (
+            (dataset, 16),
+            {"bins": (24, 12)},
+            "bins: expected a number for each of azimuth, elevation, theta",
+        ),
         ((dataset, 16), {"bins": 24}, "bins: expected a number for each"),
         ((dataset, 16), {"bins": (24, 0, 24)}, "bins of elevation: expected an integer >= 1"),
     ):
@@ -155,20 +165,28 @@ def test_datasets_transform_images_and_targets(dataset: ObjectDataset) -> None:
     changed = make(
         dataset.root,
         transform=lambda image: image.mean(),
-        target_transform=lambda sample: {"pose": sample["rotation"], "had_image": "image" in sample},
+        target_transform=lambda sample: {
+            "pose": sample["rotation"],
+            "had_image": "image" in sample,
+        },
         **options,
     )
-    sample, plain = changed[0], dataset[0]
+    sample = changed[0]
+    plain = dataset[0]
     assert set(sample) == {"image", "pose", "had_image"}
     assert torch.equal(sample["image"], plain["image"].mean())
     assert torch.equal(sample["pose"], plain["rotation"])
     assert not sample["had_image"]
-    assert torch.equal(changed.annotation(0)["box"], dataset.annotation(0)["box"]), "annotations are not transformed"
+    assert torch.equal(changed.annotation(0)["box"], dataset.annotation(0)["box"]), (
+        "annotations are not transformed"
+    )
 
 
 def test_datasets_say_what_they_are(dataset: ObjectDataset) -> None:
     name = type(dataset).__name__
-    split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[name]
+    split = {"Pascal3DPlus": ", split='val'", "BOPDataset": ", split='test'", "PoseFolder": ""}[
+        name
+    ]
     assert repr(dataset) == f"{name}(root={str(dataset.root)!r}{split}, {len(dataset)} objects)"
 
 

@@ -26,7 +26,8 @@ def picture():
 
 @pytest.fixture
 def written(tmp_path, picture):
-    """Write the picture as HEIC, or the one of another folder's encoder, with EXIF; returns its path."""
+    """Write the picture as HEIC, or the one of another folder's encoder, with EXIF; returns its
+    path."""
     encoder = pytest.importorskip("pillow_heif")
     pytest.importorskip("pi_heif")
 
@@ -40,7 +41,10 @@ def written(tmp_path, picture):
 
 
 def close(image, pixels):
-    return float((image.movedim(0, -1).float() - torch.from_numpy(pixels.copy()).float()).abs().mean()) < 8.0
+    return (
+        float((image.movedim(0, -1).float() - torch.from_numpy(pixels.copy()).float()).abs().mean())
+        < 8.0
+    )
 
 
 def test_heic_is_read_with_its_focal_length_and_its_own_orientation(written, picture):
@@ -79,7 +83,9 @@ def test_damaged_heic_is_refused_in_one_line(written, tmp_path):
 def test_a_missing_decoder_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + b"\0" * 99)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(MissingDependencyError, match=r"a\.heic: HEIC needs pi-heif: pip install .*heic"):
+    with pytest.raises(
+        MissingDependencyError, match=r"a\.heic: HEIC needs pi-heif: pip install .*heic"
+    ):
         read_photo(tmp_path / "a.heic")
     monkeypatch.setattr(features, "check", lambda _: False)
     (tmp_path / "a.avif").write_bytes(b"\0\0\0\x18ftypavif\0\0\0\0mif1miaf" + b"\0" * 99)

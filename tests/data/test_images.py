@@ -17,13 +17,17 @@ from tests._support.miniature import write_image
 
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
 @pytest.mark.parametrize("channels", [1, 3, 4])
-def test_read_image_returns_rgb_floats_in_0_to_1_of_grey_alpha_and_16_bits(tmp_path, dtype, top, channels):
+def test_read_image_returns_rgb_floats_in_0_to_1_of_grey_alpha_and_16_bits(
+    tmp_path, dtype, top, channels
+):
     pixels = np.full((5, 7, channels), top // 5, dtype)
     pixels[0, 2, 2 % channels] = top  # red, as OpenCV counts from blue
     cv2.imwrite(str(tmp_path / "a.png"), pixels)
     image = read_image(str(tmp_path / "a.png"))
     assert (image.shape, image.dtype, image.is_contiguous()) == ((3, 5, 7), torch.float32, True)
-    torch.testing.assert_close(image[:, 0, 2], torch.tensor([1.0, *[1.0 if channels == 1 else 0.2] * 2]))
+    torch.testing.assert_close(
+        image[:, 0, 2], torch.tensor([1.0, *[1.0 if channels == 1 else 0.2] * 2])
+    )
     torch.testing.assert_close(image[:, 1:], torch.full((3, 4, 7), 0.2))
 
 
@@ -44,7 +48,8 @@ def test_read_photo_inverts_tiff_in_which_white_is_zero(tmp_path, dtype):
     top = np.iinfo(dtype).max
     Image.fromarray(np.array([[0, top // 5, top]], dtype)).save(tmp_path / "black.tif")
     data = (tmp_path / "black.tif").read_bytes()
-    black, white = struct.pack("<HHIHH", 262, 3, 1, 1, 0), struct.pack("<HHIHH", 262, 3, 1, 0, 0)
+    black = struct.pack("<HHIHH", 262, 3, 1, 1, 0)
+    white = struct.pack("<HHIHH", 262, 3, 1, 0, 0)
     assert data.count(black) == 1
     (tmp_path / "white.tif").write_bytes(data.replace(black, white))
     assert read_photo(tmp_path / "black.tif").image[0].tolist() == [[0, 51, 255]]
@@ -58,7 +63,8 @@ def test_read_photo_applies_the_exif_orientation(tmp_path, suffix, orientation):
     write_image(path, (20, 30))
     stored = read_image(path)
     with_exif(path, exif(orientation, order="><"[orientation % 2]))
-    shown = torch.from_numpy(cv2.imread(str(path))[..., ::-1].copy()).permute(2, 0, 1)  # OpenCV honours the tag
+    # OpenCV honours the tag
+    shown = torch.from_numpy(cv2.imread(str(path))[..., ::-1].copy()).permute(2, 0, 1)
     photo = read_photo(path)
     assert torch.equal(photo.image, shown)
     assert photo.orientation == orientation
@@ -86,7 +92,8 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     photo = read_photo(path)
     assert photo.focal_35mm == photo.facts()["focal_35mm"] == 27
     K = photo.guessed_camera_matrix()
-    # The diagonal of 50 px corresponds to 43.27 mm on a 36 x 24 mm film; the rotated picture is 30 px wide.
+    # The diagonal of 50 px corresponds to 43.27 mm on a 36 x 24 mm film; the rotated picture is 30
+    # px wide.
     assert float(K[0, 0]) == float(K[1, 1]) == pytest.approx(27 * 50 / 43.2666, rel=1e-5)
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
@@ -95,7 +102,13 @@ def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(t
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
     assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]
     notes = {1: ("grey: three equal channels",), 3: (), 4: ("alpha channel dropped",)}
-    for name, channels in {"png": (1, 4), "webp": (3, 4), "tiff": (1,), "bmp": (3,), "pgm": (1,)}.items():
+    for name, channels in {
+        "png": (1, 4),
+        "webp": (3, 4),
+        "tiff": (1,),
+        "bmp": (3,),
+        "pgm": (1,),
+    }.items():
         for count in channels:
             assert cv2.imwrite(str(tmp_path / f"a.{name}"), np.full((4, 4, count), 9, np.uint8))
             assert read_photo(tmp_path / f"a.{name}").notes == notes[count], name
@@ -114,7 +127,12 @@ def test_read_photo_refuses_cielab_floating_pixels_and_other_formats(tmp_path):
     assert cv2.imwrite(str(tmp_path / "b.tif"), np.ones((4, 4, 3), np.float32))
     Image.fromarray(np.ones((4, 4), np.int32)).save(tmp_path / "c.tif")
     Image.new("L", (4, 4)).save(tmp_path / "d.gif")
-    for name, match in (("a.tif", "CIELAB"), ("b.tif", "convert"), ("c.tif", "32 bits"), ("d.gif", "JPEG, PNG, TIFF")):
+    for name, match in (
+        ("a.tif", "CIELAB"),
+        ("b.tif", "convert"),
+        ("c.tif", "32 bits"),
+        ("d.gif", "JPEG, PNG, TIFF"),
+    ):
         with pytest.raises(ImageError, match=rf"{name}: .*{match}"):
             read_photo(tmp_path / name)
 
@@ -130,7 +148,9 @@ def test_read_image_refuses_truncated_other_and_missing_files(tmp_path, suffix):
         with pytest.raises(ImageError, match=r"a\.\w+: (damaged or truncated|not an image)"):
             read_image(path)
     for path in (tmp_path / "nothing.jpg", tmp_path):
-        with pytest.raises(MissingFileError, match="no such file; check the path of the photograph"):
+        with pytest.raises(
+            MissingFileError, match="no such file; check the path of the photograph"
+        ):
             read_image(path)
 
 
@@ -140,12 +160,20 @@ def test_read_photo_counts_pixels_before_it_decodes(tmp_path):
     bmp = b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, side, -side, 1, 24, 0) + bytes(20)
     packer = zlib.compressobj(9)
     body = b"".join(packer.compress(bytes(1 + side // 8)) for _ in range(side)) + packer.flush()
-    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)), (b"IDAT", body), (b"IEND", b""))
-    chunks = [struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks]
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)),
+        (b"IDAT", body),
+        (b"IEND", b""),
+    )
+    chunks = [
+        struct.pack(">I", len(c)) + k + c + struct.pack(">I", zlib.crc32(k + c)) for k, c in chunks
+    ]
     for name, content in (("a.bmp", bmp), ("a.png", b"\x89PNG\r\n\x1a\n" + b"".join(chunks))):
         (tmp_path / name).write_bytes(content)
         tracemalloc.start()
-        with pytest.raises(ImageError, match=rf"{name}: more than 89,478,485 pixels; scale it down"):
+        with pytest.raises(
+            ImageError, match=rf"{name}: more than 89,478,485 pixels; scale it down"
+        ):
             read_photo(tmp_path / name)
         assert tracemalloc.get_traced_memory()[1] < 20e6
         tracemalloc.stop()
@@ -170,8 +198,14 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path, monkeypatch):
 def test_read_photo_keeps_the_orientation_if_the_rest_of_exif_is_damaged(tmp_path):
     path = tmp_path / "a.jpg"
     write_image(path)
-    plain, whole = path.read_bytes(), exif(6, focal=27)
-    for block in (whole[:38], whole[:41], whole[:30] + b"\xff" * 4 + whole[34:], whole[:38] + b"\xff" * 18):
+    plain = path.read_bytes()
+    whole = exif(6, focal=27)
+    for block in (
+        whole[:38],
+        whole[:41],
+        whole[:30] + b"\xff" * 4 + whole[34:],
+        whole[:38] + b"\xff" * 18,
+    ):
         path.write_bytes(plain)
         with_exif(path, block)
         photo = read_photo(path)
@@ -190,7 +224,11 @@ def test_few_bits_in_sixteen_are_stretched(tmp_path, bits, channels):
     pixels[0, 0] = 2**bits - 1
     cv2.imwrite(str(tmp_path / "camera.png"), pixels)
     photo = read_photo(tmp_path / "camera.png")
-    expected = np.round(pixels[..., ::-1] * 255.0 / (2**bits - 1)) if channels == 3 else pixels * 255.0 / (2**bits - 1)
+    expected = (
+        np.round(pixels[..., ::-1] * 255.0 / (2**bits - 1))
+        if channels == 3
+        else pixels * 255.0 / (2**bits - 1)
+    )
     shown = photo.image.movedim(0, -1).numpy().astype(float)
     assert np.abs(shown - (expected if channels == 3 else expected[..., None])).max() <= 0.5 + 1e-9
     assert f"16 bits, of which the lower {bits} are used: stretched" in photo.notes
@@ -204,7 +242,10 @@ def test_sixteen_bits_that_are_used_are_not_stretched(tmp_path):
     assert photo.notes == ("grey: three equal channels",)
     cv2.imwrite(str(tmp_path / "black.png"), 0 * pixels)
     assert read_photo(tmp_path / "black.png").notes == ("grey: three equal channels",)
-    cv2.imwrite(str(tmp_path / "colour.tif"), np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16))
+    cv2.imwrite(
+        str(tmp_path / "colour.tif"),
+        np.random.default_rng(0).integers(0, 4096, (9, 9, 3)).astype(np.uint16),
+    )
     (note,) = read_photo(tmp_path / "colour.tif").notes
     assert note == "16 bits, of which the lower ones are used: 16 levels remain; save it as PNG"
 
@@ -216,7 +257,9 @@ def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count
         page.encoderinfo = {"tiffinfo": {254: 1}}
     picture = Image.new("L", (8, 6), 200)
     picture.encoderinfo = {"tiffinfo": {}}
-    pages[0].save(tmp_path / "a.tif", tiffinfo={254: 1}, save_all=True, append_images=[*pages[1:], picture])
+    pages[0].save(
+        tmp_path / "a.tif", tiffinfo={254: 1}, save_all=True, append_images=[*pages[1:], picture]
+    )
     assert read_photo(tmp_path / "a.tif").image.shape == (3, 6, 8)
     pages.append(pages[0].copy())
     pages[-1].encoderinfo = {"tiffinfo": {254: 1}}
@@ -237,7 +280,12 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
     tags[0x0112] = 6  # turned by a quarter
     tags.get_ifd(0x8769).update({0xA405: 26, 0xA002: 400, 0xA003: 300})
     diagonal = math.hypot(36.0, 24.0)
-    for size, focal in (((400, 300), 500.0), ((200, 150), 250.0), ((200, 200), 500.0), ((500, 300), None)):
+    for size, focal in (
+        ((400, 300), 500.0),
+        ((200, 150), 250.0),
+        ((200, 200), 500.0),
+        ((500, 300), None),
+    ):
         path = tmp_path / "photo.jpg"
         Image.new("RGB", size).save(path, exif=tags)
         photo = read_photo(path)

@@ -39,7 +39,9 @@ def test_labels_are_chosen_by_their_number(tmp_path):
     file = written(tmp_path / "labels.png", labels)
     assert np.array_equal(read_mask(f"{file}:2"), OBJECT.astype(np.float32))
     assert np.array_equal(read_mask(f"{file}:5"), (labels == 5).astype(np.float32))
-    with pytest.raises(InvalidInputError, match="no white pixel, but labels 2, 5; choose one as FILE:LABEL"):
+    with pytest.raises(
+        InvalidInputError, match="no white pixel, but labels 2, 5; choose one as FILE:LABEL"
+    ):
         read_mask(file)
     with pytest.raises(InvalidInputError, match="no pixel has the label 3; it has 0, 2, 5"):
         read_mask(f"{file}:3")
@@ -72,7 +74,9 @@ def test_transparency_that_varies_is_the_mask(tmp_path):
     assert np.array_equal(read_mask(file), OBJECT.astype(np.float32))
     picture[...] = 255 * OBJECT[..., None]
     picture[..., 3] = 255
-    assert np.array_equal(read_mask(written(tmp_path / "opaque.png", picture)), OBJECT.astype(np.float32))
+    assert np.array_equal(
+        read_mask(written(tmp_path / "opaque.png", picture)), OBJECT.astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -90,7 +94,9 @@ def test_arrays_of_labels_are_read_as_files_are():
     item = image_item(torch.rand(3, 20, 30), None, mask=2 * OBJECT.astype(np.uint8))
     assert torch.equal(item.mask, torch.from_numpy(OBJECT).float())
     with pytest.raises(InvalidInputError, match=r"labels 2, 5; .* mask == LABEL"):
-        image_item(torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8)))
+        image_item(
+            torch.rand(3, 20, 30), None, mask=torch.from_numpy(2 + 3 * OBJECT.astype(np.uint8))
+        )
 
 
 def test_soft_borders_of_a_white_object_are_kept(tmp_path):

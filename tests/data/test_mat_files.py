@@ -13,7 +13,8 @@ from tests._support.miniature import pascal_object, write_record
 
 
 def array(array_class: int, dims: tuple[int, ...], rest: bytes, name: bytes = b"record") -> bytes:
-    flags, sizes = struct.pack("<II", array_class, 0), struct.pack(f"<{len(dims)}i", *dims)
+    flags = struct.pack("<II", array_class, 0)
+    sizes = struct.pack(f"<{len(dims)}i", *dims)
     return element(14, element(6, flags) + element(5, sizes) + element(1, name) + rest)
 
 
@@ -33,7 +34,12 @@ def test_read_mat_agrees_with_scipy(tmp_path, compress):
     numbers = {t: np.array([[1, 2, 3], [4, 5, 100]], t) for t in types}
     structs = np.empty((1, 2), dtype=[("a", object), ("b", object)])
     structs[0, 0], structs[0, 1] = ("x", np.eye(2)), ("", np.empty((0, 0)))
-    record = {**{f"n_{k}": v for k, v in numbers.items()}, "text": "car äβ", "flag": True, "structs": structs}
+    record = {
+        **{f"n_{k}": v for k, v in numbers.items()},
+        "text": "car äβ",
+        "flag": True,
+        "structs": structs,
+    }
     record |= {"complex": np.array([1j]), "cell": np.array([1, "a"], dtype=object)}
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, {"other": 1.0, "record": record}, do_compression=compress)
@@ -55,7 +61,10 @@ def test_read_mat_refuses_false_claims_and_bounds_all_variables_together(tmp_pat
     for content, message in (
         (array(6, (1 << 15, 1 << 15), element(9, b"\0" * 8)), "claims 1073741824 numbers"),
         (array(2, (1 << 15, 1 << 15), FIELD_A), "struct array claims"),
-        (array(2, (1 << 15, 1 << 15), element(5, struct.pack("<i", 8)) + element(1, b"")), "struct array claims"),
+        (
+            array(2, (1 << 15, 1 << 15), element(5, struct.pack("<i", 8)) + element(1, b"")),
+            "struct array claims",
+        ),
         (array(2, (1, 1), element(5, struct.pack("<i", 0)) + element(1, b"")), "field names"),
         (array(6, (-1, 1), element(9, b"")), "claims -1"),
         (array(6, (1, 1), element(99, b"\0" * 8)), "unknown type"),  # ends scipy's process
@@ -78,7 +87,9 @@ def test_read_mat_refuses_false_claims_and_bounds_all_variables_together(tmp_pat
         assert isinstance(read_mat(tmp_path / "a.mat", "record"), list)
     packed = zlib.compress(array(6, (1, 100_000), element(2, bytes(100_000)), b"other"), 9)
     for count in (10, 11):
-        (tmp_path / "a.mat").write_bytes(file((struct.pack("<II", 15, len(packed)) + packed) * count))
+        (tmp_path / "a.mat").write_bytes(
+            file((struct.pack("<II", 15, len(packed)) + packed) * count)
+        )
         message = "holds no variable" if count == 10 else "more than 1,048,576 bytes"
         with pytest.raises(InvalidInputError, match=message):
             read_mat(tmp_path / "a.mat", "record")
@@ -90,8 +101,10 @@ def test_read_mat_refuses_false_claims_and_bounds_all_variables_together(tmp_pat
 def test_read_mat_raises_no_other_error(tmp_path):
     path = tmp_path / "a.mat"
     write_record(path, [pascal_object("car"), pascal_object("sofa")])
-    scipy.io.savemat(path, {"record": scipy.io.loadmat(path)["record"]})  # without compression damage reaches further
-    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    # without compression damage reaches further
+    scipy.io.savemat(path, {"record": scipy.io.loadmat(path)["record"]})
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
     refused = 0
     for _ in range(300):
         data = bytearray(whole[: rng.integers(100, len(whole))] if rng.random() < 0.3 else whole)
@@ -103,7 +116,11 @@ def test_read_mat_raises_no_other_error(tmp_path):
         except InvalidInputError:
             refused += 1
     assert refused > 100
-    for content in (b"short", b"MATLAB 7.3".ljust(124) + b"\x00\x02IM" + b"\x89HDF", b"MATLAB".ljust(124) + b"\1\0MI"):
+    for content in (
+        b"short",
+        b"MATLAB 7.3".ljust(124) + b"\x00\x02IM" + b"\x89HDF",
+        b"MATLAB".ljust(124) + b"\1\0MI",
+    ):
         path.write_bytes(content)
         with pytest.raises(InvalidInputError, match="MATLAB 5"):
             read_mat(path, "record")

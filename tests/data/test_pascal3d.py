@@ -21,7 +21,10 @@ def test_pascal3d_counts_skipped_items(tree):
     assert dict(dataset.skipped) == reasons
     assert {k: len(v) for k, v in dataset.skipped_items.items()} == reasons
     assert dataset.skipped_items["missing_image"] == ["car_pascal/2008_000009"]
-    assert dataset.skipped_items["coarse_viewpoint"] == ["car_pascal/2008_000003 #0", "car_pascal/2008_000003 #1"]
+    assert dataset.skipped_items["coarse_viewpoint"] == [
+        "car_pascal/2008_000003 #0",
+        "car_pascal/2008_000003 #1",
+    ]
 
 
 def test_pascal3d_reads_the_imagenet_part(tmp_path):
@@ -37,8 +40,26 @@ def test_pascal3d_returns_documented_samples(tree):
     dataset = Pascal3DPlus(tree[0], categories=["car"])
     sample = dataset[0]
     assert set(sample) == {
-        *("image", "image_path", "image_id", "object_index", "box", "viewpoint", "rotation", "distance", "translation"),
-        *("camera_matrix", "category", "cad_index", "cad_path", "truncated", "occluded", "difficult"),
+        *(
+            "image",
+            "image_path",
+            "image_id",
+            "object_index",
+            "box",
+            "viewpoint",
+            "rotation",
+            "distance",
+            "translation",
+        ),
+        *(
+            "camera_matrix",
+            "category",
+            "cad_index",
+            "cad_path",
+            "truncated",
+            "occluded",
+            "difficult",
+        ),
     }
     assert sample["image"].shape == (3, 60, 80)
     assert sample["box"].tolist() == [10, 5, 70, 55], "boxes of the release count from 1"
@@ -46,15 +67,24 @@ def test_pascal3d_returns_documented_samples(tree):
     assert sample["viewpoint"].tolist() == [30, 10, -5]
     torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
     assert sample["translation"].tolist() == [0, 0, 40]
-    assert (sample["category"], sample["cad_index"], sample["image_id"]) == ("car", 1, "2008_000001")
+    assert (sample["category"], sample["cad_index"], sample["image_id"]) == (
+        "car",
+        1,
+        "2008_000001",
+    )
     assert sample["cad_path"].endswith("01.off")
     assert all(v.dtype == torch.float32 for v in sample.values() if isinstance(v, torch.Tensor))
     assert (sample["truncated"], sample["occluded"], sample["difficult"]) == (False, False, False)
     shifted = Pascal3DPlus(tree[0], pixel_origin=0)[0]
-    assert (shifted["box"].tolist(), shifted["camera_matrix"][:2, 2].tolist()) == ([11, 6, 71, 56], [41, 31])
+    assert (shifted["box"].tolist(), shifted["camera_matrix"][:2, 2].tolist()) == (
+        [11, 6, 71, 56],
+        [41, 31],
+    )
 
 
-@pytest.mark.parametrize("option", [{"truncated": False}, {"occluded": False}, {"difficult": False}], ids=str)
+@pytest.mark.parametrize(
+    "option", [{"truncated": False}, {"occluded": False}, {"difficult": False}], ids=str
+)
 def test_pascal3d_skips_flagged_objects(tree, option):
     dataset = Pascal3DPlus(tree[0], categories=["car"], **option)
     assert len(dataset) == 3
@@ -67,14 +97,24 @@ def test_pascal3d_reads_image_sets_with_invalid_entries(tree):
     root = tree[0]
     lists = root / "Image_sets"
     lists.mkdir()
-    lists.joinpath("car_pascal_tiny.txt").write_text("2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n")
+    lists.joinpath("car_pascal_tiny.txt").write_text(
+        "2008_000001\n\n../car_pascal/2008_000001\n" + "x" * 5000 + "\n"
+    )
     dataset = Pascal3DPlus(root, "tiny")
     assert (len(dataset), dict(dataset.skipped)) == (1, {"missing_annotation": 2})
 
 
 def test_pascal3d_defaults_of_missing_camera_fields_and_invalid_cad_indices(tree):
     record = tree[0] / "Annotations" / "car_pascal" / "2008_000001.mat"
-    write_record(record, [{**pascal_object("car"), "viewpoint": {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0}}])
+    write_record(
+        record,
+        [
+            {
+                **pascal_object("car"),
+                "viewpoint": {"azimuth": 10.0, "elevation": 20.0, "distance": 3.0},
+            }
+        ],
+    )
     sample = Pascal3DPlus(tree[0], categories=["car"])[0]
     assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
     assert sample["viewpoint"].tolist() == [10, 20, 0]
@@ -90,8 +130,15 @@ def test_pascal3d_reports_missing_files_with_advice_and_refuses_invalid_options(
         Pascal3DPlus(tree[0], "train")
     with pytest.raises(MissingFileError, match=r"boat_val\.txt"):
         Pascal3DPlus(tree[0], categories=["boat"])
-    wrong = [({"part": "voc"}, "part"), ({"pixel_origin": 2}, "pixel_origin"), ({"categories": "car"}, "list of names")]
-    wrong += [({"categories": ["../car"]}, "plain names"), ({"split": "../val", "categories": []}, "plain names")]
+    wrong = [
+        ({"part": "voc"}, "part"),
+        ({"pixel_origin": 2}, "pixel_origin"),
+        ({"categories": "car"}, "list of names"),
+    ]
+    wrong += [
+        ({"categories": ["../car"]}, "plain names"),
+        ({"split": "../val", "categories": []}, "plain names"),
+    ]
     for options, message in wrong:
         with pytest.raises(InvalidInputError, match=message):
             Pascal3DPlus(tree[0], **options)

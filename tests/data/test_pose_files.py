@@ -64,7 +64,9 @@ def test_megapose_writes_quaternions_and_metres(tmp_path):
     check(read_pose(tmp_path / "pose.json:can"), "m")
     check(read_pose(tmp_path / "pose.json:1"), "m")
     check(read_pose(file, mesh="can"), "m")
-    with pytest.raises(InvalidInputError, match="expected one pose, got 2 of 2; choose one as FILE:NAME: box, can"):
+    with pytest.raises(
+        InvalidInputError, match="expected one pose, got 2 of 2; choose one as FILE:NAME: box, can"
+    ):
         read_pose(file)
     with pytest.raises(InvalidInputError, match=r"in the world of TWC"):
         read_pose(written(tmp_path, [{**mine, "TWC": [[0, 0, 0, 1], [0, 0, 1]]}]))
@@ -80,7 +82,9 @@ def test_bop_writes_millimetres_and_several_objects(tmp_path):
     file = written(tmp_path, truth)
     check(read_pose(tmp_path / "pose.json:000003", mesh="obj_000005"), "mm")
     check(read_pose(tmp_path / "pose.json:12:1"), "mm")
-    with pytest.raises(InvalidInputError, match="poses of several images; choose one as FILE:IMAGE_ID from 3, 12"):
+    with pytest.raises(
+        InvalidInputError, match="poses of several images; choose one as FILE:IMAGE_ID from 3, 12"
+    ):
         read_pose(file)
     with pytest.raises(InvalidInputError, match="expected one pose, got 2 of 2"):
         read_pose(tmp_path / "pose.json:12", mesh="obj_000005")
@@ -92,7 +96,12 @@ def test_ros_writes_metres(tmp_path):
     q = dict(zip("xyzw", QUATERNION, strict=True))
     pose = {"position": dict(zip("xyz", t.tolist(), strict=True)), "orientation": q}
     check(read_pose(written(tmp_path, {"header": {"frame_id": "camera"}, "pose": pose})), "m")
-    check(read_pose(written(tmp_path, {"header": {}, "pose": {"pose": pose, "covariance": [0.0] * 36}})), "m")
+    check(
+        read_pose(
+            written(tmp_path, {"header": {}, "pose": {"pose": pose, "covariance": [0.0] * 36}})
+        ),
+        "m",
+    )
     with pytest.raises(InvalidInputError, match="expected position and orientation"):
         read_pose(written(tmp_path, {"header": {}, "pose": [1]}))
 
@@ -105,10 +114,16 @@ def test_opengl_poses_look_along_minus_z(tmp_path):
 def test_what_is_no_pose_is_refused(tmp_path):
     for content, words in (
         ({"rotation": R.tolist(), "translation": None}, "register with --camera first"),
-        ({"frame": "world", "rotation": R.tolist(), "translation": [0, 0, 1]}, "whose pose is in the world"),
+        (
+            {"frame": "world", "rotation": R.tolist(), "translation": [0, 0, 1]},
+            "whose pose is in the world",
+        ),
         ({"T": (2 * T).tolist()}, "a last row of 0 0 0 1"),
         ({"T": np.diag([2.0, 1, 1, 1]).tolist()}, "rigid"),
-        ({"rotation": [1.0, 0, 0, 0], "translation": [0, 0, 1]}, "rotation: expected 9 finite numbers"),
+        (
+            {"rotation": [1.0, 0, 0, 0], "translation": [0, 0, 1]},
+            "rotation: expected 9 finite numbers",
+        ),
         ([], "expected JSON with rotation and translation, or T_cam_from_model"),
         ("text", "expected JSON with rotation"),
     ):

@@ -19,7 +19,9 @@ def test_pose_folder_counts_skipped_items_and_returns_documented_samples(tree):
     assert (len(dataset), dict(dataset.skipped)) == (4, reasons)
     assert dataset.skipped_items["missing_image"] == ["cup/views.csv #3"]
     sample, unknown, level = (dataset[i] for i in range(3))
-    names = "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
+    names = (
+        "image image_path image_id box viewpoint rotation distance category mesh_path object_index"
+    )
     assert (set(sample), sample["image"].shape) == (set(names.split()), (3, 60, 80))
     assert (sample["box"].tolist(), sample["viewpoint"].tolist()) == ([10, 5, 70, 55], [30, 10, -5])
     torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
@@ -42,11 +44,16 @@ def test_pose_folder_refuses_unusable_roots(tree, tmp_path):
         PoseFolder(tree[0])
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")  # Python 3.12 warns of fork beside threads
+# Python 3.12 warns of fork beside threads
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_datasets_work_with_loader_workers(tree):
     dataset = PoseFolder(tree[0])
     for context in ("fork", "spawn"):
-        loader = DataLoader(dataset, 2, num_workers=1, collate_fn=list, multiprocessing_context=context)
+        loader = DataLoader(
+            dataset, 2, num_workers=1, collate_fn=list, multiprocessing_context=context
+        )
         samples = [sample for batch in loader for sample in batch]
         assert torch.equal(samples[2]["image"], dataset[2]["image"])
-        assert [sample["image_path"] for sample in samples] == [dataset[i]["image_path"] for i in range(4)]
+        assert [sample["image_path"] for sample in samples] == [
+            dataset[i]["image_path"] for i in range(4)
+        ]

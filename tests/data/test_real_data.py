@@ -14,7 +14,9 @@ pytestmark = pytest.mark.data
 
 @cache
 def vertices(path):
-    return torch.tensor(trimesh.load(path, process=False, force="mesh").vertices, dtype=torch.float32)
+    return torch.tensor(
+        trimesh.load(path, process=False, force="mesh").vertices, dtype=torch.float32
+    )
 
 
 def projected_box(path, sample):
@@ -34,11 +36,16 @@ def test_pascal3d_counts():
 
 
 def test_pascal3d_projection_fills_the_labelled_box():
-    """Offset and distance were fitted to the box; the CAD model of the category has another shape."""
-    dataset = Pascal3DPlus(real_data("pascal3d_mini"), pixel_origin=0, truncated=False, difficult=False)
-    centre, edges = [], []
+    """Offset and distance were fitted to the box; the CAD model of the category has another
+    shape."""
+    dataset = Pascal3DPlus(
+        real_data("pascal3d_mini"), pixel_origin=0, truncated=False, difficult=False
+    )
+    centre = []
+    edges = []
     for sample in map(dataset.annotation, range(len(dataset))):
-        box, labelled = projected_box(sample["cad_path"], sample), sample["box"]
+        box = projected_box(sample["cad_path"], sample)
+        labelled = sample["box"]
         size = (labelled[2:] - labelled[:2]).max()
         centre.append((box[:2] + box[2:] - labelled[:2] - labelled[2:]).abs().max() / 2)
         edges.append((box - labelled).abs().max() / size)
@@ -53,4 +60,6 @@ def test_bop_counts_and_projection(name, count):
     assert len(dataset) == count
     assert not dataset.skipped
     for sample in map(dataset.annotation, range(count)):
-        assert (projected_box(sample["model_path"], sample) - sample["box"]).abs().max() < 2, "pixels"
+        assert (projected_box(sample["model_path"], sample) - sample["box"]).abs().max() < 2, (
+            "pixels"
+        )

@@ -38,7 +38,8 @@ def test_video_yields_rgb_frames_and_their_numbers(five):
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".webm", ".mov"])
 def test_video_reads_other_containers(tmp_path, suffix):
-    path, code = tmp_path / f"a{suffix}", "VP80" if suffix == ".webm" else "mp4v"
+    path = tmp_path / f"a{suffix}"
+    code = "VP80" if suffix == ".webm" else "mp4v"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*code), 25.0, (64, 48))
     if not writer.isOpened():
         pytest.skip(f"OpenCV writes no {suffix} here")

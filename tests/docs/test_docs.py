@@ -1,4 +1,5 @@
-"""Links, names, options and commands on the documentation's pages exist, and the page of messages is made."""
+"""Links, names, options and commands on the documentation's pages exist, and the page of messages
+is made."""
 
 import importlib.util
 import inspect
@@ -13,7 +14,9 @@ import curvireg_torch
 from .._support.pages import DOCS, PAGES, ROOT
 
 SOURCES = [*PAGES, *DOCS.rglob("gallery/**/*.py")]
-PATHS = r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
+PATHS = (
+    r"(?<![\w/.])((?:curvireg_torch|scripts|tests|docs|datasets)/[\w./-]*\.(?:py|sh|md|png|csv))\b"
+)
 GENERATED = r"<!-- ([\w ]+):begin -->.*?<!-- \1:end -->"
 
 
@@ -35,14 +38,17 @@ def test_links_resolve(page: Path) -> None:
         path, _, name = link.partition("#")
         target = page.parent / path if path else page
         assert target.exists(), f"{link}: no such file"
-        headings = re.findall(r"^#+ (.*)$", without_code(target), flags=re.MULTILINE) if name else []
+        headings = (
+            re.findall(r"^#+ (.*)$", without_code(target), flags=re.MULTILINE) if name else []
+        )
         assert not name or name in map(anchor, headings), f"{link}: no such heading"
 
 
 def resolve(dotted: str) -> object:
     """The object that ``curvireg_torch.a.b`` names; None if there is none."""
     names = dotted.split(".")
-    for count in range(1, len(names) + 1):  # attributes first: a function may have the name of its module
+    # attributes first: a function may have the name of its module
+    for count in range(1, len(names) + 1):
         try:
             found: object = import_module(".".join(names[:count]))
         except ImportError:
@@ -57,17 +63,25 @@ def resolve(dotted: str) -> object:
 @pytest.mark.parametrize("source", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_dotted_names_and_paths_exist(source: Path) -> None:
     text = source.read_text(encoding="utf-8")
-    dotted = {f"curvireg_torch.{name}" for name in re.findall(r"(?<![\w.])cr\.([A-Za-z]\w*(?:\.\w+)*)", text)}
+    dotted = {
+        f"curvireg_torch.{name}"
+        for name in re.findall(r"(?<![\w.])cr\.([A-Za-z]\w*(?:\.\w+)*)", text)
+    }
     dotted |= set(re.findall(r"(?<![\w/])(curvireg_torch(?:\.[A-Za-z_]\w*)+)(?!\w*/)", text))
     assert not [name for name in dotted if resolve(name) is None]
-    written_by_hand = re.sub(GENERATED, "", text, flags=re.DOTALL)  # records keep the paths of their commit
+    # records keep the paths of their commit
+    written_by_hand = re.sub(GENERATED, "", text, flags=re.DOTALL)
     assert not [path for path in re.findall(PATHS, written_by_hand) if not (ROOT / path).is_file()]
 
 
 def test_reference_lists_every_public_name() -> None:
     page = (DOCS / "api" / "index.md").read_text(encoding="utf-8")
     listed = re.findall(r"\{py:obj\}`(\w+) <([\w.]+)>`", page)
-    public = {name for name in curvireg_torch.__all__ if not inspect.ismodule(getattr(curvireg_torch, name))}
+    public = {
+        name
+        for name in curvireg_torch.__all__
+        if not inspect.ismodule(getattr(curvireg_torch, name))
+    }
     assert {name for name, _ in listed} == public - {"__version__"}
     for name, dotted in listed:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
@@ -80,4 +94,6 @@ def test_messages_are_listed_with_what_to_do():
     photographs, meshes = module.page(ROOT / "curvireg_torch").split("## Meshes")
     assert "| frame … cannot be read | save the video again |" in photographs  # an f-string
     assert "| every face is degenerate (area 0) | repair the mesh |" in meshes
-    assert "give --camera FX FY CX CY, --camera FILE (a calibration)" in meshes, "a constant of another module"
+    assert "give --camera FX FY CX CY, --camera FILE (a calibration)" in meshes, (
+        "a constant of another module"
+    )

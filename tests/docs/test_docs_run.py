@@ -1,4 +1,5 @@
-"""The commands and Python blocks of each page run in order, in a folder with the files that the pages name."""
+"""The commands and Python blocks of each page run in order, in a folder with the files that the
+pages name."""
 
 import json
 import re
@@ -27,9 +28,9 @@ from ..mesh.step import step_file
 
 # Commands that are not run here, and the reason
 SKIPPED = {
-    r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",
+    r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",  # noqa: E501
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser_use.py opens it
-    r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",
+    r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",  # noqa: E501
     r"python scripts/results_table": "writes into the project",
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
     r"curvireg register .*--field": "needs trained weights",
@@ -50,21 +51,27 @@ PHOTO_CAMERA = cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)
 
 def pose(azimuth: float) -> torch.Tensor:
     """(4, 4) pose of the truck in m, whose box is about 410 220 890 700."""
-    points, box = torch.from_numpy(example_mesh().vertices.copy()), torch.tensor([410.0, 220.0, 890.0, 700.0])
+    points = torch.from_numpy(example_mesh().vertices.copy())
+    box = torch.tensor([410.0, 220.0, 890.0, 700.0])
     view = cr.rotation_from_viewpoint(torch.tensor(azimuth, dtype=torch.float64), 30.0, 0.0)
-    return transform(*pose_from_box(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0)))
+    return transform(
+        *pose_from_box(points, view, box, cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0))
+    )
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a part in mm, photographs of it, and datasets."""
     folder = tmp_path_factory.mktemp("newcomer")
-    mesh, size = example_mesh(), (1080, 1920)
+    mesh = example_mesh()
+    size = (1080, 1920)
     quarter = torch.diag(torch.tensor([0.25, 0.25, 1.0], dtype=torch.float64))
     K = quarter @ cr.camera_matrix(1450.0, 1450.0, 960.0, 540.0, dtype=torch.float64)
     for seed, (name, azimuth) in enumerate(AZIMUTHS.items()):
         generator = torch.Generator().manual_seed(seed)
-        picture, _ = synthesize_photograph(mesh, pose(azimuth), K, (size[0] // 4, size[1] // 4), generator)
+        picture, _ = synthesize_photograph(
+            mesh, pose(azimuth), K, (size[0] // 4, size[1] // 4), generator
+        )
         pixels = (255 * picture.permute(1, 2, 0)).round().byte().numpy()[..., ::-1]
         cv2.imwrite(str(folder / name), cv2.resize(pixels, size[::-1]))
         with_exif(folder / name, exif(1, 28))
@@ -74,22 +81,30 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("1.jpg", "2.jpg"):
         shutil.copy(folder / "photo.jpg", kettle / name)
         shutil.copy(folder / "photo.jpg", folder / "shots" / name)
-    (table,) = re.findall(r"```\n(image,.*?)```", (DOCS / "datasets.md").read_text("utf-8"), flags=re.DOTALL)
+    (table,) = re.findall(
+        r"```\n(image,.*?)```", (DOCS / "datasets.md").read_text("utf-8"), flags=re.DOTALL
+    )
     kettle.joinpath("views.csv").write_text(table)
     mesh.export(kettle / "mesh.stl")
     write_peers(folder, folder / "photo.jpg", mesh, pose(AZIMUTHS["photo.jpg"]), PHOTO_CAMERA)
     mesh.apply_scale(1000.0).export(folder / "part.stl")
     folder.joinpath("part.step").write_text(step_file(mesh.extents.tolist(), "mm"))
     mesh.apply_scale([1.0, 1.0, 2.0]).export(folder / "tall.stl")
-    folder.joinpath("photos.csv").write_text("photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n")
+    folder.joinpath("photos.csv").write_text(
+        "photo,x0,y0,x1,y1\nphoto.jpg,410,220,890,700\nleft.jpg,380,240,900,690\n"
+    )
     miniature.write_image(folder / "photo.png", (128, 128))
-    cv2.imwrite(str(folder / "depth.png"), cv2.imread(str(folder / "photo.png"), cv2.IMREAD_GRAYSCALE))
+    cv2.imwrite(
+        str(folder / "depth.png"), cv2.imread(str(folder / "photo.png"), cv2.IMREAD_GRAYSCALE)
+    )
     miniature.write_pascal3d(folder / DEFECTIVE[0])
     miniature.write_bop(folder / DEFECTIVE[1])
     miniature.write_web(folder / DEFECTIVE[2])
     net = folder / "data" / "ObjectNet3D"
     for split in ("train", "val"):
-        miniature.write_record(net / "Annotations" / f"{split}.mat", [miniature.pascal_object("ashtray")])
+        miniature.write_record(
+            net / "Annotations" / f"{split}.mat", [miniature.pascal_object("ashtray")]
+        )
         miniature.write_image(net / "Images" / f"{split}.JPEG")
         net.joinpath("Image_sets").mkdir(exist_ok=True)
         net.joinpath("Image_sets", f"{split}.txt").write_text(f"{split}\n")
@@ -98,7 +113,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def in_folder(files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def in_folder(
+    files: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[None]:
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
     monkeypatch.chdir(files)
     threads = torch.get_num_threads()
@@ -136,7 +153,9 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     [pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else []) for p in PAGES if steps(p)],
     ids=lambda p: str(p.relative_to(ROOT)),
 )
-def test_page_runs(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_page_runs(
+    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     names: dict[str, Any] = {"__name__": "page"}
     for kind, text in steps(page):
         if kind == "python":
@@ -145,10 +164,15 @@ def test_page_runs(page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
             words = split_command(text)
             expected = int("datasets/verify.py" in words and not set(words).isdisjoint(DEFECTIVE))
             assert run_command(words, monkeypatch) == expected, (text, capsys.readouterr().err)
-            if "register" in words and "photo.jpg" in words and not any(word.startswith("--up=") for word in words):
+            if (
+                "register" in words
+                and "photo.jpg" in words
+                and not any(word.startswith("--up=") for word in words)
+            ):
                 result = json.loads(Path("out/part/result.json").read_text("utf-8"))
                 R = torch.tensor(result["rotation"], dtype=torch.float64)
-                allowed = 20 if result["translation"] is None else 5  # without a camera R is allocentric
+                # without a camera R is allocentric
+                allowed = 20 if result["translation"] is None else 5
                 assert float(rotation_error(R, pose(30.0)[:3, :3])) < allowed
     for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
         assert Path(name).is_file(), f"the page promises {name}"

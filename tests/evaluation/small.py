@@ -1,6 +1,8 @@
-"""Short evaluations. ``python -m tests.evaluation.small WORDS`` is the command line with a small bank.
+"""Short evaluations. ``python -m tests.evaluation.small WORDS`` is the command line with a small
+bank.
 
-``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last bytes are lost.
+``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last
+bytes are lost.
 """
 
 import os
@@ -32,8 +34,10 @@ def rows_of(benchmark, out):
 
 
 def kill_in_write(count: int) -> None:
-    """Kill this process in its ``count``-th write of a file that is neither a bank nor a picture."""
-    sync, writes = os.fsync, 0
+    """Kill this process in its ``count``-th write of a file that is neither a bank nor a
+    picture."""
+    sync = os.fsync
+    writes = 0
 
     def sync_or_die(file):
         nonlocal writes

@@ -13,7 +13,9 @@ from curvireg_torch.evaluation.compare import compare, in_words, read_run
 from tests._support.lists import written
 
 
-def write_run(folder, errors, dataset="pascal3d", columns=("error_deg", "symmetric_error_deg"), **settings):
+def write_run(
+    folder, errors, dataset="pascal3d", columns=("error_deg", "symmetric_error_deg"), **settings
+):
     """Write a run with errors in degrees by key."""
     folder.mkdir()
     settings = {"dataset": dataset, "root": "set", "split": "val", "preset": "learned", **settings}
@@ -35,15 +37,24 @@ def runs(tmp_path):
 
 def test_pairs_are_counted_and_a_sign_test_is_made(runs):
     comparisons = {each.score: each for each in compare(*map(read_run, runs))}
-    assert list(comparisons) == ["acc_pi_6", "acc_pi_18", "symmetric_acc_pi_6", "symmetric_acc_pi_18", "med_err_deg"]
+    assert list(comparisons) == [
+        "acc_pi_6",
+        "acc_pi_18",
+        "symmetric_acc_pi_6",
+        "symmetric_acc_pi_18",
+        "med_err_deg",
+    ]
     # below 30 degrees: A 0 1 4 7, B 0 1 2 3 5 7
     within = comparisons["acc_pi_6"]
     assert (within.n, within.a, within.b, within.difference) == (8, 0.5, 0.75, 0.25)
     assert (within.wins, within.losses) == (3, 1)
     assert within.p == pytest.approx(2 * binom.cdf(1, 4, 0.5))
     # Wilson, by hand
-    z, n, share = 1.959964, 8, 0.5
-    centre, half = (share + z * z / 2 / n) / (1 + z * z / n), math.sqrt(share / n * (1 - share) + (z / 2 / n) ** 2)
+    z = 1.959964
+    n = 8
+    share = 0.5
+    centre = (share + z * z / 2 / n) / (1 + z * z / n)
+    half = math.sqrt(share / n * (1 - share) + (z / 2 / n) ** 2)
     half *= z / (1 + z * z / n)
     assert within.a_interval == pytest.approx((centre - half, centre + half), abs=1e-5)
     assert within.difference_interval[0] < 0.25 < within.difference_interval[1]
@@ -60,14 +71,24 @@ def test_a_run_equals_itself(runs):
     run = read_run(runs[0])
     for each in compare(run, run):
         assert (each.difference, each.wins, each.losses, each.p) == (0.0, 0, 0, 1.0)
-        assert each.difference_interval[0] == each.difference_interval[1] == 0.0 or each.score == "med_err_deg"
+        assert (
+            each.difference_interval[0] == each.difference_interval[1] == 0.0
+            or each.score == "med_err_deg"
+        )
 
 
 def test_intervals_of_many_objects_are_narrow_and_hold_the_truth(tmp_path):
-    """Of 1000 objects, about 600 and 700 are right: the standard error of the difference is 0.02."""
+    """Of 1000 objects, about 600 and 700 are right: the standard error of the difference is
+    0.02."""
     draw = np.random.default_rng(5)
-    errors = [{str(k): 5.0 if draw.random() < share else 90.0 for k in range(1000)} for share in (0.6, 0.7)]
-    pair = [read_run(write_run(tmp_path / str(k), some, "web", ("error_deg",))) for k, some in enumerate(errors)]
+    errors = [
+        {str(k): 5.0 if draw.random() < share else 90.0 for k in range(1000)}
+        for share in (0.6, 0.7)
+    ]
+    pair = [
+        read_run(write_run(tmp_path / str(k), some, "web", ("error_deg",)))
+        for k, some in enumerate(errors)
+    ]
     each = compare(*pair)[0]
     low, high = each.difference_interval
     assert 0.07 < high - low < 0.1
@@ -80,7 +101,14 @@ def test_average_recalls_of_bop_are_compared_by_object(tmp_path):
     first = write_run(tmp_path / "a", {"0": 0.26, "1": 0.04, "2": "inf"}, "bop", columns)
     second = write_run(tmp_path / "b", {"0": 0.21, "1": 0.04, "2": 0.6}, "bop", columns)
     found = {each.score: each for each in compare(read_run(first), read_run(second))}
-    assert list(found) == ["acc_15_deg", "acc_30_deg", "add_recall_0.1d", "mssd_ar", "mspd_ar", "med_err_deg"]
+    assert list(found) == [
+        "acc_15_deg",
+        "acc_30_deg",
+        "add_recall_0.1d",
+        "mssd_ar",
+        "mspd_ar",
+        "med_err_deg",
+    ]
     recall = found["mssd_ar"]  # thresholds 0.05 to 0.5
     assert (recall.a, recall.b) == pytest.approx(((0.5 + 1.0) / 3, (0.6 + 1.0) / 3))
     assert (recall.wins, recall.losses) == (1, 0)

@@ -28,7 +28,9 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     assert "other_class" not in skipped, "objects of other classes are not"
     rows = rows_of(benchmark, tmp_path / "out")
     found = {key: (row.get("skipped"), row["status"]) for key, row in rows.items()}
-    scored = dict.fromkeys(("car/2008_000001/0", "car/2008_000002/1", "car/2008_000002/2"), (None, "ok"))
+    scored = dict.fromkeys(
+        ("car/2008_000001/0", "car/2008_000002/1", "car/2008_000002/2"), (None, "ok")
+    )
     broken = {"car/2008_000003/8": "unreadable_image", "sofa/2008_000002/0": "unreadable_mesh"}
     assert found == {**scored, **{key: (reason, "failed") for key, reason in broken.items()}}
     good = rows["car/2008_000001/0"]
@@ -39,9 +41,18 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     R = torch.tensor(good["rotation"], dtype=torch.float64)
     torch.testing.assert_close(R @ R.T, torch.eye(3).double(), atol=1e-6, rtol=0)
     files = {p.name for p in (tmp_path / "out").iterdir()} - {MARKER}
-    assert files == {"results.jsonl", "predictions.csv", "errors.csv", "summary.json", "index.html", "thumbnails"}
+    assert files == {
+        "results.jsonl",
+        "predictions.csv",
+        "errors.csv",
+        "summary.json",
+        "index.html",
+        "thumbnails",
+    }
     assert (tmp_path / "out" / "index.html").read_text().count("<img") == 3
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["protocol"] == str(Protocol())
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["protocol"] == str(
+        Protocol()
+    )
 
 
 def test_evaluate_bop(bop, tmp_path):
@@ -60,7 +71,9 @@ def test_evaluate_bop(bop, tmp_path):
 def test_objects_fail_alone(bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any"))
     first, second, third = benchmark.entries[:3]
-    benchmark.entries[0] = replace(first, camera=Camera(torch.diag(torch.tensor([400.0, 300.0, 1.0]))))
+    benchmark.entries[0] = replace(
+        first, camera=Camera(torch.diag(torch.tensor([400.0, 300.0, 1.0])))
+    )
     benchmark.entries[1] = replace(second, box=tuple(v + 5000.0 for v in second.box))
     summary = run(benchmark, tmp_path / "out")
     rows = rows_of(benchmark, tmp_path / "out")
@@ -82,7 +95,9 @@ def test_results_are_the_same_bits_on_other_threads_and_resumed(pascal, tmp_path
     timeless = [{key: {**row, "seconds": None} for key, row in rows.items()} for rows in (one, two)]
     assert timeless[0] == timeless[1]
     assert len(first) == 2
-    assert {key: two[key] for key in first} == first, "seconds included: nothing was registered twice"
+    assert {key: two[key] for key in first} == first, (
+        "seconds included: nothing was registered twice"
+    )
 
 
 def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
@@ -93,9 +108,13 @@ def test_defects_end_the_run(pascal, tmp_path, monkeypatch):
 
 
 def test_protocol_and_pipeline_reach_the_registrar(pascal, tmp_path, monkeypatch):
-    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")  # a second CAD of a car
-    registrars, init = [], Registrar.__init__
-    monkeypatch.setattr(Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k))
+    # a second CAD of a car
+    trimesh.creation.box((0.2, 0.9, 0.2)).export(pascal.root / "CAD" / "car" / "02.off")
+    registrars = []
+    init = Registrar.__init__
+    monkeypatch.setattr(
+        Registrar, "__init__", lambda self, *a, **k: registrars.append(self) or init(self, *a, **k)
+    )
     benchmark = Pascal3DBenchmark(pascal, Protocol(cad="any"))
     run(benchmark, tmp_path, pipeline=replace(SMALL, box_jitter=0.05), limit=1)
     assert len(registrars[0].others or registrars[-1].others) == 1
@@ -127,7 +146,9 @@ def test_evaluate_web_tells_known_from_unknown_poses(web, tmp_path, capsys):
 
 def test_objects_are_grouped_by_class_or_number(pascal, bop, web):
     first = {"pascal3d": pascal, "bop": bop, "web": web}
-    found = [DATASETS[kind].category.format_map(dataset.annotation(0)) for kind, dataset in first.items()]
+    found = [
+        DATASETS[kind].category.format_map(dataset.annotation(0)) for kind, dataset in first.items()
+    ]
     assert found == ["car", "object 1", "cup"]
 
 
@@ -143,7 +164,9 @@ def evaluate(tmp_path):
     return run
 
 
-def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_file(pascal, evaluate, capsys, tmp_path):
+def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_file(
+    pascal, evaluate, capsys, tmp_path
+):
     words = ("pascal3d", pascal.root, "--categories", "car")
     assert evaluate(*words, "--limit", "2")["limit"] == 2
     summary = evaluate(*words)
@@ -154,19 +177,29 @@ def test_evaluate_prints_the_headline_of_some_categories_and_takes_a_pipeline_fi
     numbers = f"acc_pi_6 {summary['acc_pi_6']:.3f}   acc_pi_18 {summary['acc_pi_18']:.3f}   "
     assert lines[-2].startswith(numbers)
     (tmp_path / "pipeline.json").write_text(replace(SMALL, box_jitter=0.0).to_json())
-    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")["settings"]
+    settings = evaluate("pascal3d", pascal.root, "--pipeline", tmp_path / "pipeline.json")[
+        "settings"
+    ]
     assert (settings["preset"], settings["pipeline"]["box_jitter"]) == ("custom", 0.0)
 
 
 def test_evaluate_keeps_the_views_of_the_preset_paper(pascal, evaluate):
-    settings = evaluate("pascal3d", pascal.root, "--categories", "car", "--limit", "1", "--preset", "paper")["settings"]
+    settings = evaluate(
+        "pascal3d", pascal.root, "--categories", "car", "--limit", "1", "--preset", "paper"
+    )["settings"]
     assert (settings["preset"], settings["protocol"].split()[1]) == ("paper", "pose=upright")
-    assert (settings["pipeline"]["views"]["pose"], settings["pipeline"]["views"]["frame"]) == ("paper", "principal")
+    assert (settings["pipeline"]["views"]["pose"], settings["pipeline"]["views"]["frame"]) == (
+        "paper",
+        "principal",
+    )
 
 
 def test_evaluate_bop_assumes_any_pose(bop, evaluate):
     summary = evaluate("bop", bop.root, "--protocol", "box=0.1", "seed=3")
-    assert (summary["protocol"], summary["settings"]["dataset"]) == ("cad=annotated pose=any box=0.1 seed=3", "bop")
+    assert (summary["protocol"], summary["settings"]["dataset"]) == (
+        "cad=annotated pose=any box=0.1 seed=3",
+        "bop",
+    )
     views = summary["settings"]["pipeline"]["views"]
     assert (views["pose"], views["directions"], views["theta_step"]) == ("any", 18, 360.0)
 
@@ -174,12 +207,16 @@ def test_evaluate_bop_assumes_any_pose(bop, evaluate):
 def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, capsys, monkeypatch):
     """The summary has the recall of boxes; thumbnails show the found box."""
     boxes = []
-    monkeypatch.setattr("curvireg_torch.evaluation.runner.thumbnail", lambda *a: boxes.append(a[3]) or b"")
+    monkeypatch.setattr(
+        "curvireg_torch.evaluation.runner.thumbnail", lambda *a: boxes.append(a[3]) or b""
+    )
     words = ("pascal3d", pascal.root, "--limit", "2", "--protocol", "box=none")
     summary = evaluate(*words)
     assert summary["detection"]["n"] == 2
     assert f"recall_1 {summary['detection']['recall_1']:.3f}   recall_5" in capsys.readouterr().out
-    rows = [json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line) for line in (tmp_path / "out" / "results.jsonl").read_text().splitlines()
+    ]
     row = next(row for row in rows if "detection" in row)
     assert row["detection"]["proposals"][0]["box"] in boxes
 

@@ -1,4 +1,5 @@
-"""Registration of lists: what is repeated, what the tables and the page show, and names that are no text."""
+"""Registration of lists: what is repeated, what the tables and the page show, and names that are no
+text."""
 
 import os
 from dataclasses import replace
@@ -26,7 +27,9 @@ LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
 def registrar():
     """The example mesh in eight views, without refinement."""
     views = sample_views(azimuth_step=45, elevations=[20])
-    bank = ViewBank.build(example_mesh(), views, pipeline=PRESETS["classical"], image_size=64, progress=False)
+    bank = ViewBank.build(
+        example_mesh(), views, pipeline=PRESETS["classical"], image_size=64, progress=False
+    )
     return Registrar(bank, pipeline=unrefined(bank))
 
 
@@ -35,21 +38,37 @@ def entry(tmp_path):
     """A photograph with its box."""
     write_photo(tmp_path / "photo.png", scene(0)[0])
     (tmp_path / "mesh.ply").write_text("a mesh")
-    return Entry({}, "photo.png", tmp_path / "photo.png", (tmp_path / "mesh.ply",), box=tuple(scene(0)[1].tolist()))
+    return Entry(
+        {},
+        "photo.png",
+        tmp_path / "photo.png",
+        (tmp_path / "mesh.ply",),
+        box=tuple(scene(0)[1].tolist()),
+    )
 
 
 def register_rows(rows, out, registrar, settings=None):
-    return lists.register_list(rows, out, lambda _: registrar, settings=settings or {}, progress=False)
+    return lists.register_list(
+        rows, out, lambda _: registrar, settings=settings or {}, progress=False
+    )
 
 
 def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, monkeypatch):
     unknown_box = replace(entry, box=None, camera=CAMERA)
-    rows = [entry, replace(entry, camera=CAMERA), replace(unknown_box, instances=2), replace(entry, camera=50.0), entry]
+    rows = [
+        entry,
+        replace(entry, camera=CAMERA),
+        replace(unknown_box, instances=2),
+        replace(entry, camera=50.0),
+        entry,
+    ]
     done = []
 
     def register_entry(one, photo, registrar, **_):
         done.append(one)
-        return original(replace(one, box=entry.box, instances=1), photo, registrar, bank_seconds=0.0)
+        return original(
+            replace(one, box=entry.box, instances=1), photo, registrar, bank_seconds=0.0
+        )
 
     original = runner.register_entry
     monkeypatch.setattr(runner, "register_entry", register_entry)
@@ -77,21 +96,30 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     assert (counts.ok, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
     rows = table(tmp_path / "out")
-    assert [os.path.basename(row["photo"]) for row in rows] == [r"caf\udce9.png", r"gar\udce7on.png"]
+    assert [os.path.basename(row["photo"]) for row in rows] == [
+        r"caf\udce9.png",
+        r"gar\udce7on.png",
+    ]
     assert [row["status"] for row in rows] == ["ok", "failed"]
     assert r"caf\udce9.png" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
 
 
 def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     """Excel ends every line by the commas of cells that were used once."""
-    path, options = tmp_path / "excel.csv", RegisterOptions(meshes=(tmp_path / "part.stl",))
+    path = tmp_path / "excel.csv"
+    options = RegisterOptions(meshes=(tmp_path / "part.stl",))
     rows = "a.png,1,2,30,40,,,\nb.png,1,2,30,40,new,,\n,,,,,,,\nc.png,1,2,30,40,x,y,\n"
     path.write_text(f"Photo ,x0,Y0,x1,y1,note,,\n{rows}")
     found = read_list(path, options)
     assert list(found[0].cells) == ["Photo ", "x0", "Y0", "x1", "y1", "note"]
     assert [entry.cells["note"] for entry in found] == ["", "new", "x"]
-    assert [entry.error for entry in found] == ["", "", "7 cells, the header has 6; quote texts with commas"]
-    path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")  # one within the table is passed through
+    assert [entry.error for entry in found] == [
+        "",
+        "",
+        "7 cells, the header has 6; quote texts with commas",
+    ]
+    # one within the table is passed through
+    path.write_text("photo,x0,,y0,x1,y1,\na.png,1,,2,30,40,\n")
     assert read_list(path, options)[0].box == (1.0, 2.0, 30.0, 40.0)
 
 
@@ -103,7 +131,9 @@ FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 )
 def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     photo = read_photo(entry.photo)
-    assert photograph.camera_of(replace(entry, camera=None), photo) == (None, None), "without EXIF data"
+    assert photograph.camera_of(replace(entry, camera=None), photo) == (None, None), (
+        "without EXIF data"
+    )
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
     found, name = photograph.camera_of(replace(entry, camera=camera), photo)
     assert (name, found.source) == (source, "exif" if source == "exif" else "given")
@@ -114,17 +144,41 @@ def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
 def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):
     """And the guess is that of rows without one."""
     path = tmp_path / "list.csv"
-    path.write_text("photo,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1,2,30,40,260,260,119.5,89.5\nb.png,1,2,30,40,,,,\n")
+    path.write_text(
+        "photo,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1,2,30,40,260,260,119.5,89.5\nb.png,1,2,30,40,,,,\n"
+    )
     first, second = read_list(path, RegisterOptions(meshes=(tmp_path / "part.stl",), guess=50.0))
     assert torch.equal(first.camera.matrix, CAMERA.matrix)
     assert second.camera == 50.0
 
 
 def test_names_are_in_the_order_of_their_numbers(tmp_path):
-    names = ["b.png", "a10.png", "a9.png", "a09.png", "a.png", "1.png", "x1y10.png", "x1y2.png", "10.png", "2.png"]
+    names = [
+        "b.png",
+        "a10.png",
+        "a9.png",
+        "a09.png",
+        "a.png",
+        "1.png",
+        "x1y10.png",
+        "x1y2.png",
+        "10.png",
+        "2.png",
+    ]
     for name in names:
         (tmp_path / name).touch()
-    expected = ["1.png", "2.png", "10.png", "a09.png", "a9.png", "a10.png", "a.png", "b.png", "x1y2.png", "x1y10.png"]
+    expected = [
+        "1.png",
+        "2.png",
+        "10.png",
+        "a09.png",
+        "a9.png",
+        "a10.png",
+        "a.png",
+        "b.png",
+        "x1y2.png",
+        "x1y10.png",
+    ]
     assert [path.name for path in find_photographs(tmp_path)] == expected
     assert [path.name for path in find_photographs(tmp_path / "[ab]*.png")] == expected[3:8]
     assert find_photographs(tmp_path / "none.png") == [tmp_path / "none.png"]

@@ -1,4 +1,5 @@
-"""Errors and recalls against scipy, numpy and loops; missing estimates (NaN, inf) are misses; bad input is refused."""
+"""Errors and recalls against scipy, numpy and loops; missing estimates (NaN, inf) are misses; bad
+input is refused."""
 
 import math
 from collections.abc import Callable
@@ -43,34 +44,51 @@ def test_averages_count_missing_estimates_as_misses_and_thresholds_are_strict() 
         values = 180.0 * torch.rand(n, generator=torch.Generator().manual_seed(n))
         assert metrics.median_error(values) == pytest.approx(float(np.median(values.numpy())))
     errors = torch.tensor([0.0, 0.07, 0.26, 0.50, torch.inf])
-    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of the ten.
+    # Thresholds 0.05, 0.10, ..., 0.50: the errors pass 10, 9, 5, 0 (0.5 is not below 0.5) and 0 of
+    # the ten.
     assert metrics.average_recall(errors, metrics.MSSD_THRESHOLDS) == pytest.approx(24 / 50)
     assert metrics.average_recall(errors, metrics.ADD_THRESHOLDS) == pytest.approx(2 / 5)
     pixels = torch.tensor([0.0, 7.0, 26.0, 50.0, torch.inf], dtype=torch.float64)
     assert metrics.average_recall(pixels / 640, metrics.MSPD_THRESHOLDS) == pytest.approx(24 / 50)
-    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx((10 + 8) / 50)
+    assert metrics.average_recall(pixels / 320, metrics.MSPD_THRESHOLDS) == pytest.approx(
+        (10 + 8) / 50
+    )
     assert math.isnan(metrics.median_error(errors[:0]))
     assert math.isnan(metrics.average_recall(errors[:0], metrics.MSSD_THRESHOLDS))
-    for bad in (torch.tensor([-1.0]), torch.tensor([math.nan]), torch.zeros(2, 2), torch.tensor([1])):
-        for average in (metrics.median_error, lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS)):
+    for bad in (
+        torch.tensor([-1.0]),
+        torch.tensor([math.nan]),
+        torch.zeros(2, 2),
+        torch.tensor([1]),
+    ):
+        for average in (
+            metrics.median_error,
+            lambda errors: metrics.average_recall(errors, metrics.ADD_THRESHOLDS),
+        ):
             with pytest.raises(InvalidInputError, match="errors: expected"):
                 average(bad)
 
 
 def test_symmetric_rotation_error_is_the_minimum_over_symmetries_and_identity() -> None:
-    est, gt, symmetries = rotations(10, 2), rotations(10, 3), rotations(4, 4)
+    est = rotations(10, 2)
+    gt = rotations(10, 3)
+    symmetries = rotations(4, 4)
     group = [np.eye(3), *symmetries.numpy()]
     slow = [
         math.degrees(min(Rotation.from_matrix(e.T @ g @ s).magnitude() for s in group))
         for e, g in zip(est.numpy(), gt.numpy(), strict=True)
     ]
-    np.testing.assert_allclose(metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6)
+    np.testing.assert_allclose(
+        metrics.symmetric_rotation_error(est, gt, symmetries), slow, atol=1e-6
+    )
     plain = metrics.symmetric_rotation_error(est, gt, torch.empty(0, 3, 3))
     torch.testing.assert_close(plain, rotation_error(est, gt))
     assert metrics.symmetric_rotation_error(est[:0], gt[:0], symmetries).shape == (0,)
 
 
-@pytest.mark.parametrize(("value", "whole"), [(math.nan, True), (math.nan, False), (-math.inf, False)])
+@pytest.mark.parametrize(
+    ("value", "whole"), [(math.nan, True), (math.nan, False), (-math.inf, False)]
+)
 def test_rotation_errors_of_missing_estimates_are_infinite(value: float, whole: bool) -> None:
     missing = R.clone()
     missing[2].view(-1)[slice(None) if whole else slice(0, 1)] = value
@@ -89,7 +107,8 @@ def test_add_and_adds_against_loops() -> None:
     np.testing.assert_allclose(metrics.adds_error(EST, GT, POINTS), adds)
     # The model is asymmetric, so the opposite direction of nearest neighbours gives another result.
     points = torch.cat([POINTS * 0.01, torch.tensor([[3.0, 0.0, 0.0]], dtype=torch.float64)])
-    est, gt = poses(1, 3), poses(1, 4)
+    est = poses(1, 3)
+    gt = poses(1, 4)
     forward = cdist(_move(gt[0], points), _move(est[0], points)).min(1).mean()
     backward = cdist(_move(est[0], points), _move(gt[0], points)).min(1).mean()
     assert abs(forward - backward) > 0.01
@@ -101,26 +120,37 @@ def test_mssd_and_mspd_against_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     symmetries[:, :3, 3] *= 0.02
     cameras = K.repeat(5, 1, 1)
     cameras[:, 0, 0] += 50.0 * torch.arange(5)
-    mssd, mspd = [], []
+    mssd = []
+    mspd = []
     for e, g, camera in zip(EST, GT, cameras, strict=True):
         turned = [_move(g.numpy() @ s.numpy()) for s in symmetries]
         mssd.append(min(np.linalg.norm(_move(e) - points, axis=1).max() for points in turned))
         pixels = [_project(_move(e), camera) - _project(points, camera) for points in turned]
         mspd.append(min(np.linalg.norm(difference, axis=1).max() for difference in pixels))
-    for chunk, few in ((metrics._CHUNK, 300), (90, 3)):  # all at once; two transforms at a time, bounds by few points
+    # all at once; two transforms at a time, bounds by few points
+    for chunk, few in ((metrics._CHUNK, 300), (90, 3)):
         monkeypatch.setattr(metrics, "_CHUNK", chunk)
         monkeypatch.setattr(metrics, "BOUNDING_POINTS", few)
         np.testing.assert_allclose(metrics.mssd_error(EST, GT, POINTS, symmetries=symmetries), mssd)
-        np.testing.assert_allclose(metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd)
+        np.testing.assert_allclose(
+            metrics.mspd_error(EST, GT, POINTS, cameras, symmetries=symmetries), mspd
+        )
 
 
-def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_symmetries_of_a_solid_of_revolution_are_compared_by_all_points(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Scores of cans with 315 symmetries took minutes."""
     angles = torch.arange(315.0, dtype=torch.float64) * (2 * math.pi / 315)
     symmetries = torch.eye(4, dtype=torch.float64).repeat(315, 1, 1)
-    symmetries[:, :2, :2] = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1).view(-1, 2, 2)
-    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
-    moved, transform = [], metrics._transform
+    symmetries[:, :2, :2] = torch.stack(
+        [angles.cos(), -angles.sin(), angles.sin(), angles.cos()], 1
+    ).view(-1, 2, 2)
+    points = (
+        torch.rand(6000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    )
+    moved = []
+    transform = metrics._transform
     counted = lambda T, points: moved.append(len(T) * len(points)) or transform(T, points)  # noqa: E731
     monkeypatch.setattr(metrics, "_transform", counted)
     metrics.mssd_error(EST, GT, points, symmetries=symmetries)
@@ -136,7 +166,12 @@ def test_mspd_error_is_infinite_for_points_behind_the_camera() -> None:
     assert bool(metrics.mssd_error(behind, GT, POINTS).isfinite().all())
 
 
-ERRORS = [metrics.add_error, metrics.adds_error, metrics.mssd_error, lambda *poses: metrics.mspd_error(*poses, K)]
+ERRORS = [
+    metrics.add_error,
+    metrics.adds_error,
+    metrics.mssd_error,
+    lambda *poses: metrics.mspd_error(*poses, K),
+]
 
 
 @pytest.mark.parametrize("error", ERRORS)
@@ -153,7 +188,8 @@ def test_pose_errors_contract(error: Callable[[Tensor, Tensor, Tensor], Tensor])
     single = error(EST.float(), GT, POINTS)
     assert single.dtype == torch.float32
     torch.testing.assert_close(single.double(), whole, rtol=1e-3, atol=1e-5)
-    zero = torch.zeros_like(EST)  # would map every point to the origin, which may be close to the surface
+    # would map every point to the origin, which may be close to the surface
+    zero = torch.zeros_like(EST)
     for est, gt, points, message in (
         (EST, GT, POINTS[:0], "points: expected at least one"),
         (EST, GT, POINTS * math.nan, "points: expected finite"),
@@ -170,9 +206,15 @@ WRONG: dict[str, Callable[[], object]] = {
     "R_est: expected": lambda: metrics.symmetric_rotation_error(R[0, 0], R, SYMMETRIES),
     "R_gt: expected": lambda: metrics.symmetric_rotation_error(R, R.tolist(), SYMMETRIES),  # type: ignore[arg-type]
     "R_gt: expected finite": lambda: metrics.symmetric_rotation_error(R, R * math.nan, SYMMETRIES),
-    "symmetries: expected finite": lambda: metrics.symmetric_rotation_error(R, R, SYMMETRIES * math.nan),
-    "symmetries: expected shape .* with S >= 1": lambda: metrics.mssd_error(EST, GT, POINTS, symmetries=GT[:0]),
-    "symmetries: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K, symmetries=GT * math.inf),
+    "symmetries: expected finite": lambda: metrics.symmetric_rotation_error(
+        R, R, SYMMETRIES * math.nan
+    ),
+    "symmetries: expected shape .* with S >= 1": lambda: metrics.mssd_error(
+        EST, GT, POINTS, symmetries=GT[:0]
+    ),
+    "symmetries: expected": lambda: metrics.mspd_error(
+        EST, GT, POINTS, K, symmetries=GT * math.inf
+    ),
     "camera_matrix: expected": lambda: metrics.mspd_error(EST, GT, POINTS, K[None].repeat(2, 1, 1)),
     "camera matrix: expected finite": lambda: metrics.mspd_error(EST, GT, POINTS, K * math.nan),
 }
@@ -195,4 +237,6 @@ def test_the_largest_distance_of_one_pose_is_that_of_all_points() -> None:
         pose[0, 2, 3] = 2.0
     assert float(metrics.mssd_error(quarter, identity, points)) == pytest.approx(math.sqrt(2))
     camera = torch.diag(torch.tensor([100.0, 100.0, 1.0], dtype=torch.float64))
-    assert float(metrics.mspd_error(quarter, identity, points, camera)) == pytest.approx(50 * math.sqrt(2))
+    assert float(metrics.mspd_error(quarter, identity, points, camera)) == pytest.approx(
+        50 * math.sqrt(2)
+    )

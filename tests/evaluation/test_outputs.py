@@ -1,4 +1,5 @@
-"""The rule for files that commands write: no input, and nothing of others, is written or removed."""
+"""The rule for files that commands write: no input, and nothing of others, is written or
+removed."""
 
 import json
 import os
@@ -13,12 +14,16 @@ def marked(folder):
     return json.loads((folder / MARKER).read_text())["commands"]
 
 
-@pytest.mark.parametrize(("command", "name"), [(command, name) for command in FILES for name in FILES[command]])
+@pytest.mark.parametrize(
+    ("command", "name"), [(command, name) for command in FILES for name in FILES[command]]
+)
 def test_files_of_others_are_refused_and_named(tmp_path, command, name):
     file = tmp_path / name.replace("*", "1")
     file.write_text("of others")
     with (
-        pytest.raises(InvalidInputError, match=rf"{file.name}: not written by this command; move it away"),
+        pytest.raises(
+            InvalidInputError, match=rf"{file.name}: not written by this command; move it away"
+        ),
         output_folder(tmp_path, command),
     ):
         pytest.fail("work began")
@@ -33,7 +38,10 @@ def test_own_files_are_replaced_and_others_beside_them_do_not_matter(tmp_path):
             (tmp_path / "result.json").write_text("{}")
     assert marked(tmp_path) == {"register": {"files": ["result.json"], "source": []}}
     (tmp_path / "pose.glb").write_text("a mesh that came later")
-    with pytest.raises(InvalidInputError, match=r"pose\.glb: not written"), output_folder(tmp_path, "register"):
+    with (
+        pytest.raises(InvalidInputError, match=r"pose\.glb: not written"),
+        output_folder(tmp_path, "register"),
+    ):
         pytest.fail("work began")
 
 
@@ -102,13 +110,17 @@ def test_results_of_another_source_would_be_lost(tmp_path):
         output_folder(tmp_path, "register several", source=["a.jpg", "c.jpg"]).__enter__()
     with output_folder(tmp_path, "register several"):
         pass
-    assert marked(tmp_path)["register several"]["source"] == ["a.jpg", "b.jpg"], "where none is given, it stays"
+    assert marked(tmp_path)["register several"]["source"] == ["a.jpg", "b.jpg"], (
+        "where none is given, it stays"
+    )
     with output_folder(tmp_path, "register several", source=["c.jpg", "b.jpg", "a.jpg"]):
         pass
     assert marked(tmp_path)["register several"]["source"] == ["c.jpg", "b.jpg", "a.jpg"]
 
 
-@pytest.mark.parametrize("content", ["[]", "{", '{"commands": [1]}', '{"commands": {"register": {"files": 1}}}'])
+@pytest.mark.parametrize(
+    "content", ["[]", "{", '{"commands": [1]}', '{"commands": {"register": {"files": 1}}}']
+)
 def test_damaged_markers_are_refused(tmp_path, content):
     (tmp_path / MARKER).write_text(content)
     with pytest.raises(InvalidInputError, match=rf"{MARKER}: "):
@@ -119,7 +131,9 @@ def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):
     file = tmp_path / "new" / "overlay.png"
     check_output_file(file, [], mark=b"curvireg")
     file.write_bytes(b"a picture")
-    with pytest.raises(InvalidInputError, match=r"overlay\.png: exists, and this command did not write it"):
+    with pytest.raises(
+        InvalidInputError, match=r"overlay\.png: exists, and this command did not write it"
+    ):
         check_output_file(file, [], mark=b"curvireg")
     file.write_bytes(b"a picture by curvireg")
     check_output_file(file, [], mark=b"curvireg")

@@ -25,12 +25,22 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(folder):
-    photo, box = folder / "photos" / "0.png", [float(v) for v in box_of(0)]
-    return cr.register(str(photo), str(folder / "learned.safetensors"), box=box, camera=[float(v) for v in CAMERA])
+    photo = folder / "photos" / "0.png"
+    box = [float(v) for v in box_of(0)]
+    return cr.register(
+        str(photo), str(folder / "learned.safetensors"), box=box, camera=[float(v) for v in CAMERA]
+    )
 
 
-def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(folder, result, tmp_path):
-    words = [str(folder / "photos" / "0.png"), str(folder / "learned.safetensors"), "--box", *box_of(0)]
+def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(
+    folder, result, tmp_path
+):
+    words = [
+        str(folder / "photos" / "0.png"),
+        str(folder / "learned.safetensors"),
+        "--box",
+        *box_of(0),
+    ]
     assert main(["register", *words, "--camera", *CAMERA, "--out", str(tmp_path), "--quiet"]) == 0
     document = json.loads((tmp_path / "result.json").read_text())
     for name in ("rotation", "translation", "quaternion", "T_cam_from_model"):
@@ -41,21 +51,29 @@ def test_register_equals_the_command_to_the_last_digit_and_saves_its_files(folde
     files = {path.name for path in (tmp_path / "out").iterdir()} - {MARKER}
     of_command = {path.name for path in tmp_path.iterdir()} - {"out", MARKER}
     assert files == of_command == {"result.json", "overlay.png", "pose.glb"}
-    assert json.loads((tmp_path / "out" / "result.json").read_text())["rotation"] == result.rotation.tolist()
+    assert (
+        json.loads((tmp_path / "out" / "result.json").read_text())["rotation"]
+        == result.rotation.tolist()
+    )
 
 
 def test_register_takes_pictures_of_other_kinds(folder, result):
-    registrar, box = learned_registrar(), box_of(0)
+    registrar = learned_registrar()
+    box = box_of(0)
     numbers = [float(v) for v in box]
     with Image.open(folder / "photos" / "0.png") as picture:
         pixels = np.array(picture.convert("RGB"))
         for image in (picture, pixels, torch.from_numpy(pixels).permute(2, 0, 1)):
-            same = cr.register(image, registrar, box=numbers, camera=cr.camera_matrix(*map(float, CAMERA)))
+            same = cr.register(
+                image, registrar, box=numbers, camera=cr.camera_matrix(*map(float, CAMERA))
+            )
             assert same.rotation.equal(result.rotation)
 
 
 def test_register_detects_the_object_without_a_box(folder):
-    found = cr.register(folder / "photos" / "0.png", learned_registrar(), camera=tuple(map(float, CAMERA)))
+    found = cr.register(
+        folder / "photos" / "0.png", learned_registrar(), camera=tuple(map(float, CAMERA))
+    )
     assert float(cr.rotation_error(found.rotation, scene(0)[2][:3, :3])) < 5
     expected = torch.tensor([float(v) for v in box_of(0)])
     assert float((found.box - expected).abs().max()) < 12
@@ -65,14 +83,23 @@ def test_register_takes_the_camera_from_exif(folder):
     photo = folder / "exif.png"
     cv2.imwrite(str(photo), cv2.imread(str(folder / "photos" / "0.png")))
     with_exif(photo, exif(1, 38))
-    guessed = cr.register(photo, learned_registrar(), box=[float(v) for v in box_of(0)], camera="exif")
+    guessed = cr.register(
+        photo, learned_registrar(), box=[float(v) for v in box_of(0)], camera="exif"
+    )
     assert guessed.translation is not None
 
 
 def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
-    fits, original = torch.tensor([1.0, 2.0, 30.0, 40.0]).double(), cr.Registrar.__call__
-    monkeypatch.setattr(cr.Registrar, "__call__", lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)])
-    found = cr.register(folder / "photos" / "0.png", learned_registrar(), box=[float(v) for v in box_of(0)])
+    fits = torch.tensor([1.0, 2.0, 30.0, 40.0]).double()
+    original = cr.Registrar.__call__
+    monkeypatch.setattr(
+        cr.Registrar,
+        "__call__",
+        lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)],
+    )
+    found = cr.register(
+        folder / "photos" / "0.png", learned_registrar(), box=[float(v) for v in box_of(0)]
+    )
     assert found.box.equal(fits)
 
 
@@ -87,12 +114,15 @@ def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
     drawn = np.asarray(result.plot().axes[0].images[0].get_array())
     np.testing.assert_array_equal(drawn, result.overlay())
     w, x, y, z = result.quaternion.tolist()
-    np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), result.rotation.numpy(), atol=1e-9)
+    np.testing.assert_allclose(
+        Rotation.from_quat([x, y, z, w]).as_matrix(), result.rotation.numpy(), atol=1e-9
+    )
     assert result.T_cam_from_model[:3, 3].equal(result.translation)
 
 
 def test_a_bank_has_the_unit_and_the_axis_that_are_given(folder):
-    photo, bank = folder / "photos" / "0.png", folder / "learned.safetensors"
+    photo = folder / "photos" / "0.png"
+    bank = folder / "learned.safetensors"
     for given in ({"unit": "mm"}, {"up": "y"}):
         with pytest.raises(cr.errors.BankError, match=r"learned\.safetensors: built with"):
             cr.register(photo, bank, **given)

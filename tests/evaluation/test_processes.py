@@ -38,7 +38,9 @@ def evaluation(out):
 
 def list_results(out):
     """Everything that a list wrote, without times."""
-    rows = [{k: v for k, v in row.items() if k not in ("seconds", "revision")} for row in lines(out)]
+    rows = [
+        {k: v for k, v in row.items() if k not in ("seconds", "revision")} for row in lines(out)
+    ]
     return rows, (out / "results.csv").read_text(), (out / "index.html").read_text()
 
 
@@ -50,9 +52,18 @@ def case(request, tmp_path):
         (root / "test_targets_bop19.json").unlink()  # three objects with a box instead of one
         return ["evaluate", "bop", root], evaluation
     write_files(tmp_path)
-    rows = [[f"photos/{seed}.png", *box_of(seed), mesh] for seed in range(3) for mesh in ("truck.ply", "other.ply")]
+    rows = [
+        [f"photos/{seed}.png", *box_of(seed), mesh]
+        for seed in range(3)
+        for mesh in ("truck.ply", "other.ply")
+    ]
     (tmp_path / "other.ply").write_bytes((tmp_path / "truck.ply").read_bytes())
-    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1,mesh", *rows, ["none.png", "", "", "", "", "truck.ply"])
+    path = written(
+        tmp_path / "list.csv",
+        "photo,x0,y0,x1,y1,mesh",
+        *rows,
+        ["none.png", "", "", "", "", "truck.ply"],
+    )
     return ["register", "--list", path], list_results
 
 
@@ -86,13 +97,24 @@ def test_torchrun_gives_the_same_results(case, expected, tmp_path):
     assert not list(out.glob("results.*-of-*")), "the files of the processes are merged"
 
 
-@pytest.mark.parametrize(("photos", "code"), [(["0.png", "1.png"], 3), (["none.png", "missing.png"], 2)])
+@pytest.mark.parametrize(
+    ("photos", "code"), [(["0.png", "1.png"], 3), (["none.png", "missing.png"], 2)]
+)
 def test_strict_ends_with_its_code_for_several_processes_too(tmp_path, photos, code):
     """Nothing is calibrated here, so that no result is reliable."""
     write_files(tmp_path)
     files = [tmp_path / "photos" / name for name in photos]
     done = run(
-        ["register", *files, tmp_path / "truck.safetensors", "--strict", "--jobs", "2", "--out", tmp_path / "out"]
+        [
+            "register",
+            *files,
+            tmp_path / "truck.safetensors",
+            "--strict",
+            "--jobs",
+            "2",
+            "--out",
+            tmp_path / "out",
+        ]
     )
     assert (done.returncode, "Traceback" in done.stderr) == (code, False), done.stderr
     assert (tmp_path / "out" / "results.csv").is_file()

@@ -46,14 +46,20 @@ def test_a_name_of_colmap_keeps_its_inner_blanks(tmp_path):
     (tmp_path / "images.txt").write_text("  7  1 0 0 0   0 0 1  1   a  b.png \t\n\n")
     (view,) = read_rig(tmp_path)
     assert (view.name, view.photo) == ("image a  b.png", tmp_path / "a  b.png")
-    for line in ("1 1 0 0 0 0 0 1 1", "1 1 0 0 0 0 0 1 x a.png", "x 1 0 0 0 0 0 1 1 a.png", "1 1 0 0 0 0 0 x 1 a.png"):
+    for line in (
+        "1 1 0 0 0 0 0 1 1",
+        "1 1 0 0 0 0 0 1 x a.png",
+        "x 1 0 0 0 0 0 1 1 a.png",
+        "1 1 0 0 0 0 0 x 1 a.png",
+    ):
         (tmp_path / "images.txt").write_text(line)
         with pytest.raises(InvalidInputError, match=r"images\.txt: expected IMAGE_ID QW"):
             read_rig(tmp_path)
 
 
 def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path, monkeypatch):
-    read, content = [], calibrations.read_document
+    read = []
+    content = calibrations.read_document
 
     def counted(file):
         read.append(file.name)
@@ -64,7 +70,9 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
     (tmp_path / "a.json").write_text(json.dumps({f"c{k}": camera for k in range(5)}))
     (tmp_path / "b.json").write_text(json.dumps(camera))
     names = [*(f"a.json:c{k}" for k in range(5)), "b.json", "b.json"]
-    rig = written(tmp_path / "rig.csv", COLUMNS, *([f"{k}.png", name, *POSE] for k, name in enumerate(names)))
+    rig = written(
+        tmp_path / "rig.csv", COLUMNS, *([f"{k}.png", name, *POSE] for k, name in enumerate(names))
+    )
     assert len(read_rig(rig)) == 7
     assert sorted(read) == ["a.json", "b.json"]
     read.clear()
@@ -74,18 +82,26 @@ def test_each_calibration_is_read_once_whatever_number_of_rows_names_it(tmp_path
     assert [entry.error for entry in entries] == [""] * 7
     assert sorted(read) == ["a.json", "b.json"]
     read.clear()
-    (tmp_path / "cameras.txt").write_text("\n".join(LINE.replace("1 ", f"{k} ", 1) for k in range(7)))
-    (tmp_path / "images.txt").write_text("".join(f"{k} 1 0 0 0 0 0 1 {k} {k}.png\n\n" for k in range(7)))
+    (tmp_path / "cameras.txt").write_text(
+        "\n".join(LINE.replace("1 ", f"{k} ", 1) for k in range(7))
+    )
+    (tmp_path / "images.txt").write_text(
+        "".join(f"{k} 1 0 0 0 0 0 1 {k} {k}.png\n\n" for k in range(7))
+    )
     assert len(read_rig(tmp_path)) == 7
     assert read == ["cameras.txt"]
 
 
 def test_rigs_and_lists_are_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(rigs, "MAX_RIG_VIEWS", 2)
-    (tmp_path / "b.json").write_text(json.dumps({"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]}))
+    (tmp_path / "b.json").write_text(
+        json.dumps({"camera_matrix": [300.0, 0, 1, 0, 300, 1, 0, 0, 1]})
+    )
     rows = [[f"{k}.png", "b.json", *POSE] for k in range(3)]
     assert len(read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows[:2]))) == 2
-    with pytest.raises(InvalidInputError, match=r"rig\.csv: more than 2 photographs; leave some out"):
+    with pytest.raises(
+        InvalidInputError, match=r"rig\.csv: more than 2 photographs; leave some out"
+    ):
         read_rig(written(tmp_path / "rig.csv", COLUMNS, *rows))
     options = RegisterOptions(meshes=(tmp_path / "a.ply",))
     header = "photo,x0,y0,x1,y1" + "".join(f",c{k}" for k in range(MAX_LIST_COLUMNS - 5))
@@ -110,7 +126,12 @@ LAYOUTS = {
     "points": [line for k in (1, 2, 3) for line in (IMAGE.format(k), "1.5 2 -1 3 4 17")],
     "points of some": [IMAGE.format(1), "1 2 3", IMAGE.format(2), IMAGE.format(3), "", "# the end"],
     "blank lines": ["", IMAGE.format(1), "", "", IMAGE.format(2), "1.5 2 -1", "", IMAGE.format(3)],
-    "points like an image": [IMAGE.format(1), "1 1 0 0 0 0 0 1 1 2 3 4", IMAGE.format(2), IMAGE.format(3)],
+    "points like an image": [
+        IMAGE.format(1),
+        "1 1 0 0 0 0 0 1 1 2 3 4",
+        IMAGE.format(2),
+        IMAGE.format(3),
+    ],
 }
 
 
@@ -128,7 +149,11 @@ def test_every_photograph_of_colmap_is_read_with_and_without_lines_of_points(tmp
     ("header", "row", "message"),
     [
         (f"{COLUMNS},photo", ["a.png", "cameras.txt", *POSE, "b.png"], "header: two columns photo"),
-        (COLUMNS, ["a.png", "cameras.txt", *POSE, "5"], r"row 1: a\.png: '5' is beyond the last column"),
+        (
+            COLUMNS,
+            ["a.png", "cameras.txt", *POSE, "5"],
+            r"row 1: a\.png: '5' is beyond the last column",
+        ),
         (
             f"{COLUMNS},qw,qx,qy,qz",
             ["a.png", "cameras.txt", *POSE, 1, 0, 0, 0],
@@ -145,17 +170,23 @@ def test_rows_of_a_rig_with_too_much_are_refused(tmp_path, header, row, message)
 
 def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(tmp_path):
     (tmp_path / "cameras.txt").write_text(LINE)
-    path = written(tmp_path / "rig.csv", f"{COLUMNS},,", ["a.png", "cameras.txt", *POSE, "", " ", ""])
+    path = written(
+        tmp_path / "rig.csv", f"{COLUMNS},,", ["a.png", "cameras.txt", *POSE, "", " ", ""]
+    )
     assert len(read_rig(path)) == 1
 
 
-@pytest.mark.parametrize("truth", [{"0": {"obj_id": 5}}, {"0": [5]}, {"0": ["obj_id"]}, {"0": "obj_id"}])
+@pytest.mark.parametrize(
+    "truth", [{"0": {"obj_id": 5}}, {"0": [5]}, {"0": ["obj_id"]}, {"0": "obj_id"}]
+)
 def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
     K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
     camera = {"cam_K": K, "cam_R_w2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_w2c": [0, 0, 0]}
     (tmp_path / "scene_camera.json").write_text(json.dumps({"0": camera}))
     (tmp_path / "scene_gt.json").write_text(json.dumps(truth))
-    with pytest.raises(InvalidInputError, match=r"image 0: expected a list of objects in scene_gt\.json"):
+    with pytest.raises(
+        InvalidInputError, match=r"image 0: expected a list of objects in scene_gt\.json"
+    ):
         read_rig(tmp_path, Path("obj_000005.ply"))
 
 

@@ -24,16 +24,24 @@ def entries(tmp_path, threads):
     for name in ("0.png", "1.png", "skin.png"):
         (tmp_path / name).write_text(name)
     (tmp_path / "a.stl").write_text("a")
-    text = "mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf 1/1 2/2 3/3\n"
+    text = (
+        "mtllib skin.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf "
+        "1/1 "
+        "2/2 3/3\n"
+    )
     (tmp_path / "b.obj").write_text(text)
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
     pairs = [(photo, mesh) for photo in ("0.png", "1.png") for mesh in ("a.stl", "b.obj")]
-    return [Entry(photo=tmp_path / p, meshes=(tmp_path / m,), label=f"{p[0]}{m[0]}") for p, m in pairs]
+    return [
+        Entry(photo=tmp_path / p, meshes=(tmp_path / m,), label=f"{p[0]}{m[0]}") for p, m in pairs
+    ]
 
 
 def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
-    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after`` of them."""
-    labels, opened = [], []
+    """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after``
+    of them."""
+    labels = []
+    opened = []
 
     def register(entry, registrar, _, *, bank_seconds):
         if len(labels) == stop_after:
@@ -45,7 +53,9 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         return {"status": "ok"}
 
     def open_registrar(meshes):
-        assert not any(reference() for reference in opened), "that of the mesh before is still in memory"
+        assert not any(reference() for reference in opened), (
+            "that of the mesh before is still in memory"
+        )
         error = MeshError(meshes[0].name)  # in a cycle, by its traceback, as a mesh is
         opened.append(weakref.ref(error))
         raise error
@@ -72,7 +82,13 @@ def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
         assert size == 8 or len(parts[0]) == 2
 
 
-AGAIN = {"0.png": "0a 0b", "a.stl": "0a 1a", "b.obj": "0b 1b", "skin.mtl": "0b 1b", "skin.png": "0b 1b"}
+AGAIN = {
+    "0.png": "0a 0b",
+    "a.stl": "0a 1a",
+    "b.obj": "0b 1b",
+    "skin.mtl": "0b 1b",
+    "skin.png": "0b 1b",
+}
 
 
 @pytest.mark.parametrize(("name", "again"), AGAIN.items())
@@ -109,23 +125,41 @@ def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
 
 
 CAMERA = Camera(torch.eye(3))
-ENTRY = Entry({"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA)
+ENTRY = Entry(
+    {"note": "x"}, "x.png", Path("x.png"), (Path("x.ply"),), box=(1.0, 2.0, 3.0, 4.0), camera=CAMERA
+)
 VIEWS = (View("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
-OTHERS = {"name": "y.png", "instances": 2, "start_confidence": 0.5, "as_stored": True, "views": VIEWS}
+OTHERS = {
+    "name": "y.png",
+    "instances": 2,
+    "start_confidence": 0.5,
+    "as_stored": True,
+    "views": VIEWS,
+}
 OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": ((1.0, 0.0, 0.0, 0.0),)}
-BOXES, CAMERAS = ((1.0, 2.0, 3.0, 4.25), None), (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
+BOXES = ((1.0, 2.0, 3.0, 4.25), None)
+CAMERAS = (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
 
 
 def test_request_covers_every_option_and_other_views():
-    changes = [*OTHERS.items(), *(("box", box) for box in BOXES), *(("camera", camera) for camera in CAMERAS)]
+    changes = [
+        *OTHERS.items(),
+        *(("box", box) for box in BOXES),
+        *(("camera", camera) for camera in CAMERAS),
+    ]
     for name, value in changes:
         changed = replace(ENTRY, **{name: value})
         assert changed.request() != ENTRY.request() == replace(ENTRY).request(), (name, value)
         assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key, (name, value)
-    values = {"box": (1.0, 2.0, 3.0, 4.0), "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1])))}
+    values = {
+        "box": (1.0, 2.0, 3.0, 4.0),
+        "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1]))),
+    }
     for name, value in {**values, "T_cam_from_world": 2.0 * torch.eye(4)}.items():
         other = replace(VIEWS[0], **{name: value})
-        assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request(), name
+        assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request(), (
+            name
+        )
 
 
 def test_run_processes(monkeypatch, capfd):

@@ -33,9 +33,21 @@ def scores_of(benchmark, out, rows):
     """Write results with these rows, and score them."""
     store = ResultStore(out)
     inputs = {"picture": PICTURE, "box": [-9.0, -9.0, -8.0, -8.0]}
-    known = {"score": 0.5, "confidence": 0.5, "reliable": False, "mesh": "CAD/01.off", "inputs": inputs}
+    known = {
+        "score": 0.5,
+        "confidence": 0.5,
+        "reliable": False,
+        "mesh": "CAD/01.off",
+        "inputs": inputs,
+    }
     for entry, row in zip(benchmark.entries, rows, strict=False):
-        head = {"key": entry.key, "digests": {"request": ""}, "status": "ok", "message": "", "seconds": SECONDS}
+        head = {
+            "key": entry.key,
+            "digests": {"request": ""},
+            "status": "ok",
+            "message": "",
+            "seconds": SECONDS,
+        }
         store.append({**head, **(known if "rotation" in row else {}), **row})
     return report(benchmark, store, {"root": "/some/where", "protocol": str(benchmark.protocol)})
 
@@ -82,7 +94,11 @@ def test_pascal3d_summary(furniture, tmp_path):
     assert sizes == {"easy": 3, "truncated": 3, "occluded": 2, "difficult": 1}
     assert summary["subsets"]["easy"]["acc_pi_6"] == 1 / 3
     assert summary["subsets"]["difficult"]["med_err_deg"] == float("inf")
-    assert {name: s["n"] for name, s in summary["per_class"].items()} == {"bottle": 4, "diningtable": 1, "sofa": 3}
+    assert {name: s["n"] for name, s in summary["per_class"].items()} == {
+        "bottle": 4,
+        "diningtable": 1,
+        "sofa": 3,
+    }
     assert summary["per_class"]["sofa"]["acc_pi_6"] == 2 / 3
     # classes: bottles 1/4, table 0, sofas 2/3; with symmetries 3/4, 1, 2/3
     mean = summary["mean_over_classes"]
@@ -92,7 +108,11 @@ def test_pascal3d_summary(furniture, tmp_path):
     assert mean["symmetry_aware"]["acc_pi_6"] == pytest.approx((3 / 4 + 1 + 2 / 3) / 3)
     # easy ones: a bottle that is 90 degrees off, the table, the sofa that is 5 degrees off
     easy = summary["subsets"]["easy"]
-    assert {name: s["acc_pi_18"] for name, s in easy["per_class"].items()} == {"bottle": 0, "diningtable": 0, "sofa": 1}
+    assert {name: s["acc_pi_18"] for name, s in easy["per_class"].items()} == {
+        "bottle": 0,
+        "diningtable": 0,
+        "sofa": 1,
+    }
     assert easy["mean_over_classes"]["med_err_deg"] == pytest.approx((90 + 180 + 5) / 3, abs=1e-3)
     assert summary["seconds"] == {"bank": 16.0, "register": 4.0, "register_each": 0.5}
     assert summary["settings"]["root"] == "where", "a summary is shared: no paths"
@@ -123,33 +143,51 @@ def test_bop_summary(instances, tmp_path):
         t = (samples[i]["translation"] + torch.tensor(offset)).tolist()
         return {"rotation": rotated(samples[i], "z", degrees), "translation": t}
 
-    diameter = 86.6  # half a rotation is a symmetry of object 1, not of object 2; y is along the object's z
-    rows = [row(0, 180, (3.5, 0.0, 0.0)), row(1, 180), FAILED, row(3, 20, (0.0, 0.04 * diameter, 0.0))]
+    # half a rotation is a symmetry of object 1, not of object 2; y is along the object's z
+    diameter = 86.6
+    rows = [
+        row(0, 180, (3.5, 0.0, 0.0)),
+        row(1, 180),
+        FAILED,
+        row(3, 20, (0.0, 0.04 * diameter, 0.0)),
+    ]
     summary = scores_of(benchmark, tmp_path, rows)
     assert (summary["n"], summary["failed"]) == (4, 1)
     # errors 0, 180, miss, 20
     assert (summary["acc_15_deg"], summary["acc_30_deg"]) == (1 / 4, 2 / 4)
-    assert (summary["med_err_deg"], summary["per_object"]["2"]["acc_30_deg"]) == (pytest.approx(100, abs=1e-3), 0)
+    assert (summary["med_err_deg"], summary["per_object"]["2"]["acc_30_deg"]) == (
+        pytest.approx(100, abs=1e-3),
+        0,
+    )
     assert summary["per_object"]["1"]["n"] == 3
-    # MSSD in diameters: 0.04, then twice 35.4 / 86.6, miss, then hypot(2 * 35.4 sin 10 deg / 86.6, 0.04) = 0.147
+    # MSSD in diameters: 0.04, then twice 35.4 / 86.6, miss, then hypot(2 * 35.4 sin 10 deg / 86.6,
+    # 0.04) = 0.147
     assert summary["mssd_ar"] == pytest.approx((1.0 + 0.0 + 0.0 + 0.8) / 4)
     # ADD(-S): 0.04, 0.816, miss, 0.147
     assert summary["add_recall_0.1d"] == 1 / 4
-    # MSPD: 300 / 375 * 3.5 = 2.8 px of 80, which are 22.4 of 640: six of the thresholds 5, 10, ..., 50 px (relative
-    # to the height of 60 px, five); about 100 px, miss, about 9 px
-    assert (summary["mspd_ar"], summary["subsets"]["unoccluded"]["n"]) == (pytest.approx(0.6 / 4), 0)
+    # MSPD: 300 / 375 * 3.5 = 2.8 px of 80, which are 22.4 of 640: six of the thresholds 5, 10, ...,
+    # 50 px (relative to the height of 60 px, five); about 100 px, miss, about 9 px
+    assert (summary["mspd_ar"], summary["subsets"]["unoccluded"]["n"]) == (
+        pytest.approx(0.6 / 4),
+        0,
+    )
 
 
 def test_bop_table(instances, tmp_path):
     benchmark, samples = instances
-    rows = [{"rotation": s["rotation"].tolist(), "translation": s["translation"].tolist()} for s in samples]
+    rows = [
+        {"rotation": s["rotation"].tolist(), "translation": s["translation"].tolist()}
+        for s in samples
+    ]
     rows[1] = FAILED
     scores_of(benchmark, tmp_path, rows)
     table = bop_poses(tmp_path / "predictions.csv")
     del samples[1]
     expected = [(s["scene_id"], s["image_id"], s["obj_id"]) for s in samples]
     assert [(r["scene_id"], r["im_id"], r["obj_id"]) for r in table] == expected
-    assert [r["time"] for r in table] == [1.5, 1.5, 0.5], "BOP counts the seconds of the whole image"
+    assert [r["time"] for r in table] == [1.5, 1.5, 0.5], (
+        "BOP counts the seconds of the whole image"
+    )
     t = samples[0]["translation"].tolist()
     line = (tmp_path / "predictions.csv").read_text().splitlines()[1]
     assert line.endswith(f"{' '.join(map(str, t))},1.5"), "all digits"
@@ -177,7 +215,9 @@ def test_pose_folders_score_known_poses(web):
     half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     first, _, third, _ = (sample["rotation"] for sample in benchmark.samples)
     poses = [(first, 0.75), (half, 0.25), (third @ half, 0.5)]
-    rows = [{"rotation": R.tolist(), "confidence": c, "reliable": c > 0.7} for R, c in poses] + [FAILED]
+    rows = [{"rotation": R.tolist(), "confidence": c, "reliable": c > 0.7} for R, c in poses] + [
+        FAILED
+    ]
     errors = benchmark.errors(benchmark.samples, rows)
     assert errors["error_deg"][[0, 2]].tolist() == pytest.approx([0, 180], abs=0.1)
     assert errors["error_deg"].isnan().tolist() == [False, True, False, True]
@@ -202,16 +242,24 @@ def test_detection_is_scored_in_single_photographs(bop, tmp_path):
 def test_without_a_box_any_copy_of_the_object_is_right(bop, tmp_path):
     benchmark = BOPBenchmark(bop, Protocol(pose="any", box=None))
     first, other, second, _ = benchmark.samples
-    second["box"], second["rotation"] = torch.tensor([50.0, 30.0, 70.0, 50.0]), first["rotation"][[1, 2, 0]]
+    second["box"], second["rotation"] = (
+        torch.tensor([50.0, 30.0, 70.0, 50.0]),
+        first["rotation"][[1, 2, 0]],
+    )
     assert benchmark.copies([second, other]) == [[second, first], [other]]
     pose = {"rotation": second["rotation"].tolist(), "translation": second["translation"].tolist()}
     found = located(AWAY, (49.0, 29.0, 71.0, 51.0))
-    rows = [{**pose, **found, "inputs": {"picture": PICTURE, "box": [49.0, 29.0, 71.0, 51.0]}}, FAILED]
+    rows = [
+        {**pose, **found, "inputs": {"picture": PICTURE, "box": [49.0, 29.0, 71.0, 51.0]}},
+        FAILED,
+    ]
     summary = scores_of(benchmark, tmp_path, [*rows, {**rows[0]}, FAILED])
     assert (summary["acc_15_deg"], summary["mssd_ar"], summary["mspd_ar"]) == (0.5, 0.5, 0.5)
     assert summary["detection"] == {"n": 4, "recall_1": 0.0, "recall_5": 0.5, "recall_20": 0.5}
     assert copy_shown([first, second], FAILED) is first
-    assert copy_shown([first, second], {**rows[0], "inputs": {"box": [75.0, 0.0, 79.0, 4.0]}}) is first
+    assert (
+        copy_shown([first, second], {**rows[0], "inputs": {"box": [75.0, 0.0, 79.0, 4.0]}}) is first
+    )
 
 
 BOX = (10.0, 10.0, 30.0, 30.0)
@@ -224,12 +272,22 @@ def sample(*box):
 
 def located(*boxes):
     proposals = [{"box": list(map(float, box)), "score": 0.5} for box in boxes]
-    return {"detection": {"proposals": proposals}, "inputs": {"picture": {"width": 200, "height": 100}}}
+    return {
+        "detection": {"proposals": proposals},
+        "inputs": {"picture": {"width": 200, "height": 100}},
+    }
 
 
 def test_detection_recall_counts_the_first_right_proposal_and_clips_boxes():
-    half, less = (10, 10, 30, 20), (10, 10, 30, 19.9)
-    rows = [located(BOX), located(AWAY, half), located(*[AWAY] * 5, BOX), located(less), located(*[AWAY] * 20, BOX)]
+    half = (10, 10, 30, 20)
+    less = (10, 10, 30, 19.9)
+    rows = [
+        located(BOX),
+        located(AWAY, half),
+        located(*[AWAY] * 5, BOX),
+        located(less),
+        located(*[AWAY] * 20, BOX),
+    ]
     recall = detection_recall([[sample(*BOX)]] * 5, rows)
     assert recall == {"n": 5, "recall_1": 0.2, "recall_5": 0.4, "recall_20": 0.6}
     unknown = sample(*[math.nan] * 4)
@@ -237,7 +295,12 @@ def test_detection_recall_counts_the_first_right_proposal_and_clips_boxes():
         [[sample(*BOX)], [unknown], [unknown, sample(*BOX)]], [located(BOX), located(AWAY), FAILED]
     )
     assert (recall["n"], recall["recall_1"]) == (2, 0.5)
-    assert detection_recall([], []) == {"n": 0, "recall_1": None, "recall_5": None, "recall_20": None}
+    assert detection_recall([], []) == {
+        "n": 0,
+        "recall_1": None,
+        "recall_5": None,
+        "recall_20": None,
+    }
     left = ((-20.5, 10.0, 19.5, 50.0), (-0.5, 10.0, 19.5, 50.0))
     low = ((10.0, 60.0, 30.0, 159.5), (10.0, 60.0, 30.0, 99.5))
     for annotated, proposed in (left, left[::-1], low):
@@ -261,7 +324,8 @@ def test_the_page_marks_by_the_error_up_to_symmetries(furniture, bop, tmp_path):
 
 def posed(sample, degrees):
     """A result whose pose is a rotation about z off."""
-    rotation, translation = rotated(sample, "z", degrees), sample["translation"].tolist()
+    rotation = rotated(sample, "z", degrees)
+    translation = sample["translation"].tolist()
     inputs = {"picture": PICTURE, "box": [-9.0, -9.0, -8.0, -8.0]}
     return {"rotation": rotation, "translation": translation, "inputs": inputs}
 
@@ -287,7 +351,8 @@ def test_errors_are_written_with_all_digits(instances, tmp_path):
 
 
 def test_bop_errors_are_of_the_models_of_the_challenge(instances, tmp_path):
-    """Of cubes that are three times as large, whose diameter is twice that of the models, and that have no symmetry."""
+    """Of cubes that are three times as large, whose diameter is twice that of the models, and that
+    have no symmetry."""
     benchmark, samples = instances
     root = benchmark.dataset.root
     rows = [posed(s, 20) for s in samples]
@@ -335,9 +400,11 @@ def test_an_object_that_is_visible_by_95_per_cent_is_unoccluded(instances):
 
 def test_boxes_are_clipped_where_the_last_pixel_ends():
     """At 99.5 of 100 rows: half of what is then left of the annotated box is proposed."""
-    annotated, proposed = (10.0, 79.5, 30.0, 159.5), (10.0, 89.5, 30.0, 99.5)
+    annotated = (10.0, 79.5, 30.0, 159.5)
+    proposed = (10.0, 89.5, 30.0, 99.5)
     assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
-    annotated, proposed = (179.5, 10.0, 259.5, 30.0), (189.5, 10.0, 199.5, 30.0)
+    annotated = (179.5, 10.0, 259.5, 30.0)
+    proposed = (189.5, 10.0, 199.5, 30.0)
     assert detection_recall([[sample(*annotated)]], [located(proposed)])["recall_1"] == 1.0
 
 
@@ -353,9 +420,13 @@ def test_another_cad_of_the_class_is_drawn_by_the_seed(furniture):
         drawn.append([entry.meshes[0].name for entry in sofas])
         assert all(len(entry.meshes) == 1 for entry in sofas)
         again = Pascal3DBenchmark(furniture.dataset, Protocol(cad="other", seed=seed))
-        assert [entry.meshes for entry in again.entries] == [entry.meshes for entry in benchmark.entries]
+        assert [entry.meshes for entry in again.entries] == [
+            entry.meshes for entry in benchmark.entries
+        ]
         alone = {entry.error for entry in benchmark.entries if not entry.label.startswith("sofa")}
         assert alone == {"no_other_cad"}
     assert len(set(map(tuple, drawn))) == 6
-    assert {name for some in drawn for name in some} == set(names[1:]), "all, but not the annotated one"
+    assert {name for some in drawn for name in some} == set(names[1:]), (
+        "all, but not the annotated one"
+    )
     assert str(Protocol(cad="other", seed=3)) == "cad=other pose=upright box=annotated seed=3"

@@ -29,8 +29,11 @@ def test_rows_are_read_again(tmp_path):
 
 @pytest.mark.parametrize("workers", [None, Workers(1, 2)])
 def test_rows_replace_older_ones(tmp_path, workers):
-    """Those of other digests, also in the file of another process that sorts later; of the same digests, the last."""
-    ResultStore(tmp_path, Workers(2, 3)).append({**row("a", i=0), "digests": {"request": "a", "photo": "old"}})
+    """Those of other digests, also in the file of another process that sorts later; of the same
+    digests, the last."""
+    ResultStore(tmp_path, Workers(2, 3)).append(
+        {**row("a", i=0), "digests": {"request": "a", "photo": "old"}}
+    )
     for i in (1, 2):
         store = ResultStore(tmp_path, workers)
         store.append(row("a", i=i))
@@ -49,13 +52,16 @@ def test_cut_line_is_removed(tmp_path, cut):
     whole = store.path.read_bytes()
     last = whole.splitlines(keepends=True)[-1][:cut]
     store.path.write_bytes(whole[: whole.rindex(b'{"key"')] + last)
-    reader, store = ResultStore(tmp_path), ResultStore(tmp_path)
+    reader = ResultStore(tmp_path)
+    store = ResultStore(tmp_path)
     assert [reader.is_current(key, DIGESTS) for key in "abc"] == [True, True, False]
     store.append(row("c"))
     assert (store.path.read_bytes(), store.read("c")) == (whole, row("c"))
 
 
-@pytest.mark.parametrize("content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"])
+@pytest.mark.parametrize(
+    "content", ['{"score": 1}\n', "[1]\n", "no JSON\n", '{"key": "a"}\n', "[" * 100_000 + "\n"]
+)
 def test_other_files_are_refused(tmp_path, content):
     (tmp_path / "results.jsonl").write_text(content)
     with pytest.raises(InvalidInputError, match=r"results\.jsonl: not results"):

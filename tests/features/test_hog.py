@@ -22,12 +22,15 @@ def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) 
         for j in range(W):
             length = math.hypot(*field[:, i, j])
             position = (math.atan2(field[1, i, j], field[0, i, j]) % math.pi) * bins / math.pi - 0.5
-            row, column = (i + 0.5) * grid / H - 0.5, (j + 0.5) * grid / W - 0.5
+            row = (i + 0.5) * grid / H - 0.5
+            column = (j + 0.5) * grid / W - 0.5
             for r in (math.floor(row), math.floor(row) + 1):
                 for c in (math.floor(column), math.floor(column) + 1):
                     for b in (math.floor(position), math.floor(position) + 1):
                         if 0 <= r < grid and 0 <= c < grid:
-                            weight = (1 - abs(row - r)) * (1 - abs(column - c)) * (1 - abs(position - b))
+                            weight = (
+                                (1 - abs(row - r)) * (1 - abs(column - c)) * (1 - abs(position - b))
+                            )
                             cells[r, c, b % bins] += length * weight * grid**2 / (H * W)
     out = []
     for r in range(grid - block + 1):
@@ -40,7 +43,9 @@ def _slow_hog(field: np.ndarray, grid: int, bins: int, block: int, clip: float) 
 
 @pytest.mark.parametrize(("shape", "grid"), [((24, 24), 4), ((21, 30), 4)])
 def test_hog_with_linear_voting_against_loops(shape: tuple[int, int], grid: int) -> None:
-    field = torch.randn(1, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    field = torch.randn(
+        1, 2, *shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     want = _slow_hog(field[0].numpy(), grid, 9, 2, 0.2)
     np.testing.assert_allclose(hog(field, grid=grid)[0], want, atol=1e-10)
 
@@ -82,7 +87,8 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
         module(field)[:, ::9].sum().backward()
         optimizer.step()
     with torch.no_grad():
-        weights, out = module.bin_weights, module(field)
+        weights = module.bin_weights
+        out = module(field)
     assert weights is not None
     assert 0.0 < float(weights.min()) < 0.1  # a step of the weights themselves leads to -2.5
     assert float(out.min()) >= 0.0
@@ -90,7 +96,10 @@ def test_hog_bin_weights_scale_votes_and_stay_positive_when_learnt() -> None:
 
 def test_hog_rejects_wrong_weights_and_grids() -> None:
     for options, message in (
-        *(({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0") for w in (-1e-3, math.nan)),
+        *(
+            ({"bin_weights": torch.tensor([w, *[1.0] * 8])}, "expected factors >= 0")
+            for w in (-1e-3, math.nan)
+        ),
         ({"bin_weights": torch.ones(8)}, r"bin_weights: expected shape \(9\)"),
         ({"grid": 32}, "at least 32 x 32 px"),
     ):
@@ -104,7 +113,9 @@ def _line(angle: float) -> torch.Tensor:
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     a = torch.tensor(angle).deg2rad()
     distance = x * torch.cos(a) + y * torch.sin(a)
-    return torch.exp(-0.5 * (distance / 2) ** 2)[None] * torch.stack([torch.cos(a), torch.sin(a)]).view(2, 1, 1)
+    return torch.exp(-0.5 * (distance / 2) ** 2)[None] * torch.stack(
+        [torch.cos(a), torch.sin(a)]
+    ).view(2, 1, 1)
 
 
 @pytest.mark.parametrize("angle", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0, 160.0])
@@ -121,7 +132,9 @@ def test_field_points_of_a_ridge_are_a_thin_line(angle: float, sign: float) -> N
 
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 1000), fraction=st.floats(0.01, 0.3))
-def test_field_points_fraction_selects_the_longest_of_each_image(seed: int, fraction: float) -> None:
+def test_field_points_fraction_selects_the_longest_of_each_image(
+    seed: int, fraction: float
+) -> None:
     field = image_gradient(photos(3, 24, seed=seed, dtype=torch.float64))
     field = field * torch.tensor([1.0, 0.01, 5.0]).view(3, 1, 1, 1)
     points = field_points(field, fraction=fraction)

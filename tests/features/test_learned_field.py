@@ -61,7 +61,8 @@ def test_halved_angle_inverts_doubled_angle_in_every_dtype(dtype, size):
 
 def test_learned_field_loads_other_weights_and_rejects_bad_ones(tmp_path):
     torch.manual_seed(0)
-    network, x = FieldNetwork(), torch.rand(4, 3, 128, 128)
+    network = FieldNetwork()
+    x = torch.rand(4, 3, 128, 128)
     with torch.no_grad():
         network(x)  # statistics that batch normalisation divides by
         network.eval()
@@ -72,9 +73,12 @@ def test_learned_field_loads_other_weights_and_rejects_bad_ones(tmp_path):
     assert all(p.requires_grad for p in loaded.parameters())
     with pytest.raises(InvalidInputError, match="folded"):
         save_weights(loaded.network, tmp_path / "folded.safetensors")
-    torch.testing.assert_close(loaded.mask(x), out[:, 2:].sigmoid(), atol=2e-3, rtol=0)  # stored as halves
+    # stored as halves
+    torch.testing.assert_close(loaded.mask(x), out[:, 2:].sigmoid(), atol=2e-3, rtol=0)
     torch.testing.assert_close(doubled_angle(loaded(x)), out[:, :2], atol=2e-3, rtol=0)
-    missing, corrupt, other = (tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other"))
+    missing, corrupt, other = (
+        tmp_path / f"{name}.safetensors" for name in ("missing", "corrupt", "other")
+    )
     corrupt.write_bytes(b"not weights")
     save_file({"a": torch.zeros(2)}, other)
     with pytest.raises(MissingFileError, match="does not exist"):
@@ -133,7 +137,9 @@ def test_learned_field_under_autocast(field):
 @pytest.mark.parametrize("shape", [(2, 600), (600, 2), (1, 1), (1, 5000)])
 def test_learned_field_does_not_enlarge_slivers(shape: tuple[int, int]) -> None:
     field = LearnedCurvilinearSaliency()
-    field.network.forward = Mock(side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2))
+    field.network.forward = Mock(
+        side_effect=lambda x: x.new_zeros(len(x), 3, x.shape[2] // 2, x.shape[3] // 2)
+    )
     assert field(torch.rand(1, 3, *shape)).shape == (1, 2, *shape)
     assert field.network.forward.call_args.args[0][0, 0].numel() <= 8 * 128 * 128
 

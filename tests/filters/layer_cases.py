@@ -1,4 +1,5 @@
-"""Test inputs with known properties, and the cases of all filters and HOG for the layer contract."""
+"""Test inputs with known properties, and the cases of all filters and HOG for the layer
+contract."""
 
 import torch
 from torch import Tensor
@@ -35,7 +36,9 @@ def plane(size: int, slope_x: float, slope_y: float, distance: float) -> Tensor:
     return (distance + slope_x * x + slope_y * y)[None, None]
 
 
-def depths(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+def depths(
+    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Rough surfaces inside a disc, background 0."""
     generator = torch.Generator().manual_seed(seed)
     z = 2.0 + torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64)
@@ -44,20 +47,28 @@ def depths(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = to
     return torch.where(x**2 + y**2 < (0.4 * size) ** 2, z, 0.0).to(dtype)
 
 
-def photos(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+def photos(
+    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Smooth noise with a bright box, in [0, 1]."""
     generator = torch.Generator().manual_seed(seed)
-    x = filters.gaussian_smooth(torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64), 1.0)
+    x = filters.gaussian_smooth(
+        torch.rand(n, 1, size, size, generator=generator, dtype=torch.float64), 1.0
+    )
     x[..., size // 4 : 3 * size // 4, size // 3 : 2 * size // 3] += 0.4
     return (x / x.amax(dim=(1, 2, 3), keepdim=True)).to(dtype)
 
 
-def colour_photos(n: int = 1, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+def colour_photos(
+    n: int = 1, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """(n, 3, size, size) in [0, 1]."""
     return torch.cat([photos(n, size, seed=seed + i, dtype=dtype) for i in range(3)], dim=1)
 
 
-def fields(n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
+def fields(
+    n: int = 2, size: int = 24, *, seed: int = 0, dtype: torch.dtype = torch.float32
+) -> Tensor:
     return filters.image_gradient(photos(n, size, seed=seed, dtype=torch.float64)).to(dtype)
 
 

@@ -25,12 +25,16 @@ def _round_error(size: int, make: Callable[..., Tensor], want: float) -> float:
     radius = 0.75 * size
     x, y = grid(size)
     inside = (x**2 + y**2).sqrt() < 0.4 * size
-    return float((_saliency(make(size, radius, 2 * radius)).norm(dim=1)[0] * radius - want)[inside].abs().max())
+    return float(
+        (_saliency(make(size, radius, 2 * radius)).norm(dim=1)[0] * radius - want)[inside]
+        .abs()
+        .max()
+    )
 
 
 def _saddle_error(size: int) -> float:
-    """kappa1 - kappa2 of z = (x^2 - y^2) / (2 a) + (x^4 - y^4) / (8 a^3), whose curvatures at 0 are those of the
-    saddle."""
+    """kappa1 - kappa2 of z = (x^2 - y^2) / (2 a) + (x^4 - y^4) / (8 a^3), whose curvatures at 0 are
+    those of the saddle."""
     a = 0.5 * size
     x, y = grid(size)
     z = (3 * size + (x**2 - y**2) / (2 * a) + (x**4 - y**4) / (8 * a**3))[None, None]
@@ -39,7 +43,10 @@ def _saddle_error(size: int) -> float:
 
 
 def test_depth_curvilinear_saliency_converges_with_order_two() -> None:
-    rounds = partial(_round_error, make=sphere, want=0.0), partial(_round_error, make=cylinder, want=1.0)
+    rounds = (
+        partial(_round_error, make=sphere, want=0.0),
+        partial(_round_error, make=cylinder, want=1.0),
+    )
     for error in (*rounds, _saddle_error):
         errors = torch.tensor([error(size) for size in SIZES])
         orders = -errors.log().diff() / torch.tensor(SIZES).log().diff()
@@ -49,7 +56,9 @@ def test_depth_curvilinear_saliency_converges_with_order_two() -> None:
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 2.0])
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.5, 0.0), (0.3, -2.0)])
-def test_depth_layers_are_zero_on_a_plane_up_to_the_border(sigma: float, slopes: tuple[float, float]) -> None:
+def test_depth_layers_are_zero_on_a_plane_up_to_the_border(
+    sigma: float, slopes: tuple[float, float]
+) -> None:
     depth = plane(33, *slopes, distance=200.0)
     for layer in (
         filters.depth_curvilinear_saliency,
@@ -67,18 +76,24 @@ def test_depth_curvilinear_saliency_formulas_differ_by_the_metric() -> None:
     geometric, paper = (_saliency(depth, formula=f).norm(dim=1)[0] for f in ("geometric", "paper"))
     slope = 0.5 * (depth[0, 0, :, 2:] - depth[0, 0, :, :-2])
     ratio = slope.abs() * (1 + slope**2) ** 1.5
-    torch.testing.assert_close(paper[1:-1, 1:-1], (geometric[:, 1:-1] * ratio)[1:-1], rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        paper[1:-1, 1:-1], (geometric[:, 1:-1] * ratio)[1:-1], rtol=1e-9, atol=1e-12
+    )
 
 
 def test_depth_layers_put_the_background_a_quarter_of_the_range_behind_the_object() -> None:
     depth = sphere(33, 12.0, 50.0)
-    near, far = float(depth[depth > 0].min()), float(depth.max())
-    filled, camera = torch.where(depth > 0, depth, near + 1.25 * (far - near)), {"camera_matrix": _camera(60.0, 33)}
+    near = float(depth[depth > 0].min())
+    far = float(depth.max())
+    filled = torch.where(depth > 0, depth, near + 1.25 * (far - near))
+    camera = {"camera_matrix": _camera(60.0, 33)}
     for layer, options, filled_options in (
         (filters.hessian_frobenius_norm, {}, {"depth_scale": 1.0 / (far - near)}),
         (filters.average_shading_gradient, camera, camera),
     ):  # compare lengths, since signs are arbitrary
-        torch.testing.assert_close(layer(depth, **options).norm(dim=1), layer(filled, **filled_options).norm(dim=1))
+        torch.testing.assert_close(
+            layer(depth, **options).norm(dim=1), layer(filled, **filled_options).norm(dim=1)
+        )
 
 
 def test_average_shading_gradient_of_a_sphere() -> None:
@@ -87,7 +102,10 @@ def test_average_shading_gradient_of_a_sphere() -> None:
     x, y = grid(65)
     field = filters.average_shading_gradient(sphere(65, radius, 100.0), sigma=0.0, depth_scale=1.0)
     rho2 = x**2 + y**2
-    want = math.sqrt(math.pi / 3.0) * ((2.0 + rho2 / (radius**2 - rho2).clamp(min=1.0)) / radius**2).sqrt()
+    want = (
+        math.sqrt(math.pi / 3.0)
+        * ((2.0 + rho2 / (radius**2 - rho2).clamp(min=1.0)) / radius**2).sqrt()
+    )
     inside = rho2 < 25.0**2
     torch.testing.assert_close(field.norm(dim=1)[0][inside], want[inside], rtol=2e-3, atol=0.0)
 
@@ -98,16 +116,24 @@ def _camera(focal: float, size: int) -> Tensor:
 
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
-def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(unit: float) -> None:
+def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_unit(
+    unit: float,
+) -> None:
     """fx != fy and cx != cy: the normal (point - centre) / radius is differentiated numerically."""
-    H, W, d, r = 49, 61, 5.0, 2.0
-    camera = torch.tensor([[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    H = 49
+    W = 61
+    d = 5.0
+    r = 2.0
+    camera = torch.tensor(
+        [[130.0, 0.0, 24.0], [0.0, 90.0, 31.0], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )
 
     def surface(u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Depth and normals (3, ...) at pixels u, v, of a sphere around (0.2, -0.1, d)."""
         ray = torch.stack([(u - 24.0) / 130.0, (v - 31.0) / 90.0, torch.ones_like(u)])
         centre = torch.tensor([0.2, -0.1, d], dtype=torch.float64).view(3, 1, 1)
-        a, b = (ray * ray).sum(0), (ray * centre).sum(0)
+        a = (ray * ray).sum(0)
+        b = (ray * centre).sum(0)
         z = (b - (b * b - a * ((centre * centre).sum() - r * r)).sqrt()) / a
         return z, (z * ray - centre) / r
 
@@ -121,7 +147,9 @@ def test_perspective_layers_on_an_off_axis_sphere_with_two_focal_lengths_in_any_
     got = filters.average_shading_gradient(depth, sigma=0.0, camera_matrix=camera)[0].norm(dim=0)
     torch.testing.assert_close(got[inner], want[inner], rtol=5e-3, atol=0.0)
     q1 = torch.linalg.svdvals(torch.stack([nx, ny], dim=-1).permute(1, 2, 0, 3))[..., 0]
-    ridges = filters.apparent_ridges(depth, sigma=0.0, camera_matrix=camera, maxima=False)[0].norm(dim=0)
+    ridges = filters.apparent_ridges(depth, sigma=0.0, camera_matrix=camera, maxima=False)[0].norm(
+        dim=0
+    )
     torch.testing.assert_close(ridges[inner], q1[inner], rtol=5e-3, atol=0.0)
 
 
@@ -130,21 +158,29 @@ def test_hessian_frobenius_norm_of_a_quadratic() -> None:
     z = (900.0 + 0.5 * x**2 + 2.0 * x * y - 1.5 * y**2)[None, None]
     field = filters.hessian_frobenius_norm(z, sigma=0.0, depth_scale=1.0)[0, :, 1:-1, 1:-1]
     torch.testing.assert_close(field.norm(dim=0), torch.full_like(field[0], math.sqrt(1 + 8 + 9)))
-    values, vectors = torch.linalg.eigh(torch.tensor([[1.0, 2.0], [2.0, -3.0]], dtype=torch.float64))
+    values, vectors = torch.linalg.eigh(
+        torch.tensor([[1.0, 2.0], [2.0, -3.0]], dtype=torch.float64)
+    )
     along = vectors[:, values.abs().argmax()]
     torch.testing.assert_close((field[:, 3, 3] / field[:, 3, 3].norm()).abs(), along.abs())
 
 
 def test_apparent_ridges_of_a_cylinder_and_a_roof() -> None:
-    """Across a cylinder the normal changes by 1 / (r cos) per px; on a roof it changes only at the edge."""
+    """Across a cylinder the normal changes by 1 / (r cos) per px; on a roof it changes only at the
+    edge."""
     radius = 60.0
     x, _ = grid(65)
-    field = filters.apparent_ridges(cylinder(65, radius, 100.0), sigma=0.0, depth_scale=1.0, maxima=False)[0]
+    field = filters.apparent_ridges(
+        cylinder(65, radius, 100.0), sigma=0.0, depth_scale=1.0, maxima=False
+    )[0]
     want = 1.0 / (radius**2 - x**2).sqrt()
     inside = x.abs() < 28
     torch.testing.assert_close(field.norm(dim=0)[inside], want[inside], rtol=2e-3, atol=0.0)
     roof = (100.0 + (x - 4).abs() * 0.5)[None, None]
-    ridge = filters.apparent_ridges(roof, sigma=1.0, depth_scale=1.0)[0, :, 3:-3, 3:-3].norm(dim=0) > 1e-6
+    ridge = (
+        filters.apparent_ridges(roof, sigma=1.0, depth_scale=1.0)[0, :, 3:-3, 3:-3].norm(dim=0)
+        > 1e-6
+    )
     assert ridge.sum(dim=0).nonzero().flatten().tolist() == [32 + 4 - 3]
 
 
@@ -153,7 +189,9 @@ FIELDS = {
     "cs": filters.depth_curvilinear_saliency,
     "asg": filters.average_shading_gradient,
     "hfn": filters.hessian_frobenius_norm,
-    "asg-perspective": partial(filters.average_shading_gradient, camera_matrix=_camera(137.3, 96).float()),
+    "asg-perspective": partial(
+        filters.average_shading_gradient, camera_matrix=_camera(137.3, 96).float()
+    ),
 }
 
 
@@ -164,16 +202,23 @@ def test_depth_layers_ignore_noise_of_one_ulp(field: str, distance: float) -> No
     depth[..., 30:70, 25:75] = distance
     half = torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.5
     noisy = depth.nextafter(torch.tensor(math.inf)).where(half & (depth > 0), depth)
-    a, b = FIELDS[field](noisy).double(), FIELDS[field](depth).double()  # the sign of each vector is arbitrary
+    # the sign of each vector is arbitrary
+    a = FIELDS[field](noisy).double()
+    b = FIELDS[field](depth).double()
     assert float((a * b).sum(dim=1).abs().sum() / (a.norm() * b.norm())) > 0.9999
 
 
 def test_multiscale_focus_curves_rank_edges_by_sharpness() -> None:
     x, _ = grid(121)
-    sharp, blurred = (torch.erf((x - c) / (s * math.sqrt(2.0))) for c, s in ((-30.0, 1.0), (30.0, 3.0)))
-    field = filters.multiscale_focus_curves((0.5 + 0.2 * (sharp - blurred))[None, None], saliency_weight=0.0)
+    sharp, blurred = (
+        torch.erf((x - c) / (s * math.sqrt(2.0))) for c, s in ((-30.0, 1.0), (30.0, 3.0))
+    )
+    field = filters.multiscale_focus_curves(
+        (0.5 + 0.2 * (sharp - blurred))[None, None], saliency_weight=0.0
+    )
     focus = field[0, :, 60].norm(dim=0)
-    assert float(1 / focus[30]) == pytest.approx(math.sqrt(1 + 1), rel=0.03)  # includes the pre-smoothing of 1 px
+    # includes the pre-smoothing of 1 px
+    assert float(1 / focus[30]) == pytest.approx(math.sqrt(1 + 1), rel=0.03)
     assert float(1 / focus[90]) == pytest.approx(math.sqrt(9 + 1), rel=0.03)
 
 

@@ -1,4 +1,5 @@
-"""The layer contract for all filters and HOG, missing depth, compilation, and effects of a change of the input."""
+"""The layer contract for all filters and HOG, missing depth, compilation, and effects of a change
+of the input."""
 
 from typing import ClassVar
 
@@ -16,11 +17,16 @@ class TestLayers(LayerContract):
     cases = tuple(LAYERS.values())
 
     def gradcheck_weights(self, case: LayerCase, x: torch.Tensor) -> float | torch.Tensor:
-        # At the strongest pixel all levels of MCS are 1, and rounding decides which of them is selected.
-        return case(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6 if case.name.startswith("mcs") else 1.0
+        # At the strongest pixel all levels of MCS are 1, and rounding decides which of them is
+        # selected.
+        return (
+            case(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6 if case.name.startswith("mcs") else 1.0
+        )
 
 
-@pytest.mark.parametrize("layer", [x for x in LAYERS.values() if x.inputs is depths], ids=lambda x: x.name)
+@pytest.mark.parametrize(
+    "layer", [x for x in LAYERS.values() if x.inputs is depths], ids=lambda x: x.name
+)
 @pytest.mark.parametrize("hole", [torch.nan, torch.inf, -torch.inf, 0.0])
 def test_depth_layers_are_finite_with_missing_depth(layer: LayerCase, hole: float) -> None:
     x = depths(2)
@@ -45,7 +51,10 @@ class TestCompiled:
         "ig": [{"sigma": s} for s in (1.0, 1.5, 2.3)],
         "cs": [{"depth_scale": s} for s in (1.0, 1.5, 2.3)],
         "hfn": [{"sigma": s, "depth_scale": 2.0 * s} for s in (1.0, 1.5, 2.3)],
-        "diffusion": [{"iterations": 2, "kappa": k, "step": s} for k, s in ((0.03, 0.2), (0.05, 0.1), (0.06, 0.05))],
+        "diffusion": [
+            {"iterations": 2, "kappa": k, "step": s}
+            for k, s in ((0.03, 0.2), (0.05, 0.1), (0.06, 0.05))
+        ],
         "mcs": [{"scales": 2, "kappa": k} for k in (0.03, 0.05, 0.06)],
         "mfc": [{"scales": 2, "saliency_weight": w} for w in (0.5, 0.7, 0.9)],
         "hog": [{"clip": c} for c in (0.2, 0.3, 0.4)],
@@ -62,9 +71,13 @@ class TestCompiled:
             assert LayerContract().agrees(graph(x, **options), function(x, **options)), options
 
 
-FIELDS = [x for x in LAYERS.values() if x.name.partition("-")[0] not in ("hog", "diffusion", "blur")]
+FIELDS = [
+    x for x in LAYERS.values() if x.name.partition("-")[0] not in ("hog", "diffusion", "blur")
+]
 # Suppression is strict on one side only, so which of two equal pixels remains depends on the side.
-every_field = pytest.mark.parametrize("layer", [x for x in FIELDS if x.name != "ar"], ids=lambda x: x.name)
+every_field = pytest.mark.parametrize(
+    "layer", [x for x in FIELDS if x.name != "ar"], ids=lambda x: x.name
+)
 few = settings(max_examples=3, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 
@@ -74,7 +87,8 @@ def _input(layer: LayerCase, seed: int, size: int = 25) -> Tensor:
 
 
 def _close(a: Tensor, b: Tensor) -> bool:
-    """Equality up to sign, except for 0.5 % of the vectors at a switch (tied scales, a threshold)."""
+    """Equality up to sign, except for 0.5 % of the vectors at a switch (tied scales, a
+    threshold)."""
     scale = float(b.abs().max()) + 1e-12
     off = torch.minimum((a - b).abs().amax(1), (a + b).abs().amax(1)) > 1e-7 * scale
     return float(off.float().mean()) <= 0.005
@@ -84,12 +98,17 @@ def _close(a: Tensor, b: Tensor) -> bool:
 @few
 @given(seed=seeds)
 def test_fields_rotate_and_mirror_with_the_image(layer: LayerCase, seed: int) -> None:
-    x, options = _input(layer, seed), dict(layer.options)
+    x = _input(layer, seed)
+    options = dict(layer.options)
     if "camera_matrix" in options:  # one that is centred on the 25 px image, and so as symmetric
-        options["camera_matrix"] = torch.tensor([[40.0, 0.0, 12.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]])
+        options["camera_matrix"] = torch.tensor(
+            [[40.0, 0.0, 12.0], [0.0, 40.0, 12.0], [0.0, 0.0, 1.0]]
+        )
     field = layer.function(x, **options)
     vx, vy = torch.rot90(field, 1, (-2, -1)).split(1, dim=1)
-    assert _close(layer.function(torch.rot90(x, 1, (-2, -1)), **options), torch.cat([vy, -vx], dim=1))
+    assert _close(
+        layer.function(torch.rot90(x, 1, (-2, -1)), **options), torch.cat([vy, -vx], dim=1)
+    )
     vx, vy = field.flip(-1).split(1, dim=1)
     assert _close(layer.function(x.flip(-1), **options), torch.cat([-vx, vy], dim=1))
 

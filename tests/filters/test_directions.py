@@ -1,4 +1,5 @@
-"""Edges, lines and ridges of known blur and strength at 0 to 60 degrees, on which finite differences depend."""
+"""Edges, lines and ridges of known blur and strength at 0 to 60 degrees, on which finite
+differences depend."""
 
 import math
 from collections.abc import Callable
@@ -25,7 +26,8 @@ def direction(angle: float) -> tuple[float, float]:
 
 
 def across(angle: float, offset: float = 0.0) -> Tensor:
-    """Distance in px of each pixel from a line at ``offset`` px from the middle, whose normal has the angle."""
+    """Distance in px of each pixel from a line at ``offset`` px from the middle, whose normal has
+    the angle."""
     x, y = grid(SIZE)
     gx, gy = direction(angle)
     return gx * x + gy * y - offset
@@ -33,7 +35,9 @@ def across(angle: float, offset: float = 0.0) -> Tensor:
 
 def edge(angle: float, blur: float, *, contrast: float = 1.0, offset: float = 0.0) -> Tensor:
     """(1, 1, SIZE, SIZE) step from 0 to ``contrast``, blurred."""
-    return (0.5 * contrast * (1.0 + torch.erf(across(angle, offset) / (blur * math.sqrt(2.0)))))[None, None]
+    return (0.5 * contrast * (1.0 + torch.erf(across(angle, offset) / (blur * math.sqrt(2.0)))))[
+        None, None
+    ]
 
 
 def difference_variance(angle: float) -> float:
@@ -54,12 +58,15 @@ def test_edge_blur_in_all_directions(angle: float, mode: str, blur: float) -> No
 @in_all_directions
 @in_both_modes
 @pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
-def test_multiscale_focus_curves_keep_their_bound_in_all_directions(angle: float, mode: str, offset: float) -> None:
+def test_multiscale_focus_curves_keep_their_bound_in_all_directions(
+    angle: float, mode: str, offset: float
+) -> None:
     for blur, sigma in ((1.0, 0.0), (0.7, 1.0), (2.0, 1.0), (1.5, 1.5)):
         image = edge(angle, blur, offset=offset)
         field = filters.multiscale_focus_curves(image, sigma=sigma, mode=mode, saliency_weight=0.0)
         bound = 1.0 / math.hypot(blur, sigma)
-        largest = float(field[0, :, 20:-20, 20:-20].norm(dim=0).max())  # without the corners, where an edge ends
+        # without the corners, where an edge ends
+        largest = float(field[0, :, 20:-20, 20:-20].norm(dim=0).max())
         assert largest < 1.005 * bound
         assert offset > 0.0 or largest > 0.985 * bound  # where a pixel lies on the centre line
 
@@ -75,7 +82,9 @@ def _gradient_peak(image: Tensor, sigma: float) -> float:
 
 
 def _saliency_peak(image: Tensor, sigma: float) -> float:
-    return math.sqrt(float(filters.image_curvilinear_saliency(image, sigma=sigma)[0, :, MIDDLE, MIDDLE].norm()))
+    return math.sqrt(
+        float(filters.image_curvilinear_saliency(image, sigma=sigma)[0, :, MIDDLE, MIDDLE].norm())
+    )
 
 
 @in_all_directions
@@ -84,7 +93,8 @@ def _saliency_peak(image: Tensor, sigma: float) -> float:
 def test_gradient_and_saliency_of_an_edge(
     angle: float, peak: Callable[[Tensor, float], float], blur: float, sigma: float
 ) -> None:
-    """A / sqrt(2 pi s^2), where s^2 is the sum of the variances of edge, smoothing and differences."""
+    """A / sqrt(2 pi s^2), where s^2 is the sum of the variances of edge, smoothing and
+    differences."""
     total = blur**2 + sigma**2 + difference_variance(angle)
     want = 0.6 / math.sqrt(2.0 * math.pi * total)
     assert peak(edge(angle, blur, contrast=0.6), sigma) == pytest.approx(want, rel=5e-3)
@@ -93,17 +103,20 @@ def test_gradient_and_saliency_of_an_edge(
 
 
 def test_saliency_of_equal_edges_hardly_depends_on_the_direction() -> None:
-    """MCS divides by the strongest edge of the image: with sigma 1 the direction changes CS by less than
-    a fifth, about (1 + 1/3) / (1 + 1/6), which is little beside its threshold exp(-5)."""
+    """MCS divides by the strongest edge of the image: with sigma 1 the direction changes CS by less
+    than a fifth, about (1 + 1/3) / (1 + 1/6), which is little beside its threshold exp(-5)."""
     sharp = [_saliency_peak(edge(angle, 0.4), 1.0) ** 2 for angle in ANGLES]
     assert 1.08 < max(sharp) / min(sharp) < 1.2
 
 
 @in_all_directions
 def test_second_derivatives_across_a_ridge(angle: float) -> None:
-    """z = -h exp(-t^2 / 2 w^2) has |z''| = h w / (w^2 + v)^1.5 on its line, where v is the variance of smoothing and of
-    the second differences. Differences along the line are not zero on the grid; CS subtracts them."""
-    height, width, sigma = 0.2, 2.0, 1.0
+    """z = -h exp(-t^2 / 2 w^2) has |z''| = h w / (w^2 + v)^1.5 on its line, where v is the variance
+    of smoothing and of the second differences. Differences along the line are not zero on the grid;
+    CS subtracts them."""
+    height = 0.2
+    width = 2.0
+    sigma = 1.0
     ridge = (3.0 - height * torch.exp(-0.5 * (across(angle) / width) ** 2))[None, None]
     gx, gy = direction(angle)
     hessian_variance = (gx**6 + gy**6) / 6.0 + (2.0 / 3.0) * (gx * gy) ** 2

@@ -53,7 +53,9 @@ def test_fill_missing_uses_the_surroundings() -> None:
         filled = fill_missing(ramp.masked_fill(holes, math.nan))
         assert torch.equal(filled[~holes], ramp[~holes])
         assert float((filled - ramp)[holes].abs().max()) <= 2 * size
-        gradient = filters.image_gradient(ramp.masked_fill(holes, math.nan))[..., 5:-5, 5:-5].norm(dim=1)
+        gradient = filters.image_gradient(ramp.masked_fill(holes, math.nan))[..., 5:-5, 5:-5].norm(
+            dim=1
+        )
         assert float(gradient.max()) < 2.5
     large = torch.zeros_like(ramp, dtype=torch.bool)
     large[..., :, 2:] = True  # beyond the reach of the pyramid: the mean of the valid pixels
@@ -76,7 +78,8 @@ def test_photo_layers_convert_colour_to_grey(layer: LayerCase) -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_hog_and_field_points_ignore_vectors_that_are_not_finite(value: float) -> None:
     field = filters.image_gradient(photos(2, 32))
-    zero, broken = field.clone(), field.clone()
+    zero = field.clone()
+    broken = field.clone()
     zero[0, :, 9, 12:15] = 0.0
     broken[0, :, 9, 12:15] = zero[0, :, 9, 12:15]
     broken[0, 1, 9, 12:15] = value

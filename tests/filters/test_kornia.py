@@ -1,4 +1,5 @@
-"""Our primitives equal kornia's where both are defined, and kornia's is used where the measurements say so."""
+"""Our primitives equal kornia's where both are defined, and kornia's is used where the measurements
+say so."""
 
 import json
 
@@ -17,7 +18,9 @@ SAME = [primitive for primitive in PRIMITIVES if primitive.same]
 @pytest.mark.parametrize("primitive", SAME, ids=lambda primitive: primitive.name)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_primitives_equal_those_of_kornia(primitive: script.Primitive, dtype: torch.dtype) -> None:
-    x = torch.rand(2, primitive.channels, 116, 118, generator=torch.Generator().manual_seed(0)).to(dtype)
+    x = torch.rand(2, primitive.channels, 116, 118, generator=torch.Generator().manual_seed(0)).to(
+        dtype
+    )
     assert difference_of(primitive, x) < 5e-5
     inner = slice(primitive.border, -primitive.border or None)
     assert float(forward(primitive.kornia, x)[..., inner, inner].abs().max()) > 0.01
@@ -27,7 +30,14 @@ def test_primitives_equal_those_of_kornia(primitive: script.Primitive, dtype: to
 def test_gradients_of_primitives_equal_those_of_kornia(primitive: script.Primitive) -> None:
     if not primitive.differentiable or primitive.border:  # borders are padded differently
         return
-    x = torch.rand(1, primitive.channels, 40, 44, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x = torch.rand(
+        1,
+        primitive.channels,
+        40,
+        44,
+        generator=torch.Generator().manual_seed(0),
+        dtype=torch.float64,
+    )
     gradients = []
     for function in (primitive.ours, primitive.kornia):
         image = x.clone().requires_grad_()

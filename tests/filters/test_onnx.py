@@ -28,7 +28,9 @@ def test_layers_in_onnx_runtime(name: str, tmp_path: Path) -> None:
     any_batch = {0: torch.export.Dim("batch", min=1, max=64)}
     example = torch.rand(2, 1, 64, 64, generator=generator)
     path = tmp_path / "layer.onnx"
-    torch.onnx.export(layer, (example,), path, dynamo=True, dynamic_shapes=(any_batch,), verbose=False)
+    torch.onnx.export(
+        layer, (example,), path, dynamo=True, dynamic_shapes=(any_batch,), verbose=False
+    )
     session = onnxruntime.InferenceSession(path)
     images = torch.rand(5, 1, 64, 64, generator=generator)
     (found,) = session.run(None, {session.get_inputs()[0].name: images.numpy()})

@@ -1,4 +1,5 @@
-"""Options: functions and constructors check them alike; masks and cameras broadcast; cameras keep their dtype."""
+"""Options: functions and constructors check them alike; masks and cameras broadcast; cameras keep
+their dtype."""
 
 import copy
 from collections.abc import Callable
@@ -16,7 +17,11 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
     ("cs", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
     ("cs", {"formula": "x"}, "formula: expected one of 'geometric', 'paper', got 'x'"),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
-    ("asg", {"camera_matrix": torch.eye(3), "depth_scale": 1.0}, "depth_scale: has no meaning with a camera_matrix"),
+    (
+        "asg",
+        {"camera_matrix": torch.eye(3), "depth_scale": 1.0},
+        "depth_scale: has no meaning with a camera_matrix",
+    ),
     ("diffusion", {"iterations": 1, "step": 0.3}, "step: expected 0 < step <= 0.25"),
     ("mcs", {"scales": 2.5}, "scales: expected an integer >= 1, got 2.5"),
     ("mcs", {"sigma": "1"}, "sigma: expected a number, got str"),
@@ -28,8 +33,12 @@ WRONG: list[tuple[str, dict[str, object], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "options", "message"), WRONG, ids=[f"{x[0]}-{','.join(x[1])}" for x in WRONG])
-def test_functions_and_constructors_reject_wrong_options(name: str, options: dict[str, object], message: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "options", "message"), WRONG, ids=[f"{x[0]}-{','.join(x[1])}" for x in WRONG]
+)
+def test_functions_and_constructors_reject_wrong_options(
+    name: str, options: dict[str, object], message: str
+) -> None:
     function, inputs, module = PAIRS[name]
     with pytest.raises(InvalidInputError, match=message) as by_function:
         function(inputs(), **options)
@@ -45,32 +54,47 @@ def test_depth_layers_broadcast_masks() -> None:
     for broadcastable in (mask, mask[None], mask[None, None]):
         assert torch.equal(filters.depth_curvilinear_saliency(depth, broadcastable), want)
     each = torch.ones(3, 1, 1, 1, dtype=torch.bool)
-    assert torch.equal(filters.hessian_frobenius_norm(depth, each), filters.hessian_frobenius_norm(depth))
+    assert torch.equal(
+        filters.hessian_frobenius_norm(depth, each), filters.hessian_frobenius_norm(depth)
+    )
     for wrong in (mask[:23], mask.expand(2, 1, 24, 24), mask[None, None, None], depth):
-        with pytest.raises(InvalidInputError, match=r"mask: expected bool of shape \(3, 1, 24, 24\)"):
+        with pytest.raises(
+            InvalidInputError, match=r"mask: expected bool of shape \(3, 1, 24, 24\)"
+        ):
             filters.average_shading_gradient(depth, wrong)
 
 
 @pytest.mark.parametrize("module", [filters.AverageShadingGradient, filters.ApparentRidges])
-def test_perspective_modules_keep_the_dtype_of_their_camera(module: Callable[..., nn.Module]) -> None:
+def test_perspective_modules_keep_the_dtype_of_their_camera(
+    module: Callable[..., nn.Module],
+) -> None:
     camera = CAMERA.clone()
     camera[:2, 2] += 1 / 3  # not representable in half precision
     depth = depths().half()
     want = module(camera_matrix=camera)(depth)
-    for half in (module(camera_matrix=camera).half(), module(camera_matrix=camera).to(torch.bfloat16)):
+    for half in (
+        module(camera_matrix=camera).half(),
+        module(camera_matrix=camera).to(torch.bfloat16),
+    ):
         assert torch.equal(half.camera_matrix, camera)
         assert torch.equal(half(depth), want)
     assert module(camera_matrix=camera).to("meta").camera_matrix.device.type == "meta"
     assert module().half().camera_matrix is None
 
 
-# At sigma 1 the kernel is about to grow by a tap, 4e-6 of its sum: enough to disturb a difference quotient.
+# At sigma 1 the kernel is about to grow by a tap, 4e-6 of its sum: enough to disturb a difference
+# quotient.
 MODULES = {
     "ig": (filters.ImageGradient, {"sigma": 0.9}, photos, {"sigma"}),
     "ics": (filters.ImageCurvilinearSaliency, {"sigma": 0.9}, photos, {"sigma"}),
     "cs": (filters.DepthCurvilinearSaliency, {"sigma": 0.9}, depths, {"sigma"}),
     "diffusion": (filters.AnisotropicDiffusion, {"iterations": 3}, photos, {"kappa"}),
-    "mcs": (filters.MultiScaleCurvilinearSaliency, {"sigma": 0.9, "scales": 3}, photos, {"sigma", "kappa"}),
+    "mcs": (
+        filters.MultiScaleCurvilinearSaliency,
+        {"sigma": 0.9, "scales": 3},
+        photos,
+        {"sigma", "kappa"},
+    ),
     "mfc": (filters.MultiScaleFocusCurves, {"sigma": 0.9}, photos, {"sigma"}),
 }
 
@@ -79,7 +103,8 @@ MODULES = {
 def test_learnable_modules_start_at_their_options_with_correct_gradients(name: str) -> None:
     make, options, inputs, learnable = MODULES[name]
     x = inputs(2, 12, dtype=torch.float64)
-    fixed, module = make(**options), make(**options, learnable=True).double()
+    fixed = make(**options)
+    module = make(**options, learnable=True).double()
     keys = [f"parametrizations.{option}.original" for option in sorted(learnable)]
     assert sorted(module.state_dict()) == keys
     assert not list(fixed.parameters())
@@ -92,20 +117,36 @@ def test_learnable_modules_start_at_their_options_with_correct_gradients(name: s
         weights = fixed(x).norm(dim=1, keepdim=True) < 1.0 - 1e-6  # all levels are tied at the peak
 
     def function(*values: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(module, dict(zip(keys, values, strict=True)), (x,)) * weights
+        return (
+            torch.func.functional_call(module, dict(zip(keys, values, strict=True)), (x,)) * weights
+        )
 
     parameters = tuple(p for _, p in sorted(module.named_parameters()))
     gradients = torch.autograd.grad(function(*parameters).square().sum(), parameters)
     assert all(float(g) != 0.0 for g in gradients)
-    assert torch.autograd.gradcheck(function, parameters, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        function, parameters, eps=1e-7, atol=1e-5, rtol=1e-4, fast_mode=True
+    )
 
 
 def test_learnable_options_reject_values_that_are_not_positive() -> None:
     for call, message in (
-        (lambda: filters.ImageGradient(sigma=0.0, learnable=True), "sigma: expected a finite number > 0, got 0"),
-        (lambda: filters.AnisotropicDiffusion(iterations=1, kappa=-1.0, learnable=True), "kappa: .* > 0, got -1"),
-        (lambda: filters.image_gradient(photos(), sigma=torch.tensor(-1.0)), "sigma: .* >= 0, got -1"),
-        (lambda: filters.image_gradient(photos(), sigma=torch.ones(2)), r"sigma: expected shape \(\), got \(2,\)"),
+        (
+            lambda: filters.ImageGradient(sigma=0.0, learnable=True),
+            "sigma: expected a finite number > 0, got 0",
+        ),
+        (
+            lambda: filters.AnisotropicDiffusion(iterations=1, kappa=-1.0, learnable=True),
+            "kappa: .* > 0, got -1",
+        ),
+        (
+            lambda: filters.image_gradient(photos(), sigma=torch.tensor(-1.0)),
+            "sigma: .* >= 0, got -1",
+        ),
+        (
+            lambda: filters.image_gradient(photos(), sigma=torch.ones(2)),
+            r"sigma: expected shape \(\), got \(2,\)",
+        ),
     ):
         with pytest.raises(InvalidInputError, match=message):
             call()
@@ -114,12 +155,17 @@ def test_learnable_options_reject_values_that_are_not_positive() -> None:
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 1.0, 2.5, 4.0, 5.0])
 def test_gaussian_smooth_has_the_same_kernel_for_numbers_tensors_and_graphs(sigma: float) -> None:
-    """Up to 4 px the kernel of a tensor is that of the number; a larger one is cut at 16 px, traced or not."""
-    x, s = photos(1, 40, dtype=torch.float64), torch.tensor(sigma, dtype=torch.float64)
+    """Up to 4 px the kernel of a tensor is that of the number; a larger one is cut at 16 px, traced
+    or not."""
+    x = photos(1, 40, dtype=torch.float64)
+    s = torch.tensor(sigma, dtype=torch.float64)
     by_tensor = filters.gaussian_smooth(x, s)
     if sigma <= 4.0:
-        torch.testing.assert_close(by_tensor, filters.gaussian_smooth(x, sigma), rtol=1e-12, atol=0.0)
-    traced = torch.func.vmap(lambda s: filters.gaussian_smooth(x, s))(s[None])[0]  # where s cannot be read
+        torch.testing.assert_close(
+            by_tensor, filters.gaussian_smooth(x, sigma), rtol=1e-12, atol=0.0
+        )
+    # where s cannot be read
+    traced = torch.func.vmap(lambda s: filters.gaussian_smooth(x, s))(s[None])[0]
     torch.testing.assert_close(traced, by_tensor, rtol=1e-12, atol=0.0)
     s.requires_grad_()
     (gradient,) = torch.autograd.grad(filters.gaussian_smooth(x, s).square().sum(), s)

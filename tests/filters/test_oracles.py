@@ -23,7 +23,8 @@ def _gradient(x: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     """Central differences, pixel by pixel, of the smoothed image with replicated borders."""
     H, W = x.shape
     p = _smooth(np.pad(x, 1, mode="edge"), sigma)
-    gx, gy = np.zeros_like(x), np.zeros_like(x)
+    gx = np.zeros_like(x)
+    gy = np.zeros_like(x)
     for i in range(H):
         for j in range(W):
             gx[i, j] = (p[i + 1, j + 2] - p[i + 1, j]) / 2
@@ -31,7 +32,9 @@ def _gradient(x: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray]:
     return gx, gy
 
 
-def _perona_malik(x: np.ndarray, iterations: int, kappa: float, step: float, conductance: str) -> np.ndarray:
+def _perona_malik(
+    x: np.ndarray, iterations: int, kappa: float, step: float, conductance: str
+) -> np.ndarray:
     H, W = x.shape
     for _ in range(iterations):
         new = x.copy()
@@ -40,7 +43,11 @@ def _perona_malik(x: np.ndarray, iterations: int, kappa: float, step: float, con
                 for di, dj in ((0, 1), (0, -1), (1, 0), (-1, 0)):
                     if 0 <= i + di < H and 0 <= j + dj < W:
                         d = x[i + di, j + dj] - x[i, j]
-                        g = 1 / (1 + (d / kappa) ** 2) if conductance == "rational" else math.exp(-((d / kappa) ** 2))
+                        g = (
+                            1 / (1 + (d / kappa) ** 2)
+                            if conductance == "rational"
+                            else math.exp(-((d / kappa) ** 2))
+                        )
                         new[i, j] += step * g * d
         x = new
     return x
@@ -49,7 +56,9 @@ def _perona_malik(x: np.ndarray, iterations: int, kappa: float, step: float, con
 @pytest.mark.parametrize("conductance", ["rational", "exponential"])
 def test_anisotropic_diffusion_against_loops(conductance: str) -> None:
     image = photos(1, 15, dtype=torch.float64)
-    got = filters.anisotropic_diffusion(image, iterations=6, kappa=0.07, step=0.25, conductance=conductance)
+    got = filters.anisotropic_diffusion(
+        image, iterations=6, kappa=0.07, step=0.25, conductance=conductance
+    )
     want = _perona_malik(image[0, 0].numpy(), 6, 0.07, 0.25, conductance)
     np.testing.assert_allclose(got[0, 0], want, rtol=1e-12)
 
@@ -63,7 +72,8 @@ def test_multiscale_curvilinear_saliency_against_loops() -> None:
         length = np.hypot(gx, gy)
         fields.append(np.stack([length * gx, length * gy]) / (length**2).max())
     lengths = np.stack([np.hypot(*f) for f in fields])
-    retained, best = (lengths > math.exp(-3)).all(0), lengths.argmax(0)
+    retained = (lengths > math.exp(-3)).all(0)
+    best = lengths.argmax(0)
     want = np.where(retained, np.take_along_axis(np.stack(fields), best[None, None], 0)[0], 0.0)
     assert 0.05 < retained.mean() < 0.95
     # At the strongest pixel all levels are 1, and rounding decides which direction is selected.
@@ -82,7 +92,8 @@ def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float
     x = _smooth(image[0, 0].numpy(), 1.0)
     gx, gy = _gradient(image[0, 0].numpy(), 1.0)
     cs = gx**2 + gy**2
-    cosine, sine = gx / np.maximum(np.sqrt(cs), 1e-300), gy / np.maximum(np.sqrt(cs), 1e-300)
+    cosine = gx / np.maximum(np.sqrt(cs), 1e-300)
+    sine = gy / np.maximum(np.sqrt(cs), 1e-300)
     variance = (cosine**4 + sine**4) / 3
     fourth = variance**2 - 7 / 90 * (cosine**6 + sine**6)
     worst = np.zeros_like(cs)
@@ -119,7 +130,9 @@ def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loo
     image = photos(1, 33, dtype=torch.float64)
     x = filters.gaussian_smooth(image, 1.7)[0, 0].numpy()
     # scipy rounds the radius 4 sigma to the nearest pixel; gaussian_smooth rounds it up.
-    np.testing.assert_allclose(x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12)
+    np.testing.assert_allclose(
+        x, gaussian_filter(image[0, 0].numpy(), 1.7, mode="nearest", radius=7), rtol=1e-12
+    )
     xx, yy, xy = (h[0, 0].numpy() for h in central_derivatives(smooth(image, 1.7))[2:])
     gx, gy = _gradient(image[0, 0].numpy(), 1.7)
     np.testing.assert_allclose(filters.image_gradient(image, sigma=1.7)[0], [gx, gy], atol=1e-14)
@@ -131,13 +144,15 @@ def test_gaussian_gradient_saliency_and_second_derivatives_against_scipy_and_loo
 
 
 def test_dominant_eigenvector_against_lapack() -> None:
-    """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between branches."""
+    """(N, 2, 2) with real eigenvalues: adj(I_P) H_Z of random surfaces, and the boundaries between
+    branches."""
     g = torch.Generator().manual_seed(0)
     slope, h = (2 * torch.randn(500, n, generator=g, dtype=torch.float64) for n in (2, 3))
     across = torch.stack([slope[:, 1], -slope[:, 0]], dim=1)
     adjugate = torch.eye(2, dtype=torch.float64) + across[:, :, None] * across[:, None]
     general = adjugate @ h[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    symmetric = [-1, 2, 2, -1], [1, 2, 2, 1], [-1, 2, 2, 1], [1, -2, -2, -1]  # equal diagonal (a ridge), or trace 0
+    # equal diagonal (a ridge), or trace 0
+    symmetric = [-1, 2, 2, -1], [1, 2, 2, 1], [-1, 2, 2, 1], [1, -2, -2, -1]
     triangular = [0, 3, 0, 1], [0, 0, 3, -1], [2, 3, 0, -1], [0, 0, 0, -5], [-5, 0, 0, 0]
     special = torch.tensor([*symmetric, *triangular], dtype=torch.float64)
     m = torch.cat([general, special.view(-1, 2, 2)])

@@ -9,16 +9,25 @@ from curvireg_torch.geometry import Camera, camera_matrix, project_points, undis
 SIZE = (120, 160)
 MATRIX = camera_matrix(110.0, 112.0, 77.0, 61.0)
 RADIAL = Camera(MATRIX, (-0.3, 0.1, 0.003, -0.002, 0.01), size=SIZE)
-TILTED = Camera(MATRIX, (-0.2, 0.05, 0.001, 0.001, 0, 0.1, 0, 0, 0.01, 0.001, 0.02, 0.003, 0.01, -0.02), size=SIZE)
+TILTED = Camera(
+    MATRIX,
+    (-0.2, 0.05, 0.001, 0.001, 0, 0.1, 0, 0, 0.01, 0.001, 0.02, 0.003, 0.01, -0.02),
+    size=SIZE,
+)
 FISHEYE = Camera(MATRIX, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 
 
 @pytest.mark.parametrize("camera", [RADIAL, TILTED, FISHEYE], ids=["radial", "tilted", "fisheye"])
 def test_photograph_and_box_are_undistorted_as_by_opencv(camera):
-    image, box = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0)), torch.tensor([12.0, 8, 150, 100])
-    K, D, pixels = camera.matrix.numpy(), np.array(camera.distortion), image.permute(1, 2, 0).numpy()
+    image = torch.rand(3, *SIZE, generator=torch.Generator().manual_seed(0))
+    box = torch.tensor([12.0, 8, 150, 100])
+    K = camera.matrix.numpy()
+    D = np.array(camera.distortion)
+    pixels = image.permute(1, 2, 0).numpy()
     side = np.linspace(0.0, 1.0, 500)
-    outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [(x, 8 + 92 * s) for s in side for x in (12, 150)]
+    outline = [(12 + 138 * s, y) for s in side for y in (8, 100)] + [
+        (x, 8 + 92 * s) for s in side for x in (12, 150)
+    ]
     points = np.array(outline, np.float64)[:, None]
     if camera.model == "fisheye":
         expected = cv2.fisheye.undistortImage(pixels, K, D, Knew=K)
@@ -28,19 +37,24 @@ def test_photograph_and_box_are_undistorted_as_by_opencv(camera):
         points = cv2.undistortImagePoints(points, K, D, None, (3, 500, 1e-12))[:, 0]
     seen = undistorted(image, camera, box)
     assert not seen.missing.any()
-    torch.testing.assert_close(seen.image, torch.from_numpy(expected).permute(2, 0, 1), atol=0.05, rtol=0)
+    torch.testing.assert_close(
+        seen.image, torch.from_numpy(expected).permute(2, 0, 1), atol=0.05, rtol=0
+    )
     assert undistorted(image.double(), camera).image.dtype == torch.float64
     in_bytes = undistorted((image * 255).round().byte(), camera).image
     assert in_bytes.dtype == torch.uint8
     torch.testing.assert_close(in_bytes.float() / 255, seen.image, atol=2 / 255, rtol=0)
     around = torch.tensor([*points.min(axis=0), *points.max(axis=0)]).float()
     torch.testing.assert_close(seen.box, around, atol=0.01, rtol=0)
-    beyond, border = (undistorted(image, camera, torch.tensor([x, 8.0, 150, 100])).box for x in (-40.0, -0.5))
+    beyond, border = (
+        undistorted(image, camera, torch.tensor([x, 8.0, 150, 100])).box for x in (-40.0, -0.5)
+    )
     assert float(beyond[0]) == pytest.approx(float(border[0]) - 39.5, abs=0.1)
 
 
 def test_pixels_beyond_the_valid_radius_repeat_its_border():
-    # r - 0.5 r^3 grows up to r = 0.816, and falls beyond: rays at the corners would show the centre again.
+    # r - 0.5 r^3 grows up to r = 0.816, and falls beyond: rays at the corners would show the centre
+    # again.
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (-0.5, 0.0, 0.0, 0.0))
     v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
     radius = torch.hypot(u - 79.5, v - 59.5) / 100
@@ -55,7 +69,9 @@ def test_pixels_beyond_the_valid_radius_repeat_its_border():
 
 def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
     camera = Camera(camera_matrix(60.0, 60.0, 79.5, 59.5), (0.0,) * 4, "fisheye")
-    with pytest.raises(InvalidInputError, match=r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"):
+    with pytest.raises(
+        InvalidInputError, match=r"box \(0, 0, 15, 15\): outside .* too far from the optical axis"
+    ):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([0.0, 0, 15, 15]))
     with pytest.raises(InvalidInputError, match="entirely outside the 160 x 120 image"):
         undistorted(torch.zeros(1, *SIZE), camera, torch.tensor([200.0, 0, 300, 15]))
@@ -72,28 +88,37 @@ def test_unusable_cameras_and_boxes_outside_of_what_is_shown_are_refused():
 def test_camera_of_a_resized_photograph():
     small = RADIAL.at((60, 80))
     points = torch.tensor([[0.3, -0.2, 1.0], [-0.5, 0.4, 2.0]], dtype=torch.float64)
-    large, pose = project_points(points, torch.eye(4).double(), MATRIX), torch.eye(4).double()
+    large = project_points(points, torch.eye(4).double(), MATRIX)
+    pose = torch.eye(4).double()
     # The corner of the picture, (-0.5, -0.5) in px, is the same point in both.
     torch.testing.assert_close(project_points(points, pose, small.matrix), (large + 0.5) / 2 - 0.5)
     assert (small.size, small.distortion) == ((60, 80), RADIAL.distortion)
     assert RADIAL.at((40, 53)).size == (40, 53)  # 53.3, rounded
-    with pytest.raises(InvalidInputError, match=r"calibrated for 160 x 120 px, .* has 160 x 90 px, .* uncropped"):
+    with pytest.raises(
+        InvalidInputError, match=r"calibrated for 160 x 120 px, .* has 160 x 90 px, .* uncropped"
+    ):
         RADIAL.at((90, 160))
-    with pytest.raises(InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"):
+    with pytest.raises(
+        InvalidInputError, match=r"has 120 x 160 px, .*turn the photograph by 90 degrees"
+    ):
         RADIAL.at((160, 120))
 
 
 def test_sides_are_scaled_on_their_own_when_a_resized_picture_is_rounded():
     camera = Camera([[500.0, 0, 319.5], [0, 500, 239.5], [0, 0, 1]], size=(480, 640))
     small = camera.at((7, 9))  # 6.75 x 9, or 7 x 9.33
-    x, y = 9 / 640, 7 / 480
+    x = 9 / 640
+    y = 7 / 480
     expected = [[500 * x, 0, 320 * x - 0.5], [0, 500 * y, 240 * y - 0.5], [0, 0, 1]]
     torch.testing.assert_close(small.matrix, torch.tensor(expected, dtype=torch.float64))
 
 
-@pytest.mark.parametrize(("calibrated", "size"), [((10, 1000), (50, 4996)), ((1000, 10), (4996, 50))])
+@pytest.mark.parametrize(
+    ("calibrated", "size"), [((10, 1000), (50, 4996)), ((1000, 10), (4996, 50))]
+)
 def test_one_side_may_be_rounded_by_what_the_other_is_many_pixels_of(calibrated, size):
     camera = Camera([[500.0, 0, 4.5], [0, 500, 4.5], [0, 0, 1]], size=calibrated)
-    assert camera.at(size).size == size  # 50 x 5000 within a pixel of the short side, not of the long one
+    # 50 x 5000 within a pixel of the short side, not of the long one
+    assert camera.at(size).size == size
     with pytest.raises(InvalidInputError, match="another aspect ratio"):
         camera.at((size[0] + 2, size[1] + 2))

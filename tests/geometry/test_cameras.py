@@ -14,9 +14,12 @@ K = g.camera_matrix(800.0, 820.0, 310.0, 255.0, dtype=torch.float64)
 
 def test_project_points_agrees_with_opencv() -> None:
     X = np.random.default_rng(0).uniform(-1, 1, (40, 3))
-    rotation, t = np.array([0.3, -0.8, 0.2]), np.array([0.2, -0.1, 5.0])
+    rotation = np.array([0.3, -0.8, 0.2])
+    t = np.array([0.2, -0.1, 5.0])
     expected = cv2.projectPoints(X, rotation, t, K.numpy(), None)[0][:, 0]
-    T = g.transform(torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t))
+    T = g.transform(
+        torch.from_numpy(Rotation.from_rotvec(rotation).as_matrix()), torch.from_numpy(t)
+    )
     ours = g.project_points(torch.from_numpy(X), T, K)
     np.testing.assert_allclose(ours, expected, atol=1e-9)
     box = g.projected_boxes(torch.from_numpy(X), T, K)
@@ -28,7 +31,9 @@ def test_pose_from_box_recovers_the_true_pose(spread: float) -> None:
     """Of objects 3 to 12 radii away, ``spread`` (tangent) off the axis."""
     mesh = example_mesh()
     mesh.apply_translation([3.0, -2.0, 1.0])  # the centre is far from the origin
-    centre, radius, hull = mesh_centre(mesh), mesh_radius(mesh), extreme_points(mesh)
+    centre = mesh_centre(mesh)
+    radius = mesh_radius(mesh)
+    hull = extreme_points(mesh)
     generator = torch.Generator().manual_seed(0)
     for i in range(25):
         u = torch.rand(3, generator=generator, dtype=torch.float64)

@@ -23,14 +23,19 @@ def test_rotation_from_viewpoint_agrees_with_the_definition_of_pascal3d() -> Non
     for a, e, t, d in ((30.0, 20.0, -10.0, 5.0), (200.0, -35.0, 100.0, 4.0), (0.0, 0.0, 0.0, 9.0)):
         ar, er, tr = (math.radians(v) for v in (a, e, t))
         C = d * np.array([math.cos(er) * math.sin(ar), -math.cos(er) * math.cos(ar), math.sin(er)])
-        R_camera = Rotation.from_euler("x", er - math.pi / 2).as_matrix() @ Rotation.from_euler("z", -ar).as_matrix()
+        R_camera = (
+            Rotation.from_euler("x", er - math.pi / 2).as_matrix()
+            @ Rotation.from_euler("z", -ar).as_matrix()
+        )
         p = (X - C) @ R_camera.T @ np.diag([f, f, -1.0])
         xy = p[:, :2] / p[:, 2:]
         xy = xy @ np.array([[math.cos(tr), math.sin(tr)], [-math.sin(tr), math.cos(tr)]])
         expected = np.stack([px + xy[:, 0], py - xy[:, 1]], 1)
         R = g.rotation_from_viewpoint(*(torch.tensor(v, dtype=torch.float64) for v in (a, e, t)))
         T = g.transform(R, torch.tensor([0.0, 0.0, d], dtype=torch.float64))
-        ours = g.project_points(torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64))
+        ours = g.project_points(
+            torch.from_numpy(X), T, g.camera_matrix(f, f, px, py, dtype=torch.float64)
+        )
         np.testing.assert_allclose(ours, expected, atol=1e-8)
         back = [float(v) for v in g.viewpoint_from_rotation(R)]
         np.testing.assert_allclose(back, (a, e, t), atol=1e-9)
@@ -48,17 +53,23 @@ def test_axis_angle_agrees_with_scipy(angle: float) -> None:
     assert float(back.norm(dim=1).max()) <= math.pi + 1e-12
 
 
-AXIS, OFFSET = [1.0, 2.0, -2.0], [10.0, -4.0, 3.0]
+AXIS = [1.0, 2.0, -2.0]
+OFFSET = [10.0, -4.0, 3.0]
 CONTINUOUS = {"symmetries_continuous": [{"axis": AXIS, "offset": OFFSET}]}
-HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]  # about the vertical line through (4, 3)
+# about the vertical line through (4, 3)
+HALF_TURN = [-1, 0, 0, 8, 0, -1, 0, 6, 0, 0, 1, 0, 0, 0, 0, 1]
 
 
 def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input() -> None:
-    assert torch.equal(g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None])
+    assert torch.equal(
+        g.symmetry_transforms({"diameter": 3.0}), torch.eye(4, dtype=torch.float64)[None]
+    )
     transforms = g.symmetry_transforms({"symmetries_discrete": [HALF_TURN]})
     assert transforms.shape == (2, 4, 4)
     np.testing.assert_array_equal(transforms[1], np.reshape(HALF_TURN, (4, 4)))
-    np.testing.assert_allclose(transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0])
+    np.testing.assert_allclose(
+        transforms[1] @ torch.tensor([4.0, 3.0, 7.0, 1.0]).double(), [4.0, 3.0, 7.0, 1.0]
+    )
     for info, step, match in (
         ({"symmetries_discrete": [[1.0] * 12]}, 0.1, "expected 16"),
         ({"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}, 0.1, "length > 0"),
@@ -70,7 +81,9 @@ def test_symmetry_transforms_reads_matrices_and_axes_and_refuses_malformed_input
     assert len(transforms) == 32  # ceil(pi / 0.1)
     unit = np.array(AXIS) / 3.0
     for i, T in enumerate(transforms):
-        np.testing.assert_allclose(T[:3, :3], Rotation.from_rotvec(unit * i * 2 * np.pi / 32).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(
+            T[:3, :3], Rotation.from_rotvec(unit * i * 2 * np.pi / 32).as_matrix(), atol=1e-12
+        )
         for along in (-5.0, 0.0, 2.0):
             point = np.array(OFFSET) + along * unit
             np.testing.assert_allclose(T[:3, :3] @ point + T[:3, 3], point, atol=1e-12)

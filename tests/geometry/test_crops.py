@@ -19,12 +19,18 @@ def test_image_transforms_invert_crop_transforms_with_exact_zeros() -> None:
     # A camera matrix with 1e-16 in place of 0, which some versions of LAPACK leave, is refused.
     squares = torch.tensor([[10.0, 30.0, 26.3, 46.3], [-3.7, 2.1, 0.4, 6.2]], dtype=torch.float64)
     back = image_transforms(squares, 32)
-    torch.testing.assert_close(back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3))
+    torch.testing.assert_close(
+        back @ g.crop_transforms(squares, 32), torch.eye(3).double().expand(2, 3, 3)
+    )
     check_camera_matrix(back)
 
 
-@pytest.mark.parametrize(("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)])
-def test_crop_images_agrees_with_its_transforms_on_a_ramp(side: float, size: int, off: float) -> None:
+@pytest.mark.parametrize(
+    ("side", "size", "off"), [(8.0, 8, 2e-4), (8.0, 16, 2e-4), (24.0, 8, 2e-4), (20.5, 12, 0.1)]
+)
+def test_crop_images_agrees_with_its_transforms_on_a_ramp(
+    side: float, size: int, off: float
+) -> None:
     # Bilinear weights preserve a ramp exactly, also if widened by an integer factor, else nearly.
     image = ramp(60, 80)
     box = torch.tensor([[30.2, 18.3, 30.2 + side, 18.3 + 0.5 * side]])
@@ -37,7 +43,8 @@ def test_crop_images_agrees_with_its_transforms_on_a_ramp(side: float, size: int
 
 @pytest.mark.parametrize("side", [3.0, 9.5, 40.0, 200.0])
 def test_crop_squares_are_triangle_filtered(side: float) -> None:
-    image, size = torch.rand(2, 70, 90, dtype=torch.float64), 11
+    image = torch.rand(2, 70, 90, dtype=torch.float64)
+    size = 11
     corners = torch.tensor([[40.3, 31.2], [30.1, -1.7], [88.0, 60.0]], dtype=torch.float64)
     squares = torch.cat([corners, corners + torch.tensor([[side], [1.1 * side], [side]])], dim=1)
     crops = crop_squares(image, squares, size)
@@ -68,7 +75,8 @@ def test_crop_images_spreads_missing_pixels_no_further_than_its_filter() -> None
     image = torch.rand(1, 3, 60, 80)
     boxes = torch.tensor([[30.0, 20.0, 60.0, 50.0]])
     clean, _ = g.crop_images(image, boxes, size=32)
-    outside, inside = image.clone(), image.clone()
+    outside = image.clone()
+    inside = image.clone()
     outside[0, :, 2, 3], outside[0, 1, 59, 79] = math.nan, math.inf
     assert torch.equal(g.crop_images(outside, boxes, size=32)[0], clean)
     inside[0, 1, 35, 45] = math.nan

@@ -9,7 +9,9 @@ from curvireg_torch.geometry.pose_prior import PosePrior, object_frame
 
 
 def rotations(azimuth, elevation=0.0, theta=0.0):
-    return rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta)))
+    return rotation_from_viewpoint(
+        *(torch.as_tensor(v, dtype=torch.float64) for v in (azimuth, elevation, theta))
+    )
 
 
 def random_rotations(count):
@@ -17,7 +19,13 @@ def random_rotations(count):
     return rotations(360.0 * a, 160.0 * e - 80.0, 360.0 * t - 180.0)
 
 
-WRAPPED = [((300, 60), 0, 0), ((300, 60), 290, 10), ((300, 60), 180, 120), ((60, 300), 0, 60), ((0, 360), 123, 0)]
+WRAPPED = [
+    ((300, 60), 0, 0),
+    ((300, 60), 290, 10),
+    ((300, 60), 180, 120),
+    ((60, 300), 0, 60),
+    ((0, 360), 123, 0),
+]
 
 
 @pytest.mark.parametrize(("limits", "azimuth", "missed"), WRAPPED)
@@ -29,9 +37,15 @@ def test_azimuth_limits_wrap_around_zero(limits, azimuth, missed):
 @pytest.mark.parametrize("elevation", [-85.0, -30.0, 0.0, 50.0, 89.0])
 @pytest.mark.parametrize("azimuth", [70.0, 140.0, 220.0])
 def test_azimuth_excess_and_nearest_are_the_least_rotation_into_the_range(elevation, azimuth):
-    R, prior = rotations(azimuth, elevation, 25.0), PosePrior(azimuth=(300, 60))
-    grid = rotations(*torch.meshgrid(torch.arange(-60.0, 60.5, 1.0), torch.arange(-90.0, 90.5, 0.5), indexing="ij"))
-    least = torch.rad2deg((R[2] * grid[..., 2, :]).sum(-1).clamp(-1.0, 1.0).acos()).min()  # angle of the directions
+    R = rotations(azimuth, elevation, 25.0)
+    prior = PosePrior(azimuth=(300, 60))
+    grid = rotations(
+        *torch.meshgrid(
+            torch.arange(-60.0, 60.5, 1.0), torch.arange(-90.0, 90.5, 0.5), indexing="ij"
+        )
+    )
+    # angle of the directions
+    least = torch.rad2deg((R[2] * grid[..., 2, :]).sum(-1).clamp(-1.0, 1.0).acos()).min()
     assert float(prior.excess(R)) == pytest.approx(float(least), abs=0.3)
     moved = prior.nearest(R)
     assert float(prior.excess(moved)) <= 1e-4
@@ -48,13 +62,19 @@ def test_elevation_and_theta_are_limited_each_by_itself():
 
 
 PRIORS = [PosePrior(azimuth=(300, 60)), PosePrior(elevation=(10, 30), theta=(-5, 5))]
-PRIORS += [PosePrior(azimuth=(100, 140), theta=(-15, 15)), PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25)]
+PRIORS += [
+    PosePrior(azimuth=(100, 140), theta=(-15, 15)),
+    PosePrior(rotation=rotations(200.0, 40.0, -20.0), within=25),
+]
 
 
-@pytest.mark.parametrize("prior", PRIORS, ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"])
+@pytest.mark.parametrize(
+    "prior", PRIORS, ids=["azimuth", "elevation, theta", "azimuth, theta", "rotation"]
+)
 def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
     R = random_rotations(4000)
-    before, moved = prior.excess(R), prior.nearest(R)
+    before = prior.excess(R)
+    moved = prior.nearest(R)
     assert float(prior.excess(moved).max()) < 1e-5
     inside = before <= 0.0
     assert inside.any()
@@ -67,13 +87,17 @@ def test_nearest_moves_rotations_to_the_border_and_keeps_those_inside(prior):
 def test_nearest_satisfies_limits_together():
     """One pass leaves limits that were satisfied before by up to the tolerance of a later one."""
     centre = rotations(70.0, 35.0, 12.0)
-    prior = PosePrior(azimuth=(30, 60), elevation=(0, 25), theta=(-8, 8), rotation=centre, within=25.0)
+    prior = PosePrior(
+        azimuth=(30, 60), elevation=(0, 25), theta=(-8, 8), rotation=centre, within=25.0
+    )
     R = random_rotations(500)
     assert float(prior.excess(prior._moved_once(R, None)).max()) > 1.0
     assert float(prior.excess(prior.nearest(R)).max()) < 0.1
 
 
-@pytest.mark.parametrize("prior", [PosePrior(azimuth=(300, 60)), PosePrior(viewpoint=(20, 10, 0), within=30)], ids=str)
+@pytest.mark.parametrize(
+    "prior", [PosePrior(azimuth=(300, 60)), PosePrior(viewpoint=(20, 10, 0), within=30)], ids=str
+)
 def test_angles_are_counted_about_the_objects_own_axes(prior):
     frame = object_frame("y", "x")
     R = rotations(torch.arange(0.0, 360.0, 20.0), 15.0)
@@ -89,7 +113,11 @@ def test_object_frame_puts_up_on_z_and_the_front_towards_azimuth_zero(up):
             with pytest.raises(InvalidInputError, match="front: expected another axis"):
                 object_frame(up, front)
             continue
-        axes = {s + a: (1.0 - 2.0 * bool(s)) * torch.eye(3).double()[i] for i, a in enumerate("xyz") for s in ("", "-")}
+        axes = {
+            s + a: (1.0 - 2.0 * bool(s)) * torch.eye(3).double()[i]
+            for i, a in enumerate("xyz")
+            for s in ("", "-")
+        }
         R = object_frame(up, front)
         assert torch.allclose(R @ axes[up], axes["z"], atol=1e-12)
         assert torch.allclose(R @ axes[front], axes["-y"], atol=1e-12)

@@ -7,7 +7,14 @@ from scipy.spatial.transform import Rotation
 import curvireg_torch as cr
 from curvireg_torch import geometry as g
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import ViewSphere, paper_views, rotation_error, sample_views, uniform_views, up_rotation
+from curvireg_torch.geometry import (
+    ViewSphere,
+    paper_views,
+    rotation_error,
+    sample_views,
+    uniform_views,
+    up_rotation,
+)
 from curvireg_torch.utils.choices import UP_AXES
 
 
@@ -24,13 +31,19 @@ def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
 
 @pytest.mark.parametrize("elevation", [90.0, -90.0])
 @pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-6, 1e-5, 1e-3])
-def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation: float, noise: float) -> None:
+def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(
+    elevation: float, noise: float
+) -> None:
     """Rotations from an optimiser are rounded, and so not exact."""
     generator = torch.Generator().manual_seed(0)
-    azimuth, theta = (360.0 * torch.rand(50, 20, generator=generator, dtype=torch.float64) for _ in range(2))
+    azimuth, theta = (
+        360.0 * torch.rand(50, 20, generator=generator, dtype=torch.float64) for _ in range(2)
+    )
     exact = g.rotation_from_viewpoint(azimuth, elevation, theta)
     perturbation = torch.randn(exact.shape[:-1], generator=generator, dtype=torch.float64) * noise
-    tilt = torch.from_numpy(Rotation.from_rotvec(perturbation.view(-1, 3).numpy()).as_matrix()).view(exact.shape)
+    tilt = torch.from_numpy(
+        Rotation.from_rotvec(perturbation.view(-1, 3).numpy()).as_matrix()
+    ).view(exact.shape)
     rounded = (tilt @ exact).float() + 5e-7 * torch.randn(exact.shape, generator=generator)
     back = g.rotation_from_viewpoint(*g.viewpoint_from_rotation(rounded))
     assert back.shape == rounded.shape
@@ -39,20 +52,28 @@ def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(elevation
 
 def test_rotation_error_agrees_with_scipy() -> None:
     A = Rotation.random(60, random_state=1)
-    differences = Rotation.from_rotvec([[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10)
+    differences = Rotation.from_rotvec(
+        [[0, 0, v] for v in (0.0, 1e-9, 1e-4, 1.0, 3.0, math.pi)] * 10
+    )
     B = A * differences
     ours = g.rotation_error(torch.from_numpy(A.as_matrix()), torch.from_numpy(B.as_matrix()))
     expected = torch.rad2deg(torch.from_numpy((A.inv() * B).magnitude()))
     torch.testing.assert_close(ours, expected, rtol=0, atol=1e-5)
     small = ours[expected < 1e-6]
     torch.testing.assert_close(small, expected[expected < 1e-6], rtol=0.02, atol=1e-12)
-    assert g.rotation_error(torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)).shape == (4, 5)
+    assert g.rotation_error(
+        torch.eye(3).expand(4, 1, 3, 3), torch.eye(3).expand(5, 3, 3)
+    ).shape == (4, 5)
 
 
 @pytest.mark.parametrize("count", [2, 5, 20, 100, 300, 700])
 def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
-    probes = torch.randn(100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    probes = torch.nn.functional.normalize(torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1)
+    probes = torch.randn(
+        100_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    probes = torch.nn.functional.normalize(
+        torch.cat([probes, torch.eye(3).double(), -torch.eye(3).double()]), dim=1
+    )
     directions = -uniform_views(count).rotations[:, 2].double()
     nearest = torch.cat([(p @ directions.T).amax(1) for p in probes.split(20_000)])
     radius = math.degrees(math.acos(max(-1.0, float(nearest.min()))))
@@ -62,11 +83,14 @@ def test_uniform_views_has_the_stated_covering_radius(count: int) -> None:
 def test_paper_views_is_the_grid_of_the_paper() -> None:
     views = paper_views()
     assert len(views) == 756
-    assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx([1.5, 3.0, 4.5, 6.0, 7.5, 9.0])
+    assert sorted({round(float(d), 4) for d in views.distance}) == pytest.approx(
+        [1.5, 3.0, 4.5, 6.0, 7.5, 9.0]
+    )
     one_shell = views[views.distance == views.distance[0]]
     assert len(one_shell) == 126
     R = one_shell.rotations.double()
-    assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0  # no view twice
+    # no view twice
+    assert float((rotation_error(R[:, None], R) + 9.0 * torch.eye(126)).min()) > 3.0
     # Neighbours in elevation differ by 50 degrees about the camera's x axis.
     grid = one_shell.rotations.view(7, 18, 3, 3)
     assert torch.allclose(rotation_error(grid[1:], grid[:-1]), torch.tensor(50.0), atol=1e-3)
@@ -82,7 +106,10 @@ def test_view_functions_refuse_invalid_options() -> None:
         (lambda: sample_views(azimuth_step=0), "azimuth_step"),
         (lambda: sample_views(elevations=[91]), "elevations"),
         (lambda: uniform_views(2.5), "count: expected an integer"),
-        (lambda: sample_views(elevations=[float("nan")]), "elevations: expected at least one finite"),
+        (
+            lambda: sample_views(elevations=[float("nan")]),
+            "elevations: expected at least one finite",
+        ),
     ):
         with pytest.raises(InvalidInputError, match=match):
             call()
@@ -90,7 +117,9 @@ def test_view_functions_refuse_invalid_options() -> None:
 
 @pytest.mark.parametrize("up", UP_AXES)
 def test_for_up_shows_the_same_views(up: str) -> None:
-    assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0], "from glTF's front to that of PASCAL3D+"
+    assert (up_rotation("y").numpy() @ [0, 0, 1]).tolist() == [0, -1, 0], (
+        "from glTF's front to that of PASCAL3D+"
+    )
     views = cr.sample_views(azimuth_step=40, elevations=[-20, 30, 90], thetas=[0, 25])
     seen = views.for_up(up).rotations.double() @ up_rotation(up).T
     torch.testing.assert_close(seen, views.rotations.double(), rtol=0, atol=2e-6)

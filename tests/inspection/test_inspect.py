@@ -13,7 +13,13 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.inspection.facts import mesh_facts
 from curvireg_torch.inspection.look_alikes import look_alikes
 from curvireg_torch.inspection.page import report_lines, report_page
-from curvireg_torch.inspection.trial import Expected, Outcome, Photograph, generate_photographs, run_trial
+from curvireg_torch.inspection.trial import (
+    Expected,
+    Outcome,
+    Photograph,
+    generate_photographs,
+    run_trial,
+)
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
@@ -28,8 +34,8 @@ def plate(size, at):
 
 
 def hollow_box() -> trimesh.Trimesh:
-    """A box of 60 x 40 x 30 without a bottom, of which one half is solid: only from below is its sides' difference
-    seen."""
+    """A box of 60 x 40 x 30 without a bottom, of which one half is solid: only from below is its
+    sides' difference seen."""
     walls = [
         plate((60, 40, 2), (0, 0, 14)),
         plate((60, 2, 30), (0, 19, 0)),
@@ -49,7 +55,9 @@ def registrar() -> Registrar:
 def test_facts_of_a_closed_body_and_of_its_triangles_apart():
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     box.units = "m"
-    apart = trimesh.Trimesh(box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False)
+    apart = trimesh.Trimesh(
+        box.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
+    )
     apart.units = "m"
     for mesh in (box, apart):
         facts = mesh_facts(mesh)
@@ -64,7 +72,9 @@ def test_facts_of_a_closed_body_and_of_its_triangles_apart():
 
 def test_open_doubled_and_loose_faces_are_counted():
     box = trimesh.creation.box((1, 2, 3))
-    twice = trimesh.Trimesh(box.vertices, np.concatenate([box.faces[:-1], box.faces[:3]]), process=False)
+    twice = trimesh.Trimesh(
+        box.vertices, np.concatenate([box.faces[:-1], box.faces[:3]]), process=False
+    )
     other = plate((0.2, 0.2, 0.2), (3, 0, 0))
     facts = mesh_facts(trimesh.util.concatenate([twice, other]))
     assert (facts.parts, facts.doubled_faces) == (2, 3)
@@ -74,7 +84,12 @@ def test_open_doubled_and_loose_faces_are_counted():
 
 @pytest.mark.parametrize(
     ("size", "unit", "text"),
-    [(80.0, None, "suggests mm or cm"), (80.0, "m", "really m?"), (0.3, "mm", "really mm?"), (0.3, "m", None)],
+    [
+        (80.0, None, "suggests mm or cm"),
+        (80.0, "m", "really m?"),
+        (0.3, "mm", "really mm?"),
+        (0.3, "m", None),
+    ],
 )
 def test_unit_is_doubted_by_size(size, unit, text):
     mesh = trimesh.creation.box((size, 0.7 * size, 0.5 * size))
@@ -97,7 +112,8 @@ def test_a_sphere_and_a_wire_are_hopeless():
 
 def test_symmetry_deviation_grows_with_the_asymmetry():
     cubes = [
-        trimesh.util.concatenate([trimesh.creation.box((1, 2, 3)), plate((s, s, s), (0, 0.9, 1.5))]) for s in (0.1, 0.2)
+        trimesh.util.concatenate([trimesh.creation.box((1, 2, 3)), plate((s, s, s), (0, 0.9, 1.5))])
+        for s in (0.1, 0.2)
     ]
     first, second = (mesh_facts(mesh).symmetries for mesh in cubes)
     assert first
@@ -112,7 +128,9 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
     registrar = Registrar(bank, mesh_is="exact")
     assert registrar.symmetries_of(exact=True).shape[0] == 1
     pairs = look_alikes(bank, registrar.describer, None)
-    elevation = torch.tensor([float(cr.viewpoint_from_rotation(pair.rotation)[1]) for pair in pairs])
+    elevation = torch.tensor(
+        [float(cr.viewpoint_from_rotation(pair.rotation)[1]) for pair in pairs]
+    )
     alike = torch.tensor([pair.is_alike for pair in pairs])
     angle = torch.tensor([pair.angle for pair in pairs])
     assert bool(alike[elevation > 30].all())
@@ -122,7 +140,9 @@ def test_a_half_hollow_box_looks_alike_from_above_and_not_from_below():
 
 def test_look_alikes_leave_out_symmetries():
     box = as_mesh(trimesh.creation.box((1, 2, 3)))
-    bank = ViewBank.build(box, cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60]), progress=False)
+    bank = ViewBank.build(
+        box, cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60]), progress=False
+    )
     registrar = Registrar(bank, mesh_is="exact")
     symmetries = registrar.symmetries_of(exact=True)
     counted = look_alikes(bank, registrar.describer, None)
@@ -138,7 +158,9 @@ def test_photographs_depend_on_seed_and_number_alone():
     two = generate_photographs(mesh, 2, seed=5, upright=False)
     assert torch.equal(three[1].image, two[1].image)
     assert torch.equal(three[1].truth, two[1].truth)
-    assert not torch.equal(three[1].truth, generate_photographs(mesh, 2, seed=6, upright=False)[1].truth)
+    assert not torch.equal(
+        three[1].truth, generate_photographs(mesh, 2, seed=6, upright=False)[1].truth
+    )
 
 
 def test_upright_photographs_are_seen_from_the_side():
@@ -151,14 +173,21 @@ def test_upright_photographs_are_seen_from_the_side():
 def test_trial_counts_right_and_reliable(registrar):
     photographs = generate_photographs(registrar.bank.mesh, 2, seed=1, upright=True)
     calls = []
-    trial = run_trial(registrar, photographs, compare=False, report_progress=lambda *progress: calls.append(progress))
+    trial = run_trial(
+        registrar,
+        photographs,
+        compare=False,
+        report_progress=lambda *progress: calls.append(progress),
+    )
     assert calls == [(1, 2), (2, 2)]
     assert trial.expected.n == 2
     assert not trial.compared
 
 
 def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
-    photograph = Photograph(torch.zeros(3, 4, 4), torch.tensor([0.0, 0, 200, 100]), torch.eye(4, dtype=torch.float64))
+    photograph = Photograph(
+        torch.zeros(3, 4, 4), torch.tensor([0.0, 0, 200, 100]), torch.eye(4, dtype=torch.float64)
+    )
     return Outcome(photograph, None, error, elevation)
 
 
@@ -171,7 +200,14 @@ def test_expected_shares():
 
 def test_report_of_a_hopeless_mesh_registers_nothing(tmp_path, capsys):
     trimesh.creation.icosphere(2, 10.0).export(tmp_path / "ball.stl")
-    command = ["inspect", str(tmp_path / "ball.stl"), "--unit", "mm", "--out", str(tmp_path / "out")]
+    command = [
+        "inspect",
+        str(tmp_path / "ball.stl"),
+        "--unit",
+        "mm",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main([*command, "--strict"]) == 3
     assert "rotation cannot be seen" in capsys.readouterr().out
     document = json.loads((tmp_path / "out" / "inspect.json").read_text())
@@ -182,7 +218,17 @@ def test_report_of_a_hopeless_mesh_registers_nothing(tmp_path, capsys):
 
 def test_command_writes_report_and_page(tmp_path, capsys):
     example_mesh().export(tmp_path / "truck.ply")
-    command = ["inspect", str(tmp_path / "truck.ply"), "--unit", "m", "--pose", "upright", "--n", "4", "--out"]
+    command = [
+        "inspect",
+        str(tmp_path / "truck.ply"),
+        "--unit",
+        "m",
+        "--pose",
+        "upright",
+        "--n",
+        "4",
+        "--out",
+    ]
     assert main([*command, str(tmp_path / "out")]) == 0
     document = json.loads((tmp_path / "out" / "inspect.json").read_text())
     assert {"n", "right", "reliable", "median_deg"} <= document["expected"].keys()

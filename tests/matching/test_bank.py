@@ -59,7 +59,9 @@ def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypa
     other = build(truck, small_bank.views)
     assert torch.get_num_threads() == 3
     assert_same(other, small_bank, atol=1e-5)
-    assert torch.equal(other.points_at(torch.tensor([3, 0])), small_bank.points_at(slice(None))[[3, 0]])
+    assert torch.equal(
+        other.points_at(torch.tensor([3, 0])), small_bank.points_at(slice(None))[[3, 0]]
+    )
 
 
 def test_check_compatible_refuses_another_view_policy(truck):
@@ -169,9 +171,15 @@ def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
 
 
 def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
-    bank = build(trimesh.creation.icosphere(5, radius=3.0), sample_views(azimuth_step=180, elevations=[0]))
+    bank = build(
+        trimesh.creation.icosphere(5, radius=3.0), sample_views(azimuth_step=180, elevations=[0])
+    )
     bank.save(path := tmp_path / "bank.safetensors")
-    for module, name in ((scipy.spatial, "ConvexHull"), (fast_simplification, "simplify"), (symmetry, "_Surface")):
+    for module, name in (
+        (scipy.spatial, "ConvexHull"),
+        (fast_simplification, "simplify"),
+        (symmetry, "_Surface"),
+    ):
         monkeypatch.setattr(module, name, None)  # would fail
     mesh = ViewBank.load(path).mesh
     for of in (extreme_points, mesh_symmetries):
@@ -179,7 +187,9 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
     assert torch.equal(extreme_points(mesh), extreme_points(bank.mesh))
     assert torch.equal(mesh_symmetries(mesh), mesh_symmetries(bank.mesh))
     for part in ("vertices", "faces"):
-        np.testing.assert_array_equal(getattr(view_mesh(mesh), part), getattr(view_mesh(bank.mesh), part))
+        np.testing.assert_array_equal(
+            getattr(view_mesh(mesh), part), getattr(view_mesh(bank.mesh), part)
+        )
     mesh.vertices *= 2.0
     for function in (extreme_points, mesh_symmetries, view_mesh):
         with pytest.raises(TypeError):
@@ -193,11 +203,15 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
 
 def test_float16_storage_changes_no_ranking(small_bank, saved):
     # Queries differ from views as photographs do: noise of half the descriptors' length.
-    noise = torch.rand(200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    noise = torch.rand(
+        200, small_bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0)
+    )
     noise *= 0.5 * small_bank.descriptors.norm(dim=1).mean() / noise.norm(dim=1, keepdim=True)
     queries = small_bank.descriptors[torch.arange(200) % len(small_bank)] + noise
     query = SimpleNamespace(descriptors=queries[:, None])
-    exact, stored = (Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved)))
+    exact, stored = (
+        Correlation().build(bank)(query) for bank in (small_bank, ViewBank.load(saved))
+    )
     assert float((exact - stored).abs().max()) < 1e-4
     assert torch.equal(exact.argmax(dim=1), stored.argmax(dim=1))
 

@@ -50,7 +50,8 @@ def standing(up: str = "y") -> trimesh.Trimesh:
 def test_bank_key_depends_on_everything(monkeypatch):
     mesh = trimesh.creation.box()
     millimetres, metres, moved, flipped, painted = (mesh.copy() for _ in range(5))
-    millimetres.units, metres.units = "mm", "m"
+    millimetres.units = "mm"
+    metres.units = "m"
     moved.vertices[0] += 1e-9
     flipped.faces = flipped.faces[::-1]
     painted.visual.vertex_colors[0] = (9, 8, 7, 255)
@@ -73,22 +74,31 @@ def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
     for mesh, bank in zip(meshes, banks, strict=True):
         again = cached_bank(mesh, VIEWS, **options)
         assert torch.equal(again.descriptors, bank.descriptors)
-        found, given = again.mesh.metadata, as_mesh(mesh).metadata
+        found = again.mesh.metadata
+        given = as_mesh(mesh).metadata
         assert (found["up"], "colours" in found) == (given["up"], "colours" in given)
         if "colours" in given:
             np.testing.assert_array_equal(found["colours"].uv, given["colours"].uv)
-            np.testing.assert_array_equal(found["colours"].textures[0], given["colours"].textures[0])
+            np.testing.assert_array_equal(
+                found["colours"].textures[0], given["colours"].textures[0]
+            )
 
 
 def test_cached_bank_replaces_damaged_and_mislabelled_files(tmp_path):
     bank = cached_box(tmp_path)
     (path,) = (tmp_path / "banks").iterdir()
     size = path.stat().st_size
-    for damaged in (path.read_bytes()[:-10], b"", safetensors.torch.save({"w": torch.zeros(9)}, {"format": "pt"})):
+    for damaged in (
+        path.read_bytes()[:-10],
+        b"",
+        safetensors.torch.save({"w": torch.zeros(9)}, {"format": "pt"}),
+    ):
         path.write_bytes(damaged)
         assert torch.equal(cached_box(tmp_path).descriptors, bank.descriptors)
         assert path.stat().st_size == size
-    ViewBank.build(trimesh.creation.box((9, 1, 1)), VIEWS, pipeline=PIPELINE, progress=False).save(path)
+    ViewBank.build(trimesh.creation.box((9, 1, 1)), VIEWS, pipeline=PIPELINE, progress=False).save(
+        path
+    )
     assert torch.equal(cached_box(tmp_path).descriptors, bank.descriptors)
 
 
@@ -104,7 +114,8 @@ def test_cached_bank_removes_the_least_recently_used(tmp_path, monkeypatch):
     incomplete = [first.path.with_name(f"{first.path.name}.{k:08x}.tmp") for k in range(2)]
     for path in incomplete:
         path.write_bytes(first.path.read_bytes()[:9000])
-    os.utime(incomplete[1], (1000.0, 1000.0))  # of a killed process; another process may be writing the first
+    # of a killed process; another process may be writing the first
+    os.utime(incomplete[1], (1000.0, 1000.0))
     monkeypatch.setenv("CURVIREG_CACHE_LIMIT", str(int(3.1 * first.size)))
     cached_box(tmp_path, 4.0)
     left = {file.path for file in list_cache(tmp_path)}
@@ -124,8 +135,11 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
     cached_box(None)
     (bank,) = list_cache()
     assert bank.size == bank.path.stat().st_size > 1000
-    foreign = [tmp_path / "model.safetensors", tmp_path / bank.path.name]  # the second is a bank in another folder
-    foreign += map(bank.path.with_name, ("my bank.safetensors", f"{bank.path.name}.orig", "notes.txt"))
+    # the second is a bank in another folder
+    foreign = [tmp_path / "model.safetensors", tmp_path / bank.path.name]
+    foreign += map(
+        bank.path.with_name, ("my bank.safetensors", f"{bank.path.name}.orig", "notes.txt")
+    )
     for path in foreign:
         path.write_bytes(b"notes")
     assert list_cache() == [bank]
@@ -136,7 +150,9 @@ def test_cache_never_touches_foreign_files(tmp_path, monkeypatch):
 
 def test_cached_bank_warns_of_an_unwritable_folder(tmp_path):
     (tmp_path / "file").write_text("a file where the folder should be")
-    with pytest.warns(UserWarning, match=r"file/banks/bank-.*cannot be written \(.*by CURVIREG_CACHE=FOLDER"):
+    with pytest.warns(
+        UserWarning, match=r"file/banks/bank-.*cannot be written \(.*by CURVIREG_CACHE=FOLDER"
+    ):
         assert len(cached_box(tmp_path / "file")) == len(VIEWS)
     assert (list_cache(tmp_path / "file"), clear_cache(tmp_path / "file")) == ([], 0)
 
@@ -146,7 +162,8 @@ def _build_all(folder: str, edges: tuple[float, ...]) -> float:
     return sum(float(cached_box(Path(folder), edge).descriptors.sum()) for edge in edges)
 
 
-# Spawned processes would import everything again, some seconds each. Python 3.12 warns of fork beside threads.
+# Spawned processes would import everything again, some seconds each. Python 3.12 warns of fork
+# beside threads.
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_cached_bank_in_concurrent_processes(tmp_path):
@@ -160,7 +177,9 @@ def test_cached_bank_in_concurrent_processes(tmp_path):
 
 
 @pytest.mark.parametrize("part", cache._SOURCES)
-def test_the_key_depends_on_the_code_that_describes_views(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_key_depends_on_the_code_that_describes_views(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = key(trimesh.creation.box())
     read = cache.code_digest
 

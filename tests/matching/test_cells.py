@@ -24,7 +24,9 @@ def test_best_cells_are_those_of_the_best_views():
     log_scores = torch.tensor([-5.0, -1.0, -3.0, -torch.inf, -2.0, -4.0])
     cells = torch.tensor([0, 1, 1, 2, 3, 0])
     assert best_cells(log_scores, cells, count=2).tolist() == [1, 3]
-    assert best_cells(log_scores, cells, count=9).tolist() == [1, 3, 0], "cell 2 has no view that is allowed"
+    assert best_cells(log_scores, cells, count=9).tolist() == [1, 3, 0], (
+        "cell 2 has no view that is allowed"
+    )
 
 
 def described(views):
@@ -44,7 +46,9 @@ def test_views_are_described_once_and_stored(tmp_path):
     gc.collect()
     second = DescribedViews(path)
     assert torch.equal(second.features([3, 5], refuse), described([3, 5]))
-    assert second.features([3, 7], lambda views: described(views) if views == [7] else refuse(views)).shape == (2, 2)
+    assert second.features(
+        [3, 7], lambda views: described(views) if views == [7] else refuse(views)
+    ).shape == (2, 2)
 
 
 def test_processes_add_to_one_file(tmp_path):
@@ -71,18 +75,25 @@ def test_a_damaged_file_counts_as_none(tmp_path, damage):
 
 
 def test_matcher_of_a_cached_bank_describes_no_view_twice(tmp_path, monkeypatch):
-    pipeline = Pipeline(field="focus", box_jitter=0.0).with_term("appearance", exhaustive_limit=0, top=3)
+    pipeline = Pipeline(field="focus", box_jitter=0.0).with_term(
+        "appearance", exhaustive_limit=0, top=3
+    )
     views = sample_views(azimuth_step=60, elevations=[0, 30])
     image, box, _ = scene(0)
 
     def ranking():
-        bank = cached_bank(example_mesh(), views, pipeline=pipeline, folder=tmp_path, progress=False)
+        bank = cached_bank(
+            example_mesh(), views, pipeline=pipeline, folder=tmp_path, progress=False
+        )
         result = ViewMatcher(bank)([image], box[None])
         gc.collect()
         return result
 
     first = ranking()
-    assert sorted(path.name.split("-")[0] for path in (tmp_path / "banks").iterdir()) == ["bank", "views"]
+    assert sorted(path.name.split("-")[0] for path in (tmp_path / "banks").iterdir()) == [
+        "bank",
+        "views",
+    ]
     monkeypatch.setattr(ViewMatcher, "_describe_views", lambda _, views: refuse(views))
     again = ranking()
     assert torch.equal(first.scores, again.scores)

@@ -25,9 +25,13 @@ def batch(*seeds: int) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_views_of_the_bank_match_themselves(bank):
     views = [0, 7, 60]
-    query = SimpleNamespace(descriptors=bank.descriptors[views, None], points=bank.points_at(views)[:, None])
+    query = SimpleNamespace(
+        descriptors=bank.descriptors[views, None], points=bank.points_at(views)[:, None]
+    )
     assert Correlation().build(bank)(query).argmax(dim=1).tolist() == views
-    assert Repeatability().build(bank)(query)[:, views].diag().tolist() == pytest.approx([1.0] * 3, abs=0.05)
+    assert Repeatability().build(bank)(query)[:, views].diag().tolist() == pytest.approx(
+        [1.0] * 3, abs=0.05
+    )
 
 
 def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
@@ -39,7 +43,11 @@ def test_ranking_is_sorted_bounded_and_a_product(bank, matcher):
         assert float(scores.min()) >= 0
         assert float(scores.max()) <= 1 + 1e-6
     box = ranking.terms["box"].log()
-    parts = Correlation().log_score(ranking.hog), Repeatability().log_score(ranking.repeatability), box
+    parts = (
+        Correlation().log_score(ranking.hog),
+        Repeatability().log_score(ranking.repeatability),
+        box,
+    )
     torch.testing.assert_close(ranking.scores, sum(parts).exp())
     assert ranking.top(3).equal(ranking.order[:, :3])
     tied = matcher(torch.full((1, 1, 64, 64), 0.5), torch.tensor([[0.0, 0, 50, 50]]))
@@ -60,14 +68,22 @@ def test_matcher_is_batch_independent_and_takes_bytes_and_mixed_channels(matcher
     torch.testing.assert_close(matcher(pixels, boxes).scores, matcher(exact, boxes).scores)
     grey = exact[1].mean(dim=0, keepdim=True)
     mixed = matcher([pixels[0], grey], boxes)
-    torch.testing.assert_close(mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        mixed.scores[0], matcher(exact[:1], boxes[:1]).scores[0], rtol=1e-4, atol=1e-5
+    )
+    torch.testing.assert_close(
+        mixed.scores[1], matcher([grey], boxes[1:]).scores[0], rtol=1e-4, atol=1e-5
+    )
 
 
 def test_matcher_refuses_unusable_input(matcher):
     for image, boxes, message in (
         (torch.rand(1, 3, 64, 64), [[5.0, 5, 5, 50]], "X0 < X1"),
-        (torch.rand(2, 3, 64, 64), [[5.0, 5, 50, 50]] * 3, r"shape \(2, 4\), one for each image, got \(3, 4\)"),
+        (
+            torch.rand(2, 3, 64, 64),
+            [[5.0, 5, 50, 50]] * 3,
+            r"shape \(2, 4\), one for each image, got \(3, 4\)",
+        ),
         (torch.zeros(1, 3, 64, 64, dtype=torch.int16), [[5.0, 5, 50, 50]], "uint8, or floating"),
     ):
         with pytest.raises(InvalidInputError, match=message):
@@ -95,18 +111,26 @@ def test_matcher_weights_terms(bank):
     squared = ViewMatcher(bank, pipeline=without.with_term("hog", weight=2))(images, boxes)
     torch.testing.assert_close(squared.scores, plain.scores**2)
     wide = bank.pipeline.with_term("repeatability", sigma=1e6).with_term("box", sigma=1e6)
-    torch.testing.assert_close(ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0)
-    alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(images, boxes)
+    torch.testing.assert_close(
+        ViewMatcher(bank, pipeline=wide)(images, boxes).scores, plain.scores, atol=1e-5, rtol=0
+    )
+    alone = ViewMatcher(bank, pipeline=replace(bank.pipeline, terms=(Correlation(),)))(
+        images, boxes
+    )
     assert set(alone.terms) == {"hog"}
 
 
 def test_distinct_views_applies_symmetries_to_the_model():
     R = rotation_from_axis_angle(torch.tensor([0.9, -0.4, 0.7], dtype=torch.float64))
     quarter = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64))
-    symmetries = torch.stack([torch.eye(3, dtype=torch.float64), quarter, quarter @ quarter, quarter.T])
+    symmetries = torch.stack(
+        [torch.eye(3, dtype=torch.float64), quarter, quarter @ quarter, quarter.T]
+    )
     views = torch.stack([R, R @ quarter, quarter @ R, R @ quarter.T])
     assert distinct_views(torch.arange(4), views, count=4, symmetries=symmetries).tolist() == [0, 2]
-    assert distinct_views(torch.tensor([3, 2, 1, 0]), views, count=4, symmetries=symmetries).tolist() == [3, 2]
+    assert distinct_views(
+        torch.tensor([3, 2, 1, 0]), views, count=4, symmetries=symmetries
+    ).tolist() == [3, 2]
     assert distinct_views(torch.arange(4), views, count=4).tolist() == [0, 1, 2, 3]
 
 
@@ -114,7 +138,9 @@ def test_views_exactly_as_far_apart_as_the_angle_count_as_one():
     views = sample_views(azimuth_step=10, elevations=[0, 35])
     order = torch.arange(len(views)).roll(5)
     chosen = distinct_views(order, views.rotations, count=99, angle=20.0)
-    apart = rotation_error(views.rotations[chosen][:, None], views.rotations[chosen]).fill_diagonal_(180.0)
+    apart = rotation_error(
+        views.rotations[chosen][:, None], views.rotations[chosen]
+    ).fill_diagonal_(180.0)
     assert len(chosen) > 12
     assert apart.min() > 20.01
     assert chosen[0] == order[0]

@@ -27,14 +27,19 @@ def scores(matcher: ViewMatcher) -> torch.Tensor:
     return matcher(image[None], box[None]).scores
 
 
-def test_matcher_computes_in_full_precision_under_autocast(small_bank: ViewBank, matcher: ViewMatcher) -> None:
+def test_matcher_computes_in_full_precision_under_autocast(
+    small_bank: ViewBank, matcher: ViewMatcher
+) -> None:
     image, box, _ = scene(0)
     query = matcher.query(image[None], box[None])
     similarity = matcher.similarity(query)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(scores(matcher), scores(ViewMatcher(small_bank)))
         assert torch.equal(matcher.similarity(query), similarity)
-        assert torch.equal(matcher.features(query.crops).descriptors, matcher.features(query.crops).descriptors.float())
+        assert torch.equal(
+            matcher.features(query.crops).descriptors,
+            matcher.features(query.crops).descriptors.float(),
+        )
         autocast = scores(matcher)
     assert torch.equal(autocast, scores(matcher))
 
@@ -83,7 +88,9 @@ def test_registrar_computes_in_full_precision_under_autocast(
 
 
 @pytest.mark.parametrize("convert", ["half", "bfloat16", "double"])
-def test_matcher_refuses_other_dtypes_and_stays_as_it_was(matcher: ViewMatcher, convert: str) -> None:
+def test_matcher_refuses_other_dtypes_and_stays_as_it_was(
+    matcher: ViewMatcher, convert: str
+) -> None:
     before = scores(matcher)
     with pytest.raises(InvalidInputError, match="ViewMatcher: computes in float32, got torch"):
         getattr(matcher, convert)()
@@ -125,8 +132,12 @@ def test_matcher_ranks_on_a_gpu_and_back(small_bank: ViewBank) -> None:
     torch.testing.assert_close(scores(matcher.to("cpu")), expected, atol=1e-3, rtol=0.0)
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))])
-def test_matcher_can_be_copied_and_pickled(small_bank: ViewBank, copied: Callable[[ViewMatcher], ViewMatcher]) -> None:
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))]
+)
+def test_matcher_can_be_copied_and_pickled(
+    small_bank: ViewBank, copied: Callable[[ViewMatcher], ViewMatcher]
+) -> None:
     matcher = ViewMatcher(small_bank)
     expected = scores(matcher)
     _ = matcher.describer  # renderers cannot be pickled
@@ -162,18 +173,24 @@ def test_hooks_of_the_field_run(small_bank: ViewBank) -> None:
     assert torch.equal(matcher.query(image[None], box[None]).field, plain.field)
 
 
-@pytest.mark.parametrize("kind", ["forward_pre_hook", "forward_hook", "full_backward_hook", "full_backward_pre_hook"])
+@pytest.mark.parametrize(
+    "kind", ["forward_pre_hook", "forward_hook", "full_backward_hook", "full_backward_pre_hook"]
+)
 def test_a_hook_of_any_kind_calls_the_field(kind: str) -> None:
-    field, called = LearnedCurvilinearSaliency(), []
+    field = LearnedCurvilinearSaliency()
+    called = []
     getattr(field, f"register_{kind}")(lambda *_: called.append(kind))
     crops = torch.rand(1, 3, 32, 32, requires_grad=True)
     terms.photograph_field(field, crops)[0].sum().backward()
     assert called == [kind]
 
 
-@pytest.mark.parametrize("register", ["register_module_forward_hook", "register_module_forward_pre_hook"])
+@pytest.mark.parametrize(
+    "register", ["register_module_forward_hook", "register_module_forward_pre_hook"]
+)
 def test_hooks_of_all_modules_see_the_field(register: str) -> None:
-    field, seen = LearnedCurvilinearSaliency(), []
+    field = LearnedCurvilinearSaliency()
+    seen = []
     handle = getattr(torch.nn.modules.module, register)(lambda module, *_: seen.append(module))
     terms.photograph_field(field, torch.rand(1, 3, 32, 32))
     handle.remove()

@@ -13,7 +13,8 @@ import curvireg_torch as cr
 
 @pytest.fixture
 def load() -> Callable[..., tuple[trimesh.Trimesh, list[str]]]:
-    """A function that loads a mesh, and returns it with the texts of its warnings, but for that of its size."""
+    """A function that loads a mesh, and returns it with the texts of its warnings, but for that of
+    its size."""
 
     def read(path: Path, **options: Any) -> tuple[trimesh.Trimesh, list[str]]:
         with warnings.catch_warnings(record=True) as caught:

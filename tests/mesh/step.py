@@ -1,4 +1,5 @@
-"""STEP files of a box and IGES files of a rectangle, as CAD programs write them, in several units."""
+"""STEP files of a box and IGES files of a rectangle, as CAD programs write them, in several
+units."""
 
 from collections.abc import Sequence
 
@@ -33,7 +34,8 @@ def step_file(size: Sequence[float], unit: str) -> str:
         return w.add(f"DIRECTION('',({x!r},{y!r},{z!r}))")
 
     def edge(a: int, b: int) -> str:
-        first, second = min(a, b), max(a, b)
+        first = min(a, b)
+        second = max(a, b)
         if (first, second) not in edges:
             along = [q - p for p, q in zip(corners[first], corners[second], strict=True)]
             vector = w.add(f"VECTOR('',{direction(along)},1.)")
@@ -57,7 +59,9 @@ def step_file(size: Sequence[float], unit: str) -> str:
         loop = w.add(f"EDGE_LOOP('',({around}))")
         bound = w.add(f"FACE_OUTER_BOUND('',{loop},.T.)")
         along = [q - p for p, q in zip(corners[ring[0]], corners[ring[1]], strict=True)]
-        place = w.add(f"AXIS2_PLACEMENT_3D('',{points[ring[0]]},{direction(normal)},{direction(along)})")
+        place = w.add(
+            f"AXIS2_PLACEMENT_3D('',{points[ring[0]]},{direction(normal)},{direction(along)})"
+        )
         plane = w.add(f"PLANE('',{place})")
         faces.append(w.add(f"ADVANCED_FACE('',({bound}),{plane},.T.)"))
     shell = w.add(f"CLOSED_SHELL('',({','.join(faces)}))")
@@ -66,20 +70,30 @@ def step_file(size: Sequence[float], unit: str) -> str:
         length = w.add(_UNITS[unit])
     else:
         name, millimetres = _CONVERTED[unit]
-        measure = w.add(f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE({millimetres}),{w.add(_UNITS['mm'])})")
+        measure = w.add(
+            f"LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE({millimetres}),{w.add(_UNITS['mm'])})"
+        )
         exponents = w.add("DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.)")
-        length = w.add(f"( CONVERSION_BASED_UNIT('{name}',{measure}) LENGTH_UNIT() NAMED_UNIT({exponents}) )")
+        length = w.add(
+            f"( CONVERSION_BASED_UNIT('{name}',{measure}) LENGTH_UNIT() NAMED_UNIT({exponents}) )"
+        )
     angle = w.add("( NAMED_UNIT(*) PLANE_ANGLE_UNIT() SI_UNIT($,.RADIAN.) )")
     solid_angle = w.add("( NAMED_UNIT(*) SI_UNIT($,.STERADIAN.) SOLID_ANGLE_UNIT() )")
-    precision = w.add(f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-07),{length},'distance_accuracy_value','')")
+    precision = w.add(
+        f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-07),{length},'distance_accuracy_value','')"
+    )
     context = w.add(
         "( GEOMETRIC_REPRESENTATION_CONTEXT(3) "
         f"GLOBAL_UNCERTAINTY_ASSIGNED_CONTEXT(({precision})) "
-        f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({length},{angle},{solid_angle})) REPRESENTATION_CONTEXT('','') )"
+        f"GLOBAL_UNIT_ASSIGNED_CONTEXT(({length},{angle},{solid_angle})) "
+        f"REPRESENTATION_CONTEXT('','') )"
     )
     shape = w.add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({solid}),{context})")
     application = w.add("APPLICATION_CONTEXT('automotive design')")
-    w.add(f"APPLICATION_PROTOCOL_DEFINITION('international standard','automotive_design',2000,{application})")
+    w.add(
+        f"APPLICATION_PROTOCOL_DEFINITION('international "
+        f"standard','automotive_design',2000,{application})"
+    )
     of_product = w.add(f"PRODUCT_CONTEXT('',{application},'mechanical')")
     product = w.add(f"PRODUCT('part','part','',({of_product}))")
     formation = w.add(f"PRODUCT_DEFINITION_FORMATION('','',{product})")
@@ -94,7 +108,8 @@ def step_file(size: Sequence[float], unit: str) -> str:
 
 
 def iges_file(size: Sequence[float], flag: int, name: str) -> str:
-    """The text of a rectangle at the origin: a ruled surface between two lines. ``flag`` is that of the unit."""
+    """The text of a rectangle at the origin: a ruled surface between two lines. ``flag`` is that of
+    the unit."""
     parameters = [
         f"110,0.,0.,0.,{size[0]!r},0.,0.;",
         f"110,0.,{size[1]!r},0.,{size[0]!r},{size[1]!r},0.;",
@@ -102,7 +117,7 @@ def iges_file(size: Sequence[float], flag: int, name: str) -> str:
     ]
     forms = [0, 0, 1]
     whole = "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,"
-    whole += f"{flag},{len(name)}H{name},1,0.01,15H20260101.000000,1E-6,10.,1Ha,1Hb,11,0,15H20260101.000000;"
+    whole += f"{flag},{len(name)}H{name},1,0.01,15H20260101.000000,1E-6,10.,1Ha,1Hb,11,0,15H20260101.000000;"  # noqa: E501
     head = [whole[k : k + 72] for k in range(0, len(whole), 72)]
     lines = [f"{'part':<72}S{1:7d}", *(f"{text:<72}G{k + 1:7d}" for k, text in enumerate(head))]
     for k, text in enumerate(parameters):

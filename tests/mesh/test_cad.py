@@ -30,20 +30,26 @@ def needs(package: str) -> pytest.MarkDecorator:
 
 @needs("cascadio")
 @pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
-def test_step_files_keep_their_unit_and_axes(tmp_path: Path, load: Load, unit: str, suffix: str) -> None:
+def test_step_files_keep_their_unit_and_axes(
+    tmp_path: Path, load: Load, unit: str, suffix: str
+) -> None:
     path = tmp_path / f"part.{suffix}"
     path.write_text(step_file((3.0, 2.0, 1.0), unit))
     mesh, texts = load(path)
     assert (mesh.units, mesh_up(mesh), texts) == (unit, "z", [])
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
     assert mesh.volume == pytest.approx(6.0, rel=1e-6)
-    with pytest.raises(MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"):
+    with pytest.raises(
+        MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"
+    ):
         cr.load_mesh(path, unit="dm")
 
 
 @needs("cascadio")
 @pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
-def test_iges_files_keep_their_unit(tmp_path: Path, load: Load, flag: int, name: str, unit: str) -> None:
+def test_iges_files_keep_their_unit(
+    tmp_path: Path, load: Load, flag: int, name: str, unit: str
+) -> None:
     (tmp_path / "part.igs").write_text(iges_file((3.0, 2.0), flag, name))
     mesh, _ = load(tmp_path / "part.igs")
     assert mesh.units == unit
@@ -52,7 +58,14 @@ def test_iges_files_keep_their_unit(tmp_path: Path, load: Load, flag: int, name:
 
 @needs("cascadio")
 @pytest.mark.parametrize(
-    "content", [b"", b"ISO-10303-21;\n", b"nothing", step_file((3, 2, 1), "mm").encode()[:900], b"ISO-10303-21;" * 999]
+    "content",
+    [
+        b"",
+        b"ISO-10303-21;\n",
+        b"nothing",
+        step_file((3, 2, 1), "mm").encode()[:900],
+        b"ISO-10303-21;" * 999,
+    ],
 )
 def test_damaged_step_files_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "part.step").write_bytes(content)
@@ -61,7 +74,9 @@ def test_damaged_step_files_are_refused(tmp_path: Path, content: bytes) -> None:
 
 
 @needs("cascadio")
-def test_step_files_are_bounded_in_size_and_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_step_files_are_bounded_in_size_and_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "part.step"
     path.write_text(step_file((3.0, 2.0, 1.0), "mm"))
     for name, value, match in (
@@ -75,7 +90,9 @@ def test_step_files_are_bounded_in_size_and_time(tmp_path: Path, monkeypatch: py
         monkeypatch.undo()
 
 
-@pytest.mark.parametrize(("suffix", "package"), [("step", "cascadio"), ("igs", "cascadio"), ("dae", "collada")])
+@pytest.mark.parametrize(
+    ("suffix", "package"), [("step", "cascadio"), ("igs", "cascadio"), ("dae", "collada")]
+)
 def test_the_message_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, package: str
 ) -> None:
@@ -83,7 +100,9 @@ def test_the_message_names_the_extra(
     (tmp_path / f"a.{suffix}").write_text("a part")
     with pytest.raises(MissingDependencyError, match=package) as caught:
         cr.load_mesh(tmp_path / f"a.{suffix}")
-    assert "pip install 'curvireg_torch[cad]', in a checkout pip install -e '.[cad]'" in str(caught.value)
+    assert "pip install 'curvireg_torch[cad]', in a checkout pip install -e '.[cad]'" in str(
+        caught.value
+    )
     assert f"a.{suffix}: " in str(caught.value)
 
 
@@ -92,14 +111,19 @@ def test_the_extra_is_loaded_only_when_needed(tmp_path: Path) -> None:
     BOX.export(tmp_path / "a.stl")
     code = "import sys, curvireg_torch as cr; cr.load_mesh(sys.argv[1], unit='mm'); "
     code += "print('collada' in sys.modules)"  # trimesh itself imports cascadio
-    done = subprocess.run([sys.executable, "-c", code, tmp_path / "a.stl"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.stl"], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == "False"
 
 
 @pytest.mark.parametrize(
     ("parameters", "unit"),
     [
-        ("1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,2,2HMM,1,0.01,15H20260101.000000,", "mm"),
+        (
+            "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,2,2HMM,1,0.01,15H20260101.000000,",
+            "mm",
+        ),
         ("1H,,1H;,4Hpart,8Hpa,t.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,1,4HINCH,1,0.01,", "in"),
         (",,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,6,1HM,1,", "m"),
         ("1H/,1H;,4Hpart/8Hpart.igs/3Hcad/3H1.0/32/38/6/308/15//1./10/2HCM/", "cm"),
@@ -151,7 +175,7 @@ COLLADA = """<?xml version="1.0"?>
 <bind_material><technique_common><instance_material symbol="m" target="#mat"/></technique_common></bind_material>
 </instance_geometry>{more}</node></visual_scene></library_visual_scenes>
 <scene><instance_visual_scene url="#s"/></scene></COLLADA>
-"""
+"""  # noqa: E501
 
 
 def collada(asset: str = "", image: str = "label.png", nodes: str = "", more: str = "") -> str:
@@ -187,7 +211,11 @@ def test_collada_files_keep_their_unit_and_axes(
 @needs("collada")
 def test_collada_names_textures_that_it_cannot_use(tmp_path: Path, load: Load) -> None:
     (tmp_path / "label.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
-    for image, match in (("no.png", "no.png is missing"), ("../x.png", "lies outside"), ("label.png", "not an image")):
+    for image, match in (
+        ("no.png", "no.png is missing"),
+        ("../x.png", "lies outside"),
+        ("label.png", "not an image"),
+    ):
         (tmp_path / "a.dae").write_text(collada(image=image))
         mesh, texts = load(tmp_path / "a.dae")
         assert not has_colours(mesh)
@@ -196,7 +224,10 @@ def test_collada_names_textures_that_it_cannot_use(tmp_path: Path, load: Load) -
 
 @needs("collada")
 def test_hostile_collada_files_are_refused(tmp_path: Path) -> None:
-    nodes = "".join(f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>" for k in range(20))
+    nodes = "".join(
+        f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>"
+        for k in range(20)
+    )
     nodes += '<node id="n20"><instance_geometry url="#g"/></node>'
     circle = '<node id="n0"><instance_node url="#n0"/></node>'
     more = '<instance_node url="#n0"/>'
@@ -219,10 +250,18 @@ def test_hostile_collada_files_are_refused(tmp_path: Path) -> None:
 
 
 def threemf(
-    path: Path, resources: str, items: str, *, unit: str = 'unit="inch"', more: dict[str, bytes] | None = None
+    path: Path,
+    resources: str,
+    items: str,
+    *,
+    unit: str = 'unit="inch"',
+    more: dict[str, bytes] | None = None,
 ) -> Path:
     namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
-    text = f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" xmlns:p="production">'
+    text = (
+        f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
+        f'xmlns:p="production">'
+    )
     text += f"<resources>{resources}</resources><build>{items}</build></model>"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("3D/3dmodel.model", text)
@@ -234,14 +273,17 @@ def threemf(
 def solid(number: int, attributes: str = "", triangle: str = "") -> str:
     vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in BOX.vertices)
     faces = "".join(
-        f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>' for k, (a, b, c) in enumerate(BOX.faces)
+        f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>'
+        for k, (a, b, c) in enumerate(BOX.faces)
     )
     mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
     return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
 
 
 def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load) -> None:
-    components = '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'
+    components = (
+        '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'
+    )
     resources = solid(1) + f'<object id="2"><components>{components}</components></object>'
     items = '<item objectid="2" transform="1 0 0 0 1 0 0 0 1 0 0 5"/>'
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, items))
@@ -250,41 +292,69 @@ def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load)
     assert mesh.volume == pytest.approx(2 * 6000)
     with pytest.raises(MeshError, match="states its unit, in"):
         cr.load_mesh(tmp_path / "a.3mf", unit="mm")
-    for unit, name, scale in (("", "mm", 1.0), ('unit="micron"', "mm", 1e-3), ('unit="meter"', "m", 1.0)):
+    for unit, name, scale in (
+        ("", "mm", 1.0),
+        ('unit="micron"', "mm", 1e-3),
+        ('unit="meter"', "m", 1.0),
+    ):
         mesh, _ = load(threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>', unit=unit))
         assert (mesh.units, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
 
 
 def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
-    base = '<basematerials id="5"><base name="a" displaycolor="#FF0000"/><base name="b" displaycolor="#0000FFFF"/>'
+    base = (
+        '<basematerials id="5"><base name="a" displaycolor="#FF0000"/><base name="b" '
+        'displaycolor="#0000FFFF"/>'
+    )
     resources = f"{base}</basematerials>" + solid(1, 'pid="5" pindex="1"', 'pid="5" p1="0"')
     mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
     colours = surface_colours(mesh)
     assert colours is not None
     assert (colours.corners[:6] == [255, 0, 0]).all()
     assert (colours.corners[6:] == [0, 0, 255]).all()
-    group = '<m:colorgroup id="6"><m:color color="#00FF00"/><m:color color="#000000"/></m:colorgroup>'
+    group = (
+        '<m:colorgroup id="6"><m:color color="#00FF00"/><m:color color="#000000"/></m:colorgroup>'
+    )
     mesh, _ = load(
-        threemf(tmp_path / "a.3mf", group + solid(1, "", 'pid="6" p1="0" p2="1" p3="0"'), '<item objectid="1"/>')
+        threemf(
+            tmp_path / "a.3mf",
+            group + solid(1, "", 'pid="6" p1="0" p2="1" p3="0"'),
+            '<item objectid="1"/>',
+        )
     )
     colours = surface_colours(mesh)
     assert colours is not None
     assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
     pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    texture = '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/><m:texture2dgroup id="8" texid="7">'
-    texture += '<m:tex2coord u="0" v="0"/><m:tex2coord u="1" v="0"/><m:tex2coord u="0" v="1"/></m:texture2dgroup>'
+    texture = (
+        '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/><m:texture2dgroup '
+        'id="8" '
+        'texid="7">'
+    )
+    texture += (
+        '<m:tex2coord u="0" v="0"/><m:tex2coord u="1" v="0"/><m:tex2coord u="0" '
+        'v="1"/></m:texture2dgroup>'
+    )
     resources = texture + solid(1, "", 'pid="8" p1="0" p2="1" p3="2"')
     pictures = {"3D/a.png": (tmp_path / "a.png").read_bytes()}
-    mesh, texts = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=pictures))
+    mesh, texts = load(
+        threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=pictures)
+    )
     colours = surface_colours(mesh)
     assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
     assert colours.uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
-    assert "/3D/a.png is missing" in load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))[1][0]
+    assert (
+        "/3D/a.png is missing"
+        in load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))[1][0]
+    )
     other = solid(1, "", 'pid="9" p1="0"')
-    assert "of a kind that is not read" in load(threemf(tmp_path / "a.3mf", other, '<item objectid="1"/>'))[1][0]
+    assert (
+        "of a kind that is not read"
+        in load(threemf(tmp_path / "a.3mf", other, '<item objectid="1"/>'))[1][0]
+    )
 
 
 def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
@@ -292,7 +362,8 @@ def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
     with zipfile.ZipFile(inner) as archive:
         content = archive.read("3D/3dmodel.model")
     resources = (
-        '<object id="1"><components><component p:path="/3D/Objects/a.model" objectid="3"/></components></object>'
+        '<object id="1"><components><component p:path="/3D/Objects/a.model" '
+        'objectid="3"/></components></object>'
     )
     more = {"3D/Objects/a.model": content}
     mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=more))
@@ -303,7 +374,7 @@ def test_hostile_threemf_files_are_refused(tmp_path: Path, monkeypatch: pytest.M
     path = tmp_path / "a.3mf"
     circle = '<object id="1"><components><component objectid="1"/></components></object>'
     many = "".join(
-        f'<object id="{k}"><components>{f"""<component objectid="{k + 1}"/>""" * 10}</components></object>'
+        f'<object id="{k}"><components>{f"""<component objectid="{k + 1}"/>""" * 10}</components></object>'  # noqa: E501
         for k in range(1, 9)
     )
     item = '<item objectid="1"/>'
@@ -341,7 +412,7 @@ scale="0.01 0.01 0.01"/></geometry></visual></link>
 <joint name="j" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="1 0 0"
 rpy="0 1.5707963267948966 0"/></joint>
 <joint name="k" type="fixed"><parent link="tip"/><child link="ball"/><origin xyz="0 0 2"/></joint></robot>
-"""
+"""  # noqa: E501
 
 
 def robot(folder: Path, base: str = "package://arm/meshes/base.stl") -> Path:
@@ -413,7 +484,8 @@ def test_a_mirrored_part_keeps_its_outside(tmp_path: Path) -> None:
 @pytest.mark.slow
 @needs("cascadio")
 def test_register_takes_the_unit_of_a_step_file(tmp_path: Path) -> None:
-    """As a user does: a photograph, a STEP file and a box; the mesh is in the file's millimetres."""
+    """As a user does: a photograph, a STEP file and a box; the mesh is in the file's
+    millimetres."""
     from curvireg_torch.cli import main
 
     (tmp_path / "part.step").write_text(step_file((60.0, 40.0, 25.0), "mm"))
@@ -431,8 +503,25 @@ def test_register_takes_the_unit_of_a_step_file(tmp_path: Path) -> None:
     Image.fromarray((255 * picture).astype(np.uint8)).save(tmp_path / "photo.png")
     rows, columns = (depth > 0).nonzero()
     box = [columns.min(), rows.min(), columns.max(), rows.max()]
-    words = ["register", str(tmp_path / "photo.png"), str(tmp_path / "part.step"), "--preset", "fast", "--quiet"]
-    words += ["--box", *map(str, box), "--camera", "900", "900", "319.5", "239.5", "--out", str(tmp_path / "out")]
+    words = [
+        "register",
+        str(tmp_path / "photo.png"),
+        str(tmp_path / "part.step"),
+        "--preset",
+        "fast",
+        "--quiet",
+    ]
+    words += [
+        "--box",
+        *map(str, box),
+        "--camera",
+        "900",
+        "900",
+        "319.5",
+        "239.5",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(words) in (None, 0)
     document: dict[str, Any] = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["unit"] == "mm"

@@ -50,9 +50,12 @@ def test_what_an_edge_is(angles: list[float], is_crease: bool, is_smooth: bool) 
     assert (bool(edges.is_crease[spine]), bool(edges.is_smooth[spine])) == (is_crease, is_smooth)
 
 
-@pytest.mark.parametrize(("azimuth", "expected"), [(45.0, False), (-45.0, False), (135.0, False), (-135.0, False)])
+@pytest.mark.parametrize(
+    ("azimuth", "expected"), [(45.0, False), (-45.0, False), (135.0, False), (-135.0, False)]
+)
 def test_the_faces_of_an_edge_are_all_looked_at(azimuth: float, expected: bool) -> None:
-    """Four pages, every quarter turn: from nowhere do all of them lie on one side of the spine. The first two do."""
+    """Four pages, every quarter turn: from nowhere do all of them lie on one side of the spine. The
+    first two do."""
     assert MAX_EDGE_FACES >= 4
     edges = fan([0.0, 90.0, 180.0, 270.0])
     eye = np.array([[np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.1]]) * 9.0
@@ -63,9 +66,16 @@ def test_the_faces_of_an_edge_are_all_looked_at(azimuth: float, expected: bool) 
 def test_the_contour_of_a_book_is_its_spine_where_all_pages_lie_on_one_side() -> None:
     edges = fan([10.0, 30.0, 50.0, 80.0])
     seen = [np.degrees(azimuth) for azimuth in np.radians(np.arange(0, 360, 5) + 2.5)]
-    eyes = np.array([[np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.1] for azimuth in seen]) * 9.0
+    eyes = (
+        np.array(
+            [[np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), 0.1] for azimuth in seen]
+        )
+        * 9.0
+    )
     all_same, _ = edges.sides(eyes)
-    found = {azimuth for azimuth, same in zip(seen, all_same[:, at(edges, *SPINE)], strict=True) if same}
+    found = {
+        azimuth for azimuth, same in zip(seen, all_same[:, at(edges, *SPINE)], strict=True) if same
+    }
     # all pages lie to the left or right of the line from the camera through the spine
     expected = {azimuth for azimuth in seen if 80 < azimuth < 190 or not 10 < azimuth < 260}
     assert found == expected

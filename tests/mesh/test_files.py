@@ -29,17 +29,25 @@ def write(folder: Path, suffix: str) -> Path:
     (folder / "beside.png").write_bytes(b"no part of the mesh")
     path = folder / f"part.{suffix}"
     if suffix == "gltf":
-        corners, uv = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32), np.float32([[0, 0], [1, 0], [0, 1]])
+        corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+        uv = np.float32([[0, 0], [1, 0], [0, 1]])
         (folder / "points.bin").write_bytes(corners.tobytes() + uv.tobytes())
         content = tree(
             buffers=[{"byteLength": 60, "uri": "points.bin"}],
-            bufferViews=[{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 24}],
+            bufferViews=[
+                {"buffer": 0, "byteLength": 36},
+                {"buffer": 0, "byteOffset": 36, "byteLength": 24},
+            ],
             images=[{"uri": "picture.png"}],
             textures=[{"source": 0}],
             materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
-            meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+            meshes=[
+                {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}
+            ],
         )
-        content["accessors"].append({"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 3})
+        content["accessors"].append(
+            {"bufferView": 1, "componentType": 5126, "type": "VEC2", "count": 3}
+        )
         path.write_text(json.dumps(content))
     elif suffix == "obj":
         (folder / "part.mtl").write_text("newmtl skin\nmap_Kd picture.png\n")
@@ -56,12 +64,16 @@ def write(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize("suffix", EXPECTED)
-def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(tmp_path: Path, suffix: str) -> None:
+def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(
+    tmp_path: Path, suffix: str
+) -> None:
     path = write(tmp_path, suffix)
     load_mesh(path)
     assert {file.name for file in mesh_files(path)} == EXPECTED[suffix]
     before = mesh_digest(path)
-    assert mesh_digest(write(tmp_path / "copy", suffix)) == before, "the digest is of the content, not of the folder"
+    assert mesh_digest(write(tmp_path / "copy", suffix)) == before, (
+        "the digest is of the content, not of the folder"
+    )
     (tmp_path / "beside.png").write_bytes(b"something else")
     assert mesh_digest(path) == before
     for name in EXPECTED[suffix]:

@@ -28,21 +28,37 @@ class Tree:
 
     def __init__(self) -> None:
         self.data = b""
-        self.content: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}]}
-        self.content |= {"nodes": [{"mesh": 0}], "meshes": [{"primitives": []}], "accessors": [], "bufferViews": []}
+        self.content: dict[str, Any] = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+        }
+        self.content |= {
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": []}],
+            "accessors": [],
+            "bufferViews": [],
+        }
 
     def array(self, values: Any, dtype: str = "f", **more: Any) -> int:
         x = np.asarray(values, dtype)
         x = x[:, None] if x.ndim == 1 else x
         kind = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}[x.shape[1]]
         self.data += bytes(-len(self.data) % 4)
-        self.content["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": x.nbytes})
+        self.content["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(self.data), "byteLength": x.nbytes}
+        )
         self.data += x.tobytes()
-        accessor = {"bufferView": len(self.content["bufferViews"]) - 1, "componentType": TYPES[dtype]}
+        accessor = {
+            "bufferView": len(self.content["bufferViews"]) - 1,
+            "componentType": TYPES[dtype],
+        }
         self.content["accessors"].append({**accessor, "count": len(x), "type": kind, **more})
         return len(self.content["accessors"]) - 1
 
-    def part(self, indices: Any = None, positions: Any = BOX.vertices, **more: Any) -> dict[str, Any]:
+    def part(
+        self, indices: Any = None, positions: Any = BOX.vertices, **more: Any
+    ) -> dict[str, Any]:
         part: dict[str, Any] = {"attributes": {"POSITION": self.array(positions)}, **more}
         if indices is not None:
             part["indices"] = self.array(np.ravel(indices), "I")
@@ -98,7 +114,12 @@ def test_vertex_colours_are_multiplied_by_the_material(
     assert found is not None
     assert has_colours(mesh)
     assert not texts
-    tint = np.array([1.0, 1.0, 1.0]) if factor is None or factor[0] == 1 else np.array([0.7354, 1.0, 0.0])  # sRGB
+    # sRGB
+    tint = (
+        np.array([1.0, 1.0, 1.0])
+        if factor is None or factor[0] == 1
+        else np.array([0.7354, 1.0, 0.0])
+    )
     expected = 255 * colours[BOX.faces][..., :3] * tint
     np.testing.assert_allclose(found.corners, expected, atol=1.0)
 
@@ -115,14 +136,25 @@ def test_vertex_colours_are_multiplied_by_the_material(
 )
 @pytest.mark.parametrize("required", [True, False])
 def test_transforms_and_other_sets_of_texture_coordinates(
-    tmp_path: Path, load: Load, transform: dict[str, Any], expected: list[tuple[float, float]], required: bool
+    tmp_path: Path,
+    load: Load,
+    transform: dict[str, Any],
+    expected: list[tuple[float, float]],
+    required: bool,
 ) -> None:
     """In the file (0, 0) is the top left; here it is the bottom left."""
     pixels = np.random.default_rng(0).integers(0, 255, (4, 4, 3), np.uint8)
     for number, info in (
         (0, {"index": 0, "extensions": {"KHR_texture_transform": transform}}),
         (1, {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": transform}}),
-        (1, {"index": 0, "texCoord": 0, "extensions": {"KHR_texture_transform": {**transform, "texCoord": 1}}}),
+        (
+            1,
+            {
+                "index": 0,
+                "texCoord": 0,
+                "extensions": {"KHR_texture_transform": {**transform, "texCoord": 1}},
+            },
+        ),
     ):
         tree = Tree()
         tree.picture(pixels)
@@ -130,7 +162,9 @@ def test_transforms_and_other_sets_of_texture_coordinates(
         part["attributes"]["TEXCOORD_0"] = tree.array(np.full((3, 2), 9.0))
         part["attributes"][f"TEXCOORD_{number}"] = tree.array([[0, 0], [1, 0], [0, 0.5]])
         tree.content["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": info}}]
-        tree.content["extensionsRequired" if required else "extensionsUsed"] = ["KHR_texture_transform"]
+        tree.content["extensionsRequired" if required else "extensionsUsed"] = [
+            "KHR_texture_transform"
+        ]
         mesh, texts = load(tree.write(tmp_path / "a.gltf"))
         colours = surface_colours(mesh)
         assert colours is not None
@@ -144,7 +178,9 @@ def test_a_texture_without_coordinates_or_format_is_named(tmp_path: Path, load: 
     tree = Tree()
     tree.picture(np.zeros((4, 4, 3), np.uint8))
     tree.part(BOX.faces, material=0)
-    tree.content["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 2}}}]
+    tree.content["materials"] = [
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 2}}}
+    ]
     assert "lacks TEXCOORD_2" in load(tree.write(tmp_path / "a.gltf"))[1][0]
     tree.content["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
     assert "in a format that is not read" in load(tree.write(tmp_path / "a.gltf"))[1][0]
@@ -153,7 +189,9 @@ def test_a_texture_without_coordinates_or_format_is_named(tmp_path: Path, load: 
 def test_quantised_positions_and_places_of_nodes(tmp_path: Path, load: Load) -> None:
     tree = Tree()
     part = tree.part(BOX.faces)
-    part["attributes"]["POSITION"] = tree.array(np.round(BOX.vertices * 2 * 1000), "h", normalized=True)
+    part["attributes"]["POSITION"] = tree.array(
+        np.round(BOX.vertices * 2 * 1000), "h", normalized=True
+    )
     tree.content["extensionsRequired"] = ["KHR_mesh_quantization"]
     quarter = math.sqrt(0.5)
     tree.content["nodes"] = [
@@ -173,7 +211,10 @@ def test_skinned_meshes_are_shown_as_their_joints_stand(tmp_path: Path, load: Lo
     inverse = np.tile(np.eye(4), (2, 1, 1))
     inverse[1, 0, 3] = -1.0  # of a joint that stood at x = 1
     tree.content["skins"] = [
-        {"joints": [1, 2], "inverseBindMatrices": tree.array(inverse.transpose(0, 2, 1).reshape(2, 16))}
+        {
+            "joints": [1, 2],
+            "inverseBindMatrices": tree.array(inverse.transpose(0, 2, 1).reshape(2, 16)),
+        }
     ]
     tree.content["nodes"] = [
         {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},  # does not count
@@ -219,8 +260,16 @@ def test_morph_targets_are_named(tmp_path: Path, load: Load) -> None:
 def test_damaged_trees_are_refused(tmp_path: Path, change: dict[str, Any]) -> None:
     tree = Tree()
     part = tree.part(BOX.faces, material=0)
-    part["attributes"] |= {"JOINTS_0": tree.array([[9] * 4] * 8, "B"), "WEIGHTS_0": tree.array([[1, 0, 0, 0]] * 8)}
-    tree.content |= {"nodes": [{"mesh": 0, "skin": 0}], "materials": [{}], "skins": [{"joints": [0]}], **change}
+    part["attributes"] |= {
+        "JOINTS_0": tree.array([[9] * 4] * 8, "B"),
+        "WEIGHTS_0": tree.array([[1, 0, 0, 0]] * 8),
+    }
+    tree.content |= {
+        "nodes": [{"mesh": 0, "skin": 0}],
+        "materials": [{}],
+        "skins": [{"joints": [0]}],
+        **change,
+    }
     with pytest.raises(MeshError, match="cannot be read as a mesh"):
         cr.load_mesh(tree.write(tmp_path / "a.gltf"))
 
@@ -233,7 +282,9 @@ def test_parts_share_a_view_without_copies(tmp_path: Path, load: Load) -> None:
     tree.content["bufferViews"][0]["byteLength"] = len(tree.data)
     tree.content["accessors"] *= 1000
     tree.content["accessors"] = [{**one, "byteOffset": 36} for one in tree.content["accessors"]]
-    tree.content["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"})
+    tree.content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"}
+    )
     primitives = [{"attributes": {"POSITION": k}} for k in range(1000)]
     tree.content["meshes"][0]["primitives"] = primitives
     for one in tree.content["accessors"]:

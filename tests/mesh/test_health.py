@@ -9,7 +9,13 @@ import pytest
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.mesh import has_colours, mesh_centre, mesh_radius, mesh_symmetries, mesh_warnings
+from curvireg_torch.mesh import (
+    has_colours,
+    mesh_centre,
+    mesh_radius,
+    mesh_symmetries,
+    mesh_warnings,
+)
 from curvireg_torch.mesh.colours import SurfaceColours
 from curvireg_torch.mesh.health import stray_faces
 from curvireg_torch.mesh.mesh import as_mesh
@@ -28,14 +34,18 @@ def triangle(size: float, at: tuple[float, float, float]) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, [[0, 1, 2]], process=False)
 
 
-def box(at: tuple[float, float, float] = (0.0, 0.0, 0.0), sides: tuple[float, ...] = SIDES) -> trimesh.Trimesh:
+def box(
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0), sides: tuple[float, ...] = SIDES
+) -> trimesh.Trimesh:
     mesh = trimesh.creation.box(sides)
     mesh.apply_translation(at)
     return mesh
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-@pytest.mark.parametrize("at", [(300.0, 0.0, 0.0), (0.0, -120.0, 0.0), (0.0, 0.0, 1e6), (80.0, 80.0, 80.0)])
+@pytest.mark.parametrize(
+    "at", [(300.0, 0.0, 0.0), (0.0, -120.0, 0.0), (0.0, 0.0, 1e6), (80.0, 80.0, 80.0)]
+)
 def test_left_over_parts_do_not_set_the_box(scale: float, at: tuple[float, float, float]) -> None:
     whole = joined(triangle(1.0, at), box(), triangle(1.0, (at[0], at[1] + 3.0, at[2])))
     whole.apply_scale(scale)
@@ -64,10 +74,13 @@ def test_colours_stay_with_their_faces() -> None:
         joined(box(), box((100.0, 0.0, 0.0), (4.0, 4.0, 4.0))),  # 0.9 % of the area
         joined(box(), box((0.0, 0.0, 60.0), (0.2, 0.2, 90.0))),  # a thin mast on the top
         joined(box(), triangle(1.0, (34.0, 0.0, 0.0))),  # a chip near the surface
-        joined(box(), *(triangle(1.0, (30.0 + 7.0 * k, 0.0, 0.0)) for k in range(1, 6))),  # a row of chips, 7 apart
-        joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),  # a knob above a plate's middle
+        # a row of chips, 7 apart
+        joined(box(), *(triangle(1.0, (30.0 + 7.0 * k, 0.0, 0.0)) for k in range(1, 6))),
+        # a knob above a plate's middle
+        joined(box(sides=(60.0, 40.0, 1e-3)), triangle(2.0, (0.0, 0.0, 3.0))),
         joined(box(), box(sides=(200.0, 200.0, 200.0))),
-        joined(*(triangle(5.0, (float(k * k), float(k), 0.0)) for k in range(60))),  # a soup of loose triangles
+        # a soup of loose triangles
+        joined(*(triangle(5.0, (float(k * k), float(k), 0.0)) for k in range(60))),
         trimesh.creation.icosphere(2),
         triangle(1.0, (0.0, 0.0, 0.0)),
         box(sides=(1000.0, 1.0, 1.0)),
@@ -105,7 +118,9 @@ def test_coordinates_of_maps(tmp_path: Path, load: Load, suffix: str) -> None:
     mesh, texts = load(tmp_path / f"a.{suffix}", unit="mm")
     if suffix == "obj":
         assert not texts
-        np.testing.assert_allclose(mesh.vertices[mesh.faces] - offset, sphere.triangles - offset, atol=1e-6)
+        np.testing.assert_allclose(
+            mesh.vertices[mesh.faces] - offset, sphere.triangles - offset, atol=1e-6
+        )
     else:
         assert "rounded to steps of 0.5" in texts[0]
         assert [warning.kind for warning in mesh_warnings(mesh)] == ["precision"]
@@ -139,7 +154,9 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction: float) -> None:
     texture = np.full((side, side, 3), 200, np.uint8)
     width = round(side * fraction**0.5)
     texture[:width, :width, 1] = 90
-    mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    mesh = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
     uv = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]], np.float32)
     corners = np.full((2, 3, 3), 255, np.uint8)
     mesh.metadata["colours"] = SurfaceColours(corners, uv, np.zeros(2, np.int32), (texture,))
@@ -149,7 +166,9 @@ def test_a_texture_counts_if_a_word_of_it_differs(fraction: float) -> None:
 def test_notes_reach_the_result(tmp_path: Path) -> None:
     scene = cr.synthetic.demo_scene()
     stray = triangle(0.001 * mesh_radius(scene.mesh), (9.0 * mesh_radius(scene.mesh), 0.0, 0.0))
-    mesh = as_mesh(joined(trimesh.Trimesh(scene.mesh.vertices, scene.mesh.faces, process=False), stray))
+    mesh = as_mesh(
+        joined(trimesh.Trimesh(scene.mesh.vertices, scene.mesh.faces, process=False), stray)
+    )
     views = cr.sample_views(azimuth_step=60, elevations=[20])
     bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
     bank.save(tmp_path / "bank.safetensors")
@@ -165,16 +184,21 @@ def test_notes_reach_the_result(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_pose_of_a_mesh_far_from_its_origin() -> None:
-    """As with coordinates of maps, 7 km away from an object of 35 cm: the pose of the mesh near the origin, moved."""
+    """As with coordinates of maps, 7 km away from an object of 35 cm: the pose of the mesh near the
+    origin, moved."""
     scene = cr.synthetic.demo_scene()
     views = cr.sample_views(azimuth_step=20, elevations=[10, 30])
     poses = []
     for offset in (np.zeros(3), np.array([4.4e3, 5.1e2, 4.6e3])):
         mesh = trimesh.Trimesh(scene.mesh.vertices + offset, scene.mesh.faces, process=False)
         bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
-        result = cr.Registrar(bank, pipeline=bank.pipeline)([scene.image], [scene.box], scene.camera_matrix)[0]
+        result = cr.Registrar(bank, pipeline=bank.pipeline)(
+            [scene.image], [scene.box], scene.camera_matrix
+        )[0]
         assert result.translation is not None
-        poses.append((result.rotation, result.translation.numpy() + result.rotation.numpy() @ offset))
+        poses.append(
+            (result.rotation, result.translation.numpy() + result.rotation.numpy() @ offset)
+        )
     (first, near), (second, far) = poses
     assert float(cr.rotation_error(first, second)) < 1e-3
     np.testing.assert_allclose(far, near, atol=1e-6)

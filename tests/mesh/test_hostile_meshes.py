@@ -42,11 +42,15 @@ def tree(**changes: Any) -> dict[str, Any]:
 def glb(content: dict[str, Any]) -> bytes:
     text = json.dumps({**content, "buffers": [{"byteLength": 36}]}).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", 36, b"BIN\0") + POINTS
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", 36, b"BIN\0") + POINTS
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def refused(path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0) -> None:
+def refused(
+    path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0
+) -> None:
     path.write_bytes(content)
     tracemalloc.start()
     start = time.process_time()
@@ -64,13 +68,22 @@ def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path
     (tmp_path / "a.gltf").write_text(json.dumps(tree()))
     (tmp_path / "a.glb").write_bytes(glb(tree()))
     assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
-    for damaged in (b"glTF", glb(tree())[:60], glb(tree())[:-5], glb(tree()).replace(b"JSON", b"TEXT")):
+    for damaged in (
+        b"glTF",
+        glb(tree())[:60],
+        glb(tree())[:-5],
+        glb(tree()).replace(b"JSON", b"TEXT"),
+    ):
         refused(tmp_path / "a.glb", damaged, "cannot be read")
 
 
 def zeros(**changes: Any) -> dict[str, Any]:
     """A triangle whose accessor is changed."""
-    return {"accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}]}
+    return {
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}
+        ]
+    }
 
 
 def required(name: str) -> dict[str, Any]:
@@ -87,12 +100,18 @@ def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path) -> Non
         ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
         ({"nodes": [{"children": [7], "mesh": 0}]}, "missing"),
         ({"nodes": [{"mesh": 0}] * 20_000}, "10,000 parts"),
-        ({"nodes": [{"mesh": 0, "extensions": INSTANCES}]}, "gpu_instancing, which is not read; export without it"),
+        (
+            {"nodes": [{"mesh": 0, "extensions": INSTANCES}]},
+            "gpu_instancing, which is not read; export without it",
+        ),
         (zeros(count=10**9), "claim more than"),
         (zeros(count=10**6), "cannot be read"),
         (zeros(count=-3), "-3"),
         (zeros(sparse={"count": 1}), "sparse"),
-        ({"accessors": [{"componentType": 5126, "count": 30_000_000, "type": "VEC3"}]}, "without data"),
+        (
+            {"accessors": [{"componentType": 5126, "count": 30_000_000, "type": "VEC3"}]},
+            "without data",
+        ),
         ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "claim more than"),
         ({"bufferViews": [{"buffer": 0, "byteLength": 100}]}, "cannot be read"),
         ({"buffers": [{"byteLength": 36}]}, "cannot be read"),
@@ -114,12 +133,17 @@ def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.Mo
     content = tree(
         nodes=[{"mesh": i % 20, "translation": [i, 0, 0]} for i in range(40)],
         scenes=[{"nodes": list(range(40))}],
-        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": i}]} for i in range(20)],
+        meshes=[
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": i}]}
+            for i in range(20)
+        ],
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}] * 20,
         textures=[{"source": 0}],
         images=[{"uri": uri}],
     )
-    content["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"})
+    content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
+    )
     (tmp_path / "a.gltf").write_text(json.dumps(content))
     decode = Mock(wraps=colours._texture)
     monkeypatch.setattr(colours, "_texture", decode)
@@ -129,7 +153,13 @@ def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.Mo
     assert texture[9, 9].tolist() == [200, 100, 50]
 
 
-OUTSIDE = ["../b.bin", "/etc/passwd", "file:///etc/passwd", "http://127.0.0.1:9/b.bin", "%2e%2e/b.bin"]
+OUTSIDE = [
+    "../b.bin",
+    "/etc/passwd",
+    "file:///etc/passwd",
+    "http://127.0.0.1:9/b.bin",
+    "%2e%2e/b.bin",
+]
 
 
 @pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "no.bin"])
@@ -147,7 +177,9 @@ PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000
 PLY += b"property list uchar int vertex_indices\nend_header\n"
 
 
-def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_mesh_refuses_false_claims_and_bounds_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, content, match in (
         ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
         ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
@@ -156,7 +188,11 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path: Path, monk
         ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "it was cut while"),
         ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "RecursionError"),
         ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
-        ("a.obj", b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n", "only 9e-07 units across; scale it up"),
+        (
+            "a.obj",
+            b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n",
+            "only 9e-07 units across; scale it up",
+        ),
         ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
     ):
         refused(tmp_path / name, content, match)
@@ -173,7 +209,9 @@ def test_load_mesh_refuses_false_claims_and_bounds_its_work(tmp_path: Path, monk
 
 def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
     """trimesh alone multiplies the whole chain again for each part."""
-    half_degree = {"rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]}
+    half_degree = {
+        "rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]
+    }
     chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **half_degree} for i in range(179)]
     leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
     nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
@@ -182,14 +220,17 @@ def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) ->
     mesh = cr.load_mesh(tmp_path / "a.gltf")
     assert time.process_time() - start < 10
     assert len(mesh.faces) == 500
-    at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()  # the chain's end, in the complex plane
+    # the chain's end, in the complex plane
+    at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()
     far = at + np.exp(1j * np.radians(0.5 * 179))  # the corner at x = 1 of a part
     vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
     for point in (at, far):
         assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
 
 
-def test_divide_faces_counts_before_it_divides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_divide_faces_counts_before_it_divides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
     ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
     obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10

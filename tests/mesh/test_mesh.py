@@ -22,14 +22,20 @@ def test_extreme_points_of_a_large_hull_keep_the_boxes(scale: tuple[float, float
     points = extreme_points(mesh)
     assert len(points) <= 2562
     assert {tuple(p) for p in points.tolist()} <= {tuple(p) for p in mesh.vertices.tolist()}
-    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    whole, few = (x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points))
+    directions = torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    whole, few = (
+        x @ directions.double().T for x in (torch.from_numpy(np.array(mesh.vertices)), points)
+    )
     width = whole.amax(dim=0) - whole.amin(dim=0)
     assert float(((whole.amax(dim=0) - few.amax(dim=0)) / width).max()) < 0.0015
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_normalization_transform_is_invariant_to_similarities(truck: trimesh.Trimesh, seed: int) -> None:
+def test_normalization_transform_is_invariant_to_similarities(
+    truck: trimesh.Trimesh, seed: int
+) -> None:
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3] = 7.0 * torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
     T[:3, 3] = torch.tensor([3.0, -2.0, 5.0])
@@ -57,7 +63,9 @@ def test_a_mesh_is_as_large_as_its_longest_side(axis: int) -> None:
         as_mesh(trimesh.creation.box(0.4 * sides))
 
 
-@pytest.mark.parametrize(("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")])
+@pytest.mark.parametrize(
+    ("suffix", "up"), [("glb", "y"), ("ply", "z"), ("stl", "z"), ("off", "z"), ("obj", "z")]
+)
 def test_load_mesh_notes_the_up_axis(tmp_path: Path, suffix: str, up: str) -> None:
     path = tmp_path / f"a.{suffix}"
     trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
@@ -74,32 +82,47 @@ def test_welding_joins_vertices_at_one_place_and_drops_faces_twice_or_without_ar
     apart = np.asarray(box.vertices)[box.faces].reshape(-1, 3) + 1e-8 * np.arange(36)[:, None]
     faces = np.arange(36).reshape(12, 3)
     faces = np.concatenate([faces, faces[:2, ::-1], [[0, 0, 1]]])  # twice, turned over, and a line
-    vertices, faces = simplified(trimesh.Trimesh(apart, faces, process=False), np.array([0.5, 0.0, 0.0]), 100)
-    assert sorted(vertices.round(3).tolist()) == sorted((np.asarray(box.vertices) - [0.5, 0, 0]).tolist())
+    vertices, faces = simplified(
+        trimesh.Trimesh(apart, faces, process=False), np.array([0.5, 0.0, 0.0]), 100
+    )
+    assert sorted(vertices.round(3).tolist()) == sorted(
+        (np.asarray(box.vertices) - [0.5, 0, 0]).tolist()
+    )
     welded = trimesh.Trimesh(vertices, faces, process=False)
-    assert (len(faces), welded.is_watertight, welded.volume) == (12, True, pytest.approx(6.0, rel=1e-5))
+    assert (len(faces), welded.is_watertight, welded.volume) == (
+        12,
+        True,
+        pytest.approx(6.0, rel=1e-5),
+    )
 
 
 def test_a_surface_encloses_volumes_where_each_edge_has_two_faces_of_one_orientation() -> None:
     box = trimesh.creation.box()
-    corners, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    corners = np.asarray(box.vertices)
+    faces = np.asarray(box.faces)
 
     def closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
         return encloses_volumes(trimesh.Trimesh(vertices, faces, process=False))
 
     assert closed(corners, faces)
     assert closed(1e-4 * corners + 50.0, faces)
-    two = np.concatenate([faces, faces + len(corners)]), np.concatenate([faces, faces[:, ::-1] + len(corners)])
+    two = (
+        np.concatenate([faces, faces + len(corners)]),
+        np.concatenate([faces, faces[:, ::-1] + len(corners)]),
+    )
     assert closed(np.concatenate([corners, corners + 3.0]), two[0])
     assert not closed(np.concatenate([2.0 * corners, corners + 3.0]), two[1]), "one inside out"
     assert not closed(corners, faces[:, ::-1])
     assert not closed(corners, faces[:0])
-    assert closed(corners[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))  # not welded
+    # not welded
+    assert closed(corners[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3))
     assert closed(corners, np.concatenate([faces, [[0, 0, 1]]]))  # without area
     assert not closed(corners, faces[1:])
     assert not closed(corners, np.concatenate([faces, faces[:1]]))
     assert not closed(corners, np.concatenate([faces[:1, ::-1], faces[1:]]))
-    assert not closed(np.concatenate([corners, corners]), np.concatenate([faces, faces + len(corners)]))
+    assert not closed(
+        np.concatenate([corners, corners]), np.concatenate([faces, faces + len(corners)])
+    )
 
 
 def test_edges_of_one_vertex_are_neighbours():
@@ -111,7 +134,9 @@ def test_edges_of_one_vertex_are_neighbours():
 def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
     corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=float)
     mesh = trimesh.Trimesh(
-        np.concatenate([corner, corner + np.array([1e7, 0, 0])]), [[0, 1, 2], [3, 4, 5]], process=False
+        np.concatenate([corner, corner + np.array([1e7, 0, 0])]),
+        [[0, 1, 2], [3, 4, 5]],
+        process=False,
     )
     vertices, faces = simplified(mesh, np.zeros(3), 100)
     assert np.array_equal(vertices[faces], mesh.triangles)
@@ -124,24 +149,31 @@ def test_parts_smaller_than_what_is_welded_keep_their_edges() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "warns"), [(99.0, False), (101.0, True), (900.0, True), (0.0051, False), (0.0049, True)]
+    ("size", "warns"),
+    [(99.0, False), (101.0, True), (900.0, True), (0.0051, False), (0.0049, True)],
 )
 def test_load_mesh_warns_of_the_size(tmp_path: Path, size: float, warns: bool) -> None:
     trimesh.creation.box(np.full(3, size / 3**0.5)).export(tmp_path / "a.ply")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         cr.load_mesh(tmp_path / "a.ply")
-    assert ["m across; if that is wrong, give the unit" in str(one.message) for one in caught] == [True] * warns
+    assert ["m across; if that is wrong, give the unit" in str(one.message) for one in caught] == [
+        True
+    ] * warns
 
 
 def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:
-    """A part moved along x below a node that turns x to y: products in the other order put it elsewhere."""
+    """A part moved along x below a node that turns x to y: products in the other order put it
+    elsewhere."""
     quarter = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 0, 1])
     scene = trimesh.Scene()
     scene.graph.update("turned", "world", matrix=quarter)
     moved = trimesh.transformations.translation_matrix([10.0, 0.0, 0.0])
     scene.add_geometry(
-        trimesh.creation.box((3.0, 2.0, 1.0)), node_name="part", parent_node_name="turned", transform=moved
+        trimesh.creation.box((3.0, 2.0, 1.0)),
+        node_name="part",
+        parent_node_name="turned",
+        transform=moved,
     )
     expected = [[-1.0, 8.5, -0.5], [1.0, 11.5, 0.5]]
     np.testing.assert_allclose(as_mesh(scene).bounds, expected, atol=1e-9)
@@ -152,13 +184,17 @@ def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:
 def test_a_degenerate_face_takes_no_colours_away(tmp_path: Path) -> None:
     points = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
     (tmp_path / "a.mtl").write_text("newmtl a\nKd 1 0 0\nnewmtl b\nKd 0 0 1\n")
-    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{points}usemtl a\nf 1 1 2\nf 1 2 3\nusemtl b\nf 2 4 3\n")
+    (tmp_path / "a.obj").write_text(
+        f"mtllib a.mtl\n{points}usemtl a\nf 1 1 2\nf 1 2 3\nusemtl b\nf 2 4 3\n"
+    )
     mesh = cr.load_mesh(tmp_path / "a.obj")
     assert cr.mesh.has_colours(mesh)
     assert mesh.metadata["colours"].corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
 
 
-def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("curvireg_torch.mesh.source.MAX_MESH_BYTES", 1000)
     names = [f"{k}.mtl" for k in range(3)]
     for name in names:

@@ -49,11 +49,17 @@ def write(folder: Path, library: str, name: str = "a.mtl") -> Path:
     return path
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"])
+@pytest.mark.parametrize(
+    "encoding", ["utf-8-sig", "utf-16", "utf-16-le-mark", "latin-1", "gbk", "cr", "crlf"]
+)
 @pytest.mark.parametrize("first", ["v", "mtllib", "comment", "o"])
-def test_every_encoding_gives_the_same_mesh(tmp_path: Path, load: Load, encoding: str, first: str) -> None:
+def test_every_encoding_gives_the_same_mesh(
+    tmp_path: Path, load: Load, encoding: str, first: str
+) -> None:
     name = {"latin-1": "Gehäuse", "gbk": "外壳"}.get(encoding, "part")
-    text = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}[first] + BOX
+    text = {"v": "", "mtllib": "mtllib m.mtl\n", "comment": f"# {name}\n", "o": f"o {name}\n"}[
+        first
+    ] + BOX
     (tmp_path / "m.mtl").write_text("newmtl a\nKd 0.8 0.1 0.1\n")
     if encoding == "utf-16-le-mark":
         data = b"\xff\xfe" + text.encode("utf-16-le")
@@ -66,16 +72,29 @@ def test_every_encoding_gives_the_same_mesh(tmp_path: Path, load: Load, encoding
     assert (len(mesh.faces), mesh.extents.tolist(), texts) == (12, [3.0, 2.0, 1.0], [])
 
 
-def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(tmp_path: Path, load: Load) -> None:
+def test_vertices_and_faces_in_turn_with_negative_indices_and_materials_that_return(
+    tmp_path: Path, load: Load
+) -> None:
     counted_back = "".join(
-        "f " + " ".join(str(int(i) - 9) for i in line.split()[1:]) + "\n" for line in "".join(HALVES).splitlines()
+        "f " + " ".join(str(int(i) - 9) for i in line.split()[1:]) + "\n"
+        for line in "".join(HALVES).splitlines()
     )
-    moved = [POINTS.replace("v 3", f"v {3 + shift}").replace("v 0", f"v {shift}") for shift in (0, 5, 10)]
-    parts = [f"o part{k}\nusemtl m{k % 2}\n{points}{counted_back}" for k, points in enumerate(moved)]
+    moved = [
+        POINTS.replace("v 3", f"v {3 + shift}").replace("v 0", f"v {shift}") for shift in (0, 5, 10)
+    ]
+    parts = [
+        f"o part{k}\nusemtl m{k % 2}\n{points}{counted_back}" for k, points in enumerate(moved)
+    ]
     (tmp_path / "a.obj").write_text("".join(parts))
     mesh, _ = load(tmp_path / "a.obj")
-    assert (len(mesh.vertices), len(mesh.faces), mesh.extents.tolist()) == (24, 36, [13.0, 2.0, 1.0])
-    assert mesh.volume == pytest.approx(18.0, rel=1e-9) or mesh.volume == pytest.approx(-18.0, rel=1e-9)
+    assert (len(mesh.vertices), len(mesh.faces), mesh.extents.tolist()) == (
+        24,
+        36,
+        [13.0, 2.0, 1.0],
+    )
+    assert mesh.volume == pytest.approx(18.0, rel=1e-9) or mesh.volume == pytest.approx(
+        -18.0, rel=1e-9
+    )
 
 
 def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load: Load) -> None:
@@ -83,7 +102,11 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load
     (tmp_path / "b c.mtl").write_text("newmtl blue\nKd 0 0 1\n")
     (tmp_path / "b.mtl").write_text("newmtl blue\nKd 0 0 1\n")
     body = f"{POINTS}usemtl red\n{HALVES[0]}usemtl blue\n{HALVES[1]}"
-    for head in ("mtllib a.mtl\nmtllib b.mtl\n", "mtllib a.mtl b.mtl\n", "mtllib a.mtl\nmtllib b c.mtl\n"):
+    for head in (
+        "mtllib a.mtl\nmtllib b.mtl\n",
+        "mtllib a.mtl b.mtl\n",
+        "mtllib a.mtl\nmtllib b c.mtl\n",
+    ):
         (tmp_path / "a.obj").write_text(head + body)
         mesh, texts = load(tmp_path / "a.obj")
         colours = surface_colours(mesh)
@@ -94,7 +117,9 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load
     (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + body)
     mesh, texts = load(tmp_path / "a.obj")
     assert "lack the material blue" in texts[0]
-    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}")
+    (tmp_path / "a.obj").write_text(
+        f"mtllib a.mtl\n{POINTS}usemtl red\n{HALVES[0]}usemtl\n{HALVES[1]}"
+    )
     colours = surface_colours(load(tmp_path / "a.obj")[0])
     assert colours is not None
     assert (colours.corners[6:] == 255).all(), "no name: no material"
@@ -111,10 +136,16 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load
     ],
 )
 @pytest.mark.parametrize(
-    "name", ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"]
+    "name",
+    ["label.png", "my label.png", "LABEL.PNG", '"label.png"', "maps\\label.png", "./label.png"],
 )
 def test_options_of_a_texture_precede_its_name(
-    tmp_path: Path, load: Load, options: str, scale: tuple[float, float], offset: tuple[float, float], name: str
+    tmp_path: Path,
+    load: Load,
+    options: str,
+    scale: tuple[float, float],
+    offset: tuple[float, float],
+    name: str,
 ) -> None:
     folder = tmp_path / "maps" if "maps" in name else tmp_path
     file = name.replace("maps\\", "").strip('"')
@@ -130,7 +161,9 @@ def test_options_of_a_texture_precede_its_name(
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "gbk"])
-def test_a_library_in_another_encoding_finds_its_texture(tmp_path: Path, load: Load, encoding: str) -> None:
+def test_a_library_in_another_encoding_finds_its_texture(
+    tmp_path: Path, load: Load, encoding: str
+) -> None:
     name = "标签.png" if encoding == "gbk" else "Gehäuse.png"
     picture(tmp_path / name)
     path = write(tmp_path, "")
@@ -144,7 +177,11 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
     tmp_path: Path, load: Load
 ) -> None:
     picture(tmp_path / "images" / "label.png")
-    for name in ("../images/label.png", str(tmp_path / "images" / "label.png"), "C:\\art\\label.png"):
+    for name in (
+        "../images/label.png",
+        str(tmp_path / "images" / "label.png"),
+        "C:\\art\\label.png",
+    ):
         path = write(tmp_path / "models", f"newmtl label\nmap_Kd {name}\n")
         mesh, texts = load(path)
         assert not has_colours(mesh)
@@ -165,15 +202,24 @@ def test_textures_outside_of_the_folder_are_named_and_found_where_their_folder_i
 
 def test_colours_behind_the_coordinates(tmp_path: Path, load: Load) -> None:
     for scale in (1, 255):
-        points = "".join(f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines()))
+        points = "".join(
+            f"{line} {k % 2 * scale} 0 {scale}\n" for k, line in enumerate(POINTS.splitlines())
+        )
         (tmp_path / "a.obj").write_text(points + "".join(HALVES))
         colours = surface_colours(load(tmp_path / "a.obj")[0])
         assert colours is not None
-        assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {(0, 0, 255), (255, 0, 255)}
+        assert set(map(tuple, colours.corners.reshape(-1, 3).tolist())) == {
+            (0, 0, 255),
+            (255, 0, 255),
+        }
 
 
 def test_corners_of_several_forms_in_one_file(tmp_path: Path, load: Load) -> None:
-    faces = "".join(HALVES).replace("f 1 3 4\n", "f 1/1 3/2/1 4\n").replace("f 3 8 4\n", "f 3//1 8/ 4//\n")
+    faces = (
+        "".join(HALVES)
+        .replace("f 1 3 4\n", "f 1/1 3/2/1 4\n")
+        .replace("f 3 8 4\n", "f 3//1 8/ 4//\n")
+    )
     (tmp_path / "a.obj").write_text(POINTS + UV + "vn 0 0 1\n" + faces)
     np.testing.assert_array_equal(load(tmp_path / "a.obj")[0].faces, load_box(tmp_path).faces)
 
@@ -184,7 +230,8 @@ def load_box(folder: Path) -> trimesh.Trimesh:
 
 
 @pytest.mark.parametrize(
-    "line", ["v 1 2", "v 0,5 1,0 2,0", "v a b c", "f 1 2 99", "f 1 2 -99", "f 1 2 0", "f 1/9 2/9 3/9"]
+    "line",
+    ["v 1 2", "v 0,5 1,0 2,0", "v a b c", "f 1 2 99", "f 1 2 -99", "f 1 2 0", "f 1/9 2/9 3/9"],
 )
 def test_damaged_lines_are_refused(tmp_path: Path, line: str) -> None:
     (tmp_path / "a.obj").write_text(f"{BOX}vt 0 0\n{line}\n")
@@ -208,7 +255,8 @@ HOSTILE = {
 
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
-    """Of four times the size, at most nine times the time; quadratic readers take sixteen times as long."""
+    """Of four times the size, at most nine times the time; quadratic readers take sixteen times as
+    long."""
 
     def seconds(n: int) -> float:
         path = tmp_path / "a.obj"
@@ -233,12 +281,15 @@ def test_an_obj_of_many_parts_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_can_with_one_plain_material_is_grey(tmp_path: Path, load: Load) -> None:
-    """Texture coordinates without a material, a missing library, and one colour: no print, and all its symmetries."""
+    """Texture coordinates without a material, a missing library, and one colour: no print, and all
+    its symmetries."""
     can = trimesh.creation.cylinder(30.0, 100.0, sections=96)
     points = "".join(f"v {x} {y} {z}\n" for x, y, z in can.vertices)
     faces = "".join(f"f {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for a, b, c in can.faces)
     (tmp_path / "kd.mtl").write_text("newmtl steel\nKd 0.6 0.6 0.6\n")
-    (tmp_path / "two.mtl").write_text("newmtl steel\nKd 0.6 0.6 0.6\nnewmtl chrome\nKd 0.61 0.6 0.6\n")
+    (tmp_path / "two.mtl").write_text(
+        "newmtl steel\nKd 0.6 0.6 0.6\nnewmtl chrome\nKd 0.61 0.6 0.6\n"
+    )
     for head in ("", "mtllib lost.mtl\n", "mtllib kd.mtl\n", "mtllib two.mtl\n"):
         half = len(faces.splitlines()) // 2
         rows = faces.splitlines(keepends=True)
@@ -248,7 +299,9 @@ def test_a_can_with_one_plain_material_is_grey(tmp_path: Path, load: Load) -> No
         mesh, texts = load(tmp_path / "can.obj", unit="mm")
         assert not has_colours(mesh)
         assert len(mesh_symmetries(mesh)) == 72
-        assert [("lost.mtl is missing" in text) for text in texts] == ["lost" in head] * ("lost" in head)
+        assert [("lost.mtl is missing" in text) for text in texts] == ["lost" in head] * (
+            "lost" in head
+        )
 
 
 def test_options_of_the_command_line_reach_the_reader(tmp_path: Path) -> None:

@@ -18,7 +18,9 @@ POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
 SHADES = [(255, 0, 0), (0, 255, 0), (0, 0, 255), (51, 102, 153)]
 
 
-def header(vertex: str, face: str, *, count: int = 2, comments: str = "", kind: str = "ascii") -> str:
+def header(
+    vertex: str, face: str, *, count: int = 2, comments: str = "", kind: str = "ascii"
+) -> str:
     columns = "".join(f"property float {axis}\n" for axis in "xyz") + vertex
     text = f"ply\nformat {kind} 1.0\n{comments}element vertex 4\n{columns}element face {count}\n"
     return f"{text}property list uchar int vertex_indices\n{face}end_header\n"
@@ -31,8 +33,12 @@ def rows(extra: list[str]) -> str:
 @pytest.mark.parametrize("prefix", ["", "diffuse_"])
 @pytest.mark.parametrize("short", [False, True])
 @pytest.mark.parametrize("kind", ["uchar", "float", "ushort"])
-def test_colours_under_every_name(tmp_path: Path, load: Load, prefix: str, short: bool, kind: str) -> None:
-    names = [f"{prefix}{name[0] if short and not prefix else name}" for name in ("red", "green", "blue")]
+def test_colours_under_every_name(
+    tmp_path: Path, load: Load, prefix: str, short: bool, kind: str
+) -> None:
+    names = [
+        f"{prefix}{name[0] if short and not prefix else name}" for name in ("red", "green", "blue")
+    ]
     vertex = "".join(f"property {kind} {name}\n" for name in names)
     scale = 1 / 255 if kind == "float" else 1
     extra = [" ".join(f"{shade * scale:g}" for shade in shades) for shades in SHADES]
@@ -56,7 +62,11 @@ def test_two_textures_are_read_or_named(tmp_path: Path, load: Load) -> None:
     comments = "comment TextureFile 0.png\ncomment TextureFile 1.png\n"
     face = "property list uchar float texcoord\n"
     faces = "3 0 1 2 6 0 0 1 0 1 1 {}\n3 0 2 3 6 0 0 1 1 0 .5 {}\n"
-    text = header("", face + "property int texnumber\n", comments=comments) + rows([""] * 4) + faces.format(1, 0)
+    text = (
+        header("", face + "property int texnumber\n", comments=comments)
+        + rows([""] * 4)
+        + faces.format(1, 0)
+    )
     (tmp_path / "a.ply").write_text(text)
     mesh, texts = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
@@ -76,7 +86,9 @@ def test_two_textures_are_read_or_named(tmp_path: Path, load: Load) -> None:
 
 
 @pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
-def test_texture_coordinates_of_vertices(tmp_path: Path, load: Load, names: tuple[str, str]) -> None:
+def test_texture_coordinates_of_vertices(
+    tmp_path: Path, load: Load, names: tuple[str, str]
+) -> None:
     (pixels, _) = pictures(tmp_path)
     vertex = "".join(f"property float {name}\n" for name in names)
     text = header(vertex, "", count=1, comments="comment TextureFile 0.png\n")
@@ -86,20 +98,28 @@ def test_texture_coordinates_of_vertices(tmp_path: Path, load: Load, names: tupl
     assert colours is not None
     assert not texts
     np.testing.assert_array_equal(colours.textures[0], pixels)
-    np.testing.assert_allclose(colours.uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / [4, 2], atol=1e-6)
+    np.testing.assert_allclose(
+        colours.uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / [4, 2], atol=1e-6
+    )
 
 
 def test_concave_faces_keep_their_texture_coordinates(tmp_path: Path, load: Load) -> None:
     pictures(tmp_path)
-    text = header("", "property list uchar float texcoord\n", comments="comment TextureFile 0.png\n")
+    text = header(
+        "", "property list uchar float texcoord\n", comments="comment TextureFile 0.png\n"
+    )
     points = "0 0 0\n1 2 0\n0 1 0\n-1 2 0\n"
-    (tmp_path / "a.ply").write_text(f"{text}{points}4 0 1 2 3 8 0 0 .1 .2 0 .1 .9 .2\n3 0 1 2 6 0 0 .1 .2 0 .1\n")
+    (tmp_path / "a.ply").write_text(
+        f"{text}{points}4 0 1 2 3 8 0 0 .1 .2 0 .1 .9 .2\n3 0 1 2 6 0 0 .1 .2 0 .1\n"
+    )
     mesh, _ = load(tmp_path / "a.ply")
     colours = surface_colours(mesh)
     assert colours is not None
     assert (len(mesh.faces), mesh.area) == (3, pytest.approx(1.5))
     expected = np.array([[0, 0], [0.1, 0.2], [0, 0.1], [0.9, 0.2]])
-    corner = [[POINT.index(tuple(p)) for p in one] for one in mesh.triangles.round().astype(int).tolist()]
+    corner = [
+        [POINT.index(tuple(p)) for p in one] for one in mesh.triangles.round().astype(int).tolist()
+    ]
     np.testing.assert_allclose(colours.uv, expected[corner], atol=1e-6)
 
 
@@ -113,7 +133,11 @@ def test_remarks_in_any_encoding(tmp_path: Path, load: Load, encoding: str) -> N
     Image.fromarray(pixels[0]).save(tmp_path / f"{name}.png")
     comments = f"comment made for {name}\nobj_info {name}\ncomment TextureFile {name}.png\n"
     vertex = "property float s\nproperty float t\n"
-    text = header(vertex, "", comments=comments) + rows(["0 0", "1 0", "1 1", "0 1"]) + "3 0 1 2\n3 0 2 3\n"
+    text = (
+        header(vertex, "", comments=comments)
+        + rows(["0 0", "1 0", "1 1", "0 1"])
+        + "3 0 1 2\n3 0 2 3\n"
+    )
     (tmp_path / "a.ply").write_bytes(text.encode(encoding))
     mesh, texts = load(tmp_path / "a.ply")
     assert has_colours(mesh)
@@ -122,7 +146,12 @@ def test_remarks_in_any_encoding(tmp_path: Path, load: Load, encoding: str) -> N
 
 @pytest.mark.parametrize(
     "content",
-    ["", "ply\n", "ply\nformat ascii 1.0\nend_header\n", header("", "").replace("float x", "float q") + rows([""] * 4)],
+    [
+        "",
+        "ply\n",
+        "ply\nformat ascii 1.0\nend_header\n",
+        header("", "").replace("float x", "float q") + rows([""] * 4),
+    ],
 )
 def test_damaged_files_are_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "a.ply").write_text(content)
@@ -138,9 +167,17 @@ def test_headers_of_many_columns_are_refused(tmp_path: Path) -> None:
 
 
 HOSTILE = {
-    "comments": lambda n: header("", "", comments="comment\n" * n) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
-    "blanks": lambda n: header("", "", comments=f"comment{' ' * 20 * n}x\n") + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n",
-    "textures": lambda n: header("", "", comments="comment TextureFile a.png\n" * n) + rows([""] * 4) + "3 0 1 2\n" * 2,
+    "comments": lambda n: (
+        header("", "", comments="comment\n" * n) + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n"
+    ),
+    "blanks": lambda n: (
+        header("", "", comments=f"comment{' ' * 20 * n}x\n") + rows([""] * 4) + "3 0 1 2\n3 0 2 3\n"
+    ),
+    "textures": lambda n: (
+        header("", "", comments="comment TextureFile a.png\n" * n)
+        + rows([""] * 4)
+        + "3 0 1 2\n" * 2
+    ),
 }
 
 

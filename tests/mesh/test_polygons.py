@@ -27,12 +27,19 @@ def square_with_hole(n: int) -> np.ndarray:
 @pytest.mark.parametrize("sign", [1, -1])
 def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
     rng = np.random.default_rng(0)
-    turns = [np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n) for n in (4, 5, 6, 9, 60)]
+    turns = [
+        np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
+        for n in (4, 5, 6, 9, 60)
+    ]
     stars = [np.stack([turn.real, turn.imag], axis=-1) for turn in turns]
     for flat in (U, *map(square_with_hole, (3, 8, 40)), *stars):
-        polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)  # in a tilted plane
-        # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that none overlap.
-        a, b, c = np.moveaxis(polygon[np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])], 1, 0)
+        # in a tilted plane
+        polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)
+        # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that
+        # none overlap.
+        a, b, c = np.moveaxis(
+            polygon[np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])], 1, 0
+        )
         (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
         expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
         assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
@@ -60,14 +67,22 @@ def write(path: Path, kind: str) -> None:
         lines = ["f " + " ".join(corner.format(i + first) for i in f) for f in faces]
         if kind == "obj continued":
             lines = [line.replace(" 5 ", " 5 \\\n") for line in lines]
-        uv = "".join(f"vt {x / 4:g} {y / 4:g}\nvn 0 0 1\n" for x, y, _ in vertices) * (kind == "obj with texture")
-        path.write_text("".join(f"v {p}\n" for p in points.splitlines()) + uv + "\n".join(lines) + "\n")
+        uv = "".join(f"vt {x / 4:g} {y / 4:g}\nvn 0 0 1\n" for x, y, _ in vertices) * (
+            kind == "obj with texture"
+        )
+        path.write_text(
+            "".join(f"v {p}\n" for p in points.splitlines()) + uv + "\n".join(lines) + "\n"
+        )
     else:
-        colour = "property uchar red\nproperty uchar green\nproperty uchar blue\n" * (kind == "ply with colours")
+        colour = "property uchar red\nproperty uchar green\nproperty uchar blue\n" * (
+            kind == "ply with colours"
+        )
         lists = "".join(f"{line}{' 255 0 0' * bool(colour)}\n" for line in lists.splitlines())
         header = "ply\nformat ascii 1.0\ncomment a U\nelement vertex 16\n"
         header += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 10\n"
-        path.write_text(f"{header}property list uchar int vertex_indices\n{colour}end_header\n{points}{lists}")
+        path.write_text(
+            f"{header}property list uchar int vertex_indices\n{colour}end_header\n{points}{lists}"
+        )
 
 
 KINDS = ["off", "off with colours", "obj", "obj counted back", "obj continued", "obj with texture"]
@@ -110,7 +125,9 @@ def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_p
 def binary_ply(faces: list[list[int]], vertices: np.ndarray) -> bytes:
     header = f"ply\nformat binary_big_endian 1.0\nelement vertex {len(vertices)}\n"
     header += "".join(f"property float {axis}\n" for axis in "xyz") + f"element face {len(faces)}\n"
-    body = vertices.astype(">f4").tobytes() + b"".join(struct.pack(f">B{len(f)}i", len(f), *f) for f in faces)
+    body = vertices.astype(">f4").tobytes() + b"".join(
+        struct.pack(f">B{len(f)}i", len(f), *f) for f in faces
+    )
     return f"{header}property list uchar int vertex_indices\nend_header\n".encode() + body
 
 
@@ -119,8 +136,11 @@ def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path: Path) -> 
     path = tmp_path / "u.ply"
     path.write_bytes(binary_ply(faces[:2], vertices))
     assert cr.load_mesh(path).area == pytest.approx(2 * 7)
-    path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))  # 12 corners as three quads
-    with pytest.raises(MeshError, match="different numbers of corners are not read; export triangles"):
+    # 12 corners as three quads
+    path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))
+    with pytest.raises(
+        MeshError, match="different numbers of corners are not read; export triangles"
+    ):
         cr.load_mesh(path)
     path.write_bytes(binary_ply(faces, vertices))
     with pytest.raises(MeshError, match="different numbers of corners: export triangles"):
@@ -135,8 +155,13 @@ SIDES = [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [
 @pytest.mark.parametrize("triangles", [True, False])
 def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangles: bool) -> None:
     """trimesh drops indented faces and refuses comments behind them."""
-    faces = [f for a, b, c, d in SIDES for f in ([[a, b, c], [a, c, d]] if triangles else [[a, b, c, d]])]
-    rows = [f"f {' '.join(map(str, f))}" if k % 2 else line.format(" ".join(map(str, f))) for k, f in enumerate(faces)]
+    faces = [
+        f for a, b, c, d in SIDES for f in ([[a, b, c], [a, c, d]] if triangles else [[a, b, c, d]])
+    ]
+    rows = [
+        f"f {' '.join(map(str, f))}" if k % 2 else line.format(" ".join(map(str, f)))
+        for k, f in enumerate(faces)
+    ]
     path = tmp_path / "box.obj"
     path.write_text(BOX + "\n".join(rows) + "\n")
     mesh = cr.load_mesh(path)
@@ -156,7 +181,10 @@ def test_load_mesh_refuses_damaged_polygons(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"u.{kind[:3]}"
     write(path, kind)
     data = path.read_bytes()
-    for damaged in (data.replace(b"\n8 7 6", b"\n8 99 6").replace(b"f 8 7 ", b"f 8 99 "), data[: len(data) - 12]):
+    for damaged in (
+        data.replace(b"\n8 7 6", b"\n8 99 6").replace(b"f 8 7 ", b"f 8 99 "),
+        data[: len(data) - 12],
+    ):
         if kind == "obj" and damaged == data[:-12]:
             continue  # a shorter OBJ is another OBJ
         path.write_bytes(damaged)

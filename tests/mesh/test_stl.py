@@ -24,7 +24,9 @@ def binary(header: bytes = b"exported", claimed: int = 12, tail: bytes = b"") ->
 
 def ascii_stl(name: str = "part", point: str = "  vertex {:.4f} {:.4f} {:.4f}\n") -> str:
     facets = "".join(
-        "facet normal 0 0 0\n outer loop\n" + "".join(point.format(*corner) for corner in one) + " endloop\nendfacet\n"
+        "facet normal 0 0 0\n outer loop\n"
+        + "".join(point.format(*corner) for corner in one)
+        + " endloop\nendfacet\n"
         for one in BOX.triangles
     )
     return f"solid {name}\n{facets}endsolid {name}\n"
@@ -36,10 +38,13 @@ def check(mesh: trimesh.Trimesh) -> None:
 
 
 @pytest.mark.parametrize(
-    "header", [b"exported", b"solid Part1", b"solid facet vertex", "solid Gehäuse".encode("latin-1")]
+    "header",
+    [b"exported", b"solid Part1", b"solid facet vertex", "solid Gehäuse".encode("latin-1")],
 )
 @pytest.mark.parametrize("tail", [b"", b"\r\n"])
-def test_the_header_of_a_binary_file_says_nothing(tmp_path: Path, load: Load, header: bytes, tail: bytes) -> None:
+def test_the_header_of_a_binary_file_says_nothing(
+    tmp_path: Path, load: Load, header: bytes, tail: bytes
+) -> None:
     (tmp_path / "a.stl").write_bytes(binary(header, tail=tail))
     mesh, texts = load(tmp_path / "a.stl")
     check(mesh)
@@ -71,7 +76,19 @@ def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
         ascii_stl().replace("\n", "\r").encode(),
         ("\n \n" + ascii_stl()).encode(),
     ],
-    ids=["plain", "upper", "tabs", "latin-1", "gbk", "named", "bom", "utf-16", "crlf", "cr", "blank"],
+    ids=[
+        "plain",
+        "upper",
+        "tabs",
+        "latin-1",
+        "gbk",
+        "named",
+        "bom",
+        "utf-16",
+        "crlf",
+        "cr",
+        "blank",
+    ],
 )
 def test_ascii_files_of_every_encoding(tmp_path: Path, load: Load, content: bytes) -> None:
     (tmp_path / "a.stl").write_bytes(content)
@@ -87,7 +104,9 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> 
     check(mesh)
     assert "may have been cut short" in texts[0]
     for end in ("endfacet", "endloop", "vertex", "facet normal"):
-        (tmp_path / "a.stl").write_text(text[: text.rindex(end) + (4 if end == "facet normal" else 0)])
+        (tmp_path / "a.stl").write_text(
+            text[: text.rindex(end) + (4 if end == "facet normal" else 0)]
+        )
         if end == "facet normal":
             continue
         with pytest.raises(MeshError, match="it was cut short, or is damaged"):
@@ -99,7 +118,10 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> 
     [
         (ascii_stl().replace(".", ",").encode(), "decimal commas; export it with decimal points"),
         (ascii_stl(point="  vertex {:.1f} {:.1f}\n").encode(), "does not have three coordinates"),
-        (ascii_stl(point="  vertex {:.1f} {:.1f} {:.1f} 4\n").encode(), "does not have three coordinates"),
+        (
+            ascii_stl(point="  vertex {:.1f} {:.1f} {:.1f} 4\n").encode(),
+            "does not have three coordinates",
+        ),
         (ascii_stl(point="  vertex {:.1f} {:.1f} x{:.1f}\n").encode(), "not a number"),
         (b"solid", "got none"),
         (b"", "too early"),

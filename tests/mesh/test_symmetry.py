@@ -7,7 +7,9 @@ from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.synthetic import example_mesh
 
 ROTATED = trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.5, 0.9]))
-BOTTLE = trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.15], [0.015, 0.2], [0.015, 0.25], [0, 0.25]])
+BOTTLE = trimesh.creation.revolve(
+    [[0, 0], [0.04, 0], [0.04, 0.15], [0.015, 0.2], [0.015, 0.25], [0, 0.25]]
+)
 
 
 def moved(mesh):
@@ -17,12 +19,20 @@ def moved(mesh):
     return mesh
 
 
-BOXES = [(trimesh.creation.box(size), count) for size, count in (((1, 2, 3), 4), ((1, 1, 3), 8), ((1, 1, 1), 24))]
-PRISMS = [(trimesh.creation.cylinder(1.0, 3.0, sections=n), count) for n, count in ((3, 6), (5, 10), (64, 72))]
+BOXES = [
+    (trimesh.creation.box(size), count)
+    for size, count in (((1, 2, 3), 4), ((1, 1, 3), 8), ((1, 1, 1), 24))
+]
+PRISMS = [
+    (trimesh.creation.cylinder(1.0, 3.0, sections=n), count)
+    for n, count in ((3, 6), (5, 10), (64, 72))
+]
 MOVED = [(moved(BOTTLE), 36), (moved(trimesh.creation.box((1, 2, 3))), 4)]
 
 
-@pytest.mark.parametrize(("mesh", "count"), [*BOXES, *PRISMS, *MOVED, (BOTTLE, 36), (example_mesh(), 1)])
+@pytest.mark.parametrize(
+    ("mesh", "count"), [*BOXES, *PRISMS, *MOVED, (BOTTLE, 36), (example_mesh(), 1)]
+)
 def test_symmetries_map_the_shape_to_itself(mesh, count):
     symmetries = mesh_symmetries(mesh)
     assert symmetries.shape == (count, 4, 4)

@@ -19,7 +19,15 @@ from tests.mesh.test_obj import write as write_obj
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
 FORMATS = {"JPEG": True, "PNG": True, "TIFF": True, "WEBP": True, "BMP": True, "PPM": True}
-FORMATS |= {"GIF": False, "TGA": False, "PCX": False, "ICO": False, "EPS": False, "PDF": False, "SGI": False}
+FORMATS |= {
+    "GIF": False,
+    "TGA": False,
+    "PCX": False,
+    "ICO": False,
+    "EPS": False,
+    "PDF": False,
+    "SGI": False,
+}
 
 
 def encoded(kind: str, size: tuple[int, int] = (8, 8), **how: object) -> bytes:
@@ -40,7 +48,11 @@ def write(folder: Path, carrier: str, picture: bytes) -> Path:
     if carrier == "ply":
         text = "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\n"
         text += "".join(f"property float {name}\n" for name in "xyzst") + "element face 1\n"
-        text += "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n"
+        text += (
+            "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 "
+            "0 "
+            "1\n3 0 1 2\n"
+        )
         path.write_text(text)
         return path
     uri = "data:image/png;base64," + base64.b64encode(picture).decode()
@@ -50,7 +62,9 @@ def write(folder: Path, carrier: str, picture: bytes) -> Path:
         materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
         meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
     )
-    content["accessors"].append({"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"})
+    content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
+    )
     path = folder / "a.gltf"
     path.write_text(json.dumps(content))
     return path
@@ -67,14 +81,18 @@ def test_only_the_formats_of_photographs_are_decoded(
     monkeypatch.setattr("subprocess.Popen", refuse)
     mesh, texts = load(write(tmp_path, carrier, encoded(kind)))
     assert has_colours(mesh) == FORMATS[kind]
-    assert [warning.kind for warning in mesh_warnings(mesh)] == ([] if FORMATS[kind] else ["texture"])
+    assert [warning.kind for warning in mesh_warnings(mesh)] == (
+        [] if FORMATS[kind] else ["texture"]
+    )
     assert all("not an image that is read" in text for text in texts)
 
 
 def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path: Path) -> None:
     (tmp_path / "a.eps").write_bytes(POSTSCRIPT)
     mesh = trimesh.creation.box()
-    mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], image=Image.open(tmp_path / "a.eps"))
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=mesh.vertices[:, :2], image=Image.open(tmp_path / "a.eps")
+    )
     with pytest.warns(UserWarning, match="the format EPS is not read"):
         assert surface_colours(mesh) is None or not has_colours(mesh)
 
@@ -99,7 +117,10 @@ def test_pixels_of_all_textures_together_are_bounded(
     assert found is not None
     assert len(found.textures) == 3
     assert len(texts) == 1
-    assert "the texture 3.png cannot be used (the textures have more than 3,999 pixels together)" in texts[0]
+    assert (
+        "the texture 3.png cannot be used (the textures have more than 3,999 pixels together)"
+        in texts[0]
+    )
     monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 4000)
     assert not load(path)[1]
 
@@ -122,7 +143,11 @@ def test_a_texture_of_many_pixels_or_scans_is_left_out(
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16"])
 def test_large_textures_are_reduced_in_every_mode(mode: str) -> None:
     """Before they are converted to RGBA, which would take four times the memory."""
-    image = Image.new("L", (6400, 5600), 255).convert(mode) if mode != "I;16" else Image.new(mode, (6400, 5600), 65535)
+    image = (
+        Image.new("L", (6400, 5600), 255).convert(mode)
+        if mode != "I;16"
+        else Image.new(mode, (6400, 5600), 65535)
+    )
     file = BytesIO()
     image.save(file, "TIFF")
     pixels, count = colours.texture_pixels(file.getvalue(), 6400 * 5600)

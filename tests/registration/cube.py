@@ -39,6 +39,10 @@ def noise() -> Tensor:
     return torch.rand(3, 128, 128, generator=torch.Generator().manual_seed(0))
 
 
-def fitted(image: Tensor, starts: Tensor, *, mesh: trimesh.Trimesh | None = None, **options: Any) -> ContourFit:
+def fitted(
+    image: Tensor, starts: Tensor, *, mesh: trimesh.Trimesh | None = None, **options: Any
+) -> ContourFit:
     """Fit a mesh, by default the cube, to a photograph that shows it in ``BOX``."""
-    return fit_contours(MeshContours(mesh or cube()), image, options.pop("box", BOX), K, starts, **options)
+    return fit_contours(
+        MeshContours(mesh or cube()), image, options.pop("box", BOX), K, starts, **options
+    )

@@ -1,4 +1,5 @@
-"""Distorted photographs give the poses of undistorted ones, and masks stand in for boxes and predicted masks."""
+"""Distorted photographs give the poses of undistorted ones, and masks stand in for boxes and
+predicted masks."""
 
 import cv2
 import numpy as np
@@ -22,13 +23,19 @@ FISHEYE = Camera(OFF_CENTRE, (0.02, -0.01, 0.003, -0.001), "fisheye", SIZE)
 
 
 def distorted(camera, seed):
-    """A photograph by a camera with distortion, the box and mask of the object in it, and the true pose."""
+    """A photograph by a camera with distortion, the box and mask of the object in it, and the true
+    pose."""
     generator = torch.Generator().manual_seed(seed)
     T = random_pose(example_mesh(), OFF_CENTRE, SIZE, generator, elevations=(5.0, 50.0))
     ideal, _ = synthesize_photograph(example_mesh(), T, OFF_CENTRE, SIZE, generator)
     mask = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).float()
-    K, D = camera.matrix.numpy(), np.array(camera.distortion)
-    pixels = np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    K = camera.matrix.numpy()
+    D = np.array(camera.distortion)
+    pixels = (
+        np.stack(np.meshgrid(np.arange(SIZE[1]), np.arange(SIZE[0])), axis=-1)
+        .reshape(-1, 1, 2)
+        .astype(np.float64)
+    )
     if camera.model == "fisheye":
         source = cv2.fisheye.undistortPoints(pixels, K, D, P=K)
     else:
@@ -76,7 +83,9 @@ def test_inverted_masks_and_boxes_that_the_camera_did_not_record_are_warned_of()
     assert "% of the box lie where the distorted photograph shows nothing" in item.warnings[0]
     mask = torch.ones(40, 60)
     mask[5:35, 20:50] = 0.0
-    assert "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+    assert (
+        "must be white, not black" in image_item(torch.rand(3, 40, 60), None, mask=mask).warnings[0]
+    )
     assert not image_item(torch.rand(3, 40, 60), None, mask=1.0 - mask).warnings
 
 
@@ -85,16 +94,24 @@ def test_mask_gives_the_box_and_the_outline():
     (result,) = truck_registrar()([photo], None, RADIAL, masks=iter([mask]))
     assert errors(result, T)[0] < 1.0
     y, x = (render_depth(example_mesh(), T, OFF_CENTRE, SIZE)[0, 0] > 0).nonzero().unbind(1)
-    true_box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor([-0.5, -0.5, 0.5, 0.5])
-    torch.testing.assert_close(image_item(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0)
-    assert torch.equal(image_item(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box)
+    true_box = boxes_around(torch.stack([x, y], dim=1).float()) + torch.tensor(
+        [-0.5, -0.5, 0.5, 0.5]
+    )
+    torch.testing.assert_close(
+        image_item(photo, None, RADIAL, mask=mask).box, true_box, atol=1.0, rtol=0
+    )
+    assert torch.equal(
+        image_item(photo, box, RADIAL, mask=mask).box, undistorted(photo, RADIAL, box).box
+    )
 
 
 def test_mask_decides_which_edges_are_the_outline():
     image, box, T = scene(0)
     mask = render_depth(example_mesh(), T, CAMERA, SIZE)[0, 0] > 0
     register = truck_registrar()
-    without, with_mask, wrong = register([image] * 3, torch.stack([box] * 3), CAMERA, masks=[None, mask, ~mask])
+    without, with_mask, wrong = register(
+        [image] * 3, torch.stack([box] * 3), CAMERA, masks=[None, mask, ~mask]
+    )
     assert errors(with_mask, T)[1] < errors(without, T)[1]
     assert not torch.equal(wrong.translation, with_mask.translation)
     query = register.matcher.query([image], box[None])
@@ -108,10 +125,17 @@ def test_a_given_mask_replaces_the_predicted_one_of_the_box():
     image, box, _ = scene(0)
     register = learned_registrar()
     query = register.matcher.query([image], box[None])
-    none, given = (image_item(image, box, CAMERA, mask=mask) for mask in (None, torch.ones(SIZE, dtype=torch.bool)))
+    none, given = (
+        image_item(image, box, CAMERA, mask=mask)
+        for mask in (None, torch.ones(SIZE, dtype=torch.bool))
+    )
     predicted = register.object_mask(query, [none])
-    torch.testing.assert_close(predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0)
-    assert not torch.allclose(predicted, register.matcher.field.mask(query.regions[:, -1]), atol=1e-2)
+    torch.testing.assert_close(
+        predicted, register.matcher.field.mask(query.crops), atol=1e-4, rtol=0
+    )
+    assert not torch.allclose(
+        predicted, register.matcher.field.mask(query.regions[:, -1]), atol=1e-2
+    )
     assert float(register.object_mask(query, [given]).min()) == 1.0
 
 
@@ -119,19 +143,35 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
     mask = torch.zeros(40, 60, dtype=torch.bool)
     mask[10:30, 20:50] = True
     Image.fromarray(mask.numpy()).save(tmp_path / "mask.png")
-    for form in (mask, 255 * mask.byte(), mask.byte(), mask.numpy().astype(np.float64), tmp_path / "mask.png"):
+    for form in (
+        mask,
+        255 * mask.byte(),
+        mask.byte(),
+        mask.numpy().astype(np.float64),
+        tmp_path / "mask.png",
+    ):
         item = image_item(torch.rand(3, 40, 60), None, mask=form)
         assert torch.equal(item.mask, mask.float())
         assert item.box.tolist() == [19.5, 9.5, 49.5, 29.5]
     for mask, box, words in (
-        (torch.zeros(40, 60, dtype=torch.bool), None, "mask: no white pixel; expected the object white"),
+        (
+            torch.zeros(40, 60, dtype=torch.bool),
+            None,
+            "mask: no white pixel; expected the object white",
+        ),
         (torch.eye(40, 60), [50.0, 0.0, 58.0, 9.0], "mask: no white pixel in the box"),
-        (torch.ones(60, 40), None, r"mask: expected shape \(40, 60\), that of the photograph, got \(60, 40\)"),
+        (
+            torch.ones(60, 40),
+            None,
+            r"mask: expected shape \(40, 60\), that of the photograph, got \(60, 40\)",
+        ),
         (torch.ones(40, 60, dtype=torch.int64), None, "mask: expected bool, uint8 or floating"),
         (torch.full((40, 60), 255.0), None, "mask: expected values from 0 to 1"),
         ("no.png", None, "no.png: no such file"),
     ):
-        (result,) = truck_registrar()([torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask])
+        (result,) = truck_registrar()(
+            [torch.rand(3, 40, 60)], None if box is None else [box], masks=[mask]
+        )
         assert isinstance(result, FailedRegistration)
         with pytest.raises((InvalidInputError, FileNotFoundError), match=words):
             raise result.error
@@ -140,9 +180,15 @@ def test_masks_in_any_form_are_read_and_unusable_ones_named(tmp_path):
 def test_camera_is_scaled_to_each_photograph():
     ideal, photo, box, _, _ = distorted(RADIAL, 1)
     half = torch.nn.functional.avg_pool2d(photo[None], 2)[0]
-    items = image_items([photo, half, ideal], [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]], RADIAL)
+    items = image_items(
+        [photo, half, ideal],
+        [box.tolist(), ((box + 0.5) / 2 - 0.5).tolist(), [1, 1, 60, 60]],
+        RADIAL,
+    )
     point = torch.tensor([[0.4, 0.2, 1.0]]).double()
-    large, small = (project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1))
+    large, small = (
+        project_points(point, torch.eye(4).double(), items[i].camera_matrix) for i in (0, 1)
+    )
     torch.testing.assert_close((large + 0.5) / 2 - 0.5, small)
     torch.testing.assert_close((items[0].box + 0.5) / 2 - 0.5, items[1].box, atol=0.02, rtol=0)
     (error,) = image_items([photo[:, :90]], None, RADIAL)

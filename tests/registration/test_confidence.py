@@ -14,7 +14,14 @@ from curvireg_torch.registration.contour_fit import contour_support
 from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.registration.poses import RANK_ALONE, SCORE_WEIGHTS
 from curvireg_torch.synthetic import procedural_background
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar
+from tests._support.scenes import (
+    CAMERA,
+    SIZE,
+    learned_registrar,
+    scene,
+    truck_bank,
+    truck_registrar,
+)
 
 R30 = sample_views(azimuth_step=12, elevations=[0]).rotations
 
@@ -24,7 +31,8 @@ def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
 
 
 def test_concentration_in_closed_form():
-    """Two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of view 3."""
+    """Two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of
+    view 3."""
     near = confidence.are_near(R30, R30[3])
     assert near.nonzero()[:, 0].tolist() == [1, 2, 3, 4, 5]
     share = 1 + 0.9**4 + 3 * 0.1**4
@@ -40,10 +48,17 @@ def test_concentration_in_closed_form():
 
 def test_logistic_model_in_closed_form():
     model = confidence.LogisticModel({"similarity": 3.0, "margin": 0.5}, -2.0)
-    assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(1 / (1 + math.exp(-(2.1 + 1.0 - 2.0))))
+    assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(
+        1 / (1 + math.exp(-(2.1 + 1.0 - 2.0)))
+    )
     assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
-    assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, "bounded without a rival"
-    assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (1.0, 0.0)
+    assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, (
+        "bounded without a rival"
+    )
+    assert (confidence.LogisticModel({}, 1e4)({}), confidence.LogisticModel({}, -1e4)({})) == (
+        1.0,
+        0.0,
+    )
 
 
 def test_shares_are_equal_within_the_resolution_and_fall_with_the_slope_beyond(monkeypatch):
@@ -73,7 +88,13 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
     assert set(model["weights"]) == set(confidence.CONFIDENCE_FEATURES)
     assert all(model["weights"][name] >= 0.0 for name in confidence.EVIDENCE_FEATURES)
     assert all(model["weights"][name] <= 0.0 for name in confidence.DOUBT_FEATURES)
-    tied = {"similarity": 0.7, "margin": 0.0, "edge_support": 0.5, "concentration": 0.3, "landmarks": 1.0}
+    tied = {
+        "similarity": 0.7,
+        "margin": 0.0,
+        "edge_support": 0.5,
+        "concentration": 0.3,
+        "landmarks": 1.0,
+    }
     tied |= {"undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
     decisive = ("similarity", "edge_support") if exact else ("similarity",)
     for name in decisive:
@@ -84,12 +105,25 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 def test_confidence_features():
     evidence = torch.tensor(
-        [[0.0, 0.7, 0.4, 1.0, 2.0, 0.5], [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0], [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0]]
+        [
+            [0.0, 0.7, 0.4, 1.0, 2.0, 0.5],
+            [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0],
+            [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0],
+        ]
     ).double()
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
-    expected = {"similarity": 0.7, "margin": 2.5, "edge_support": 0.4, "concentration": 0.3, "landmarks": 2.0, **doubts}
-    assert confidence.confidence_features(evidence, scores, 0.3, **doubts) == pytest.approx(expected)
+    expected = {
+        "similarity": 0.7,
+        "margin": 2.5,
+        "edge_support": 0.4,
+        "concentration": 0.3,
+        "landmarks": 2.0,
+        **doubts,
+    }
+    assert confidence.confidence_features(evidence, scores, 0.3, **doubts) == pytest.approx(
+        expected
+    )
     for factor in (10.0, -10.0):
         margin = confidence.confidence_features(evidence, factor * scores, 0.3, **doubts)["margin"]
         assert margin == math.copysign(confidence.MAX_MARGIN, factor)
@@ -102,9 +136,12 @@ def test_undetermined_axes():
     covariance = torch.diag(variances)
     assert confidence.undetermined_axes(covariance) == pytest.approx(0.2 + 0.5 + 1.0)
     assert confidence.undetermined_axes(torch.full_like(covariance, torch.nan)) == 3.0
-    few, many = torch.eye(4).repeat(35, 1, 1), torch.eye(4).repeat(36, 1, 1)
+    few = torch.eye(4).repeat(35, 1, 1)
+    many = torch.eye(4).repeat(36, 1, 1)
     assert confidence.undetermined_axes(covariance, few) == pytest.approx(1.7)
-    assert confidence.undetermined_axes(covariance, many) == pytest.approx(0.7), "one axis need not be known"
+    assert confidence.undetermined_axes(covariance, many) == pytest.approx(0.7), (
+        "one axis need not be known"
+    )
     assert confidence.undetermined_axes(0.01 * covariance, many) == 0.0
 
 
@@ -123,7 +160,12 @@ def test_only_the_default_pipeline_is_calibrated():
 def test_uncalibrated_pipeline_gives_no_number():
     image, box, _ = scene(0)
     result = truck_registrar()([image], box[None], CAMERA)[0]
-    assert (result.confidence, result.none, result.probabilities, result.ambiguous) == (None, None, (), None)
+    assert (result.confidence, result.none, result.probabilities, result.ambiguous) == (
+        None,
+        None,
+        (),
+        None,
+    )
     assert not result.reliable
     assert result.covariance is None
     assert result.hypotheses[0].covariance is not None
@@ -134,15 +176,26 @@ def test_uncalibrated_pipeline_gives_no_number():
 @pytest.mark.parametrize(("seed", "camera"), [(0, CAMERA), (1, None)])
 def test_confidence_is_that_of_the_reported_features(seed, camera):
     image, box, _ = scene(seed)
-    registrar = learned_registrar() if camera is not None else Registrar(learned_registrar().bank, mesh_is="similar")
+    registrar = (
+        learned_registrar()
+        if camera is not None
+        else Registrar(learned_registrar().bank, mesh_is="similar")
+    )
     result = registrar([image], box[None], camera)[0]
     any_right = confidence.probability_of_any(result.confidence_features, exact=camera is not None)
     weights = SCORE_WEIGHTS if camera is not None else RANK_ALONE
-    scores = [sum(w * v for w, v in zip(weights, h.evidence.values(), strict=True)) for h in result.hypotheses]
-    expected = confidence.hypothesis_probabilities(any_right, torch.tensor(scores), exact=camera is not None)
+    scores = [
+        sum(w * v for w, v in zip(weights, h.evidence.values(), strict=True))
+        for h in result.hypotheses
+    ]
+    expected = confidence.hypothesis_probabilities(
+        any_right, torch.tensor(scores), exact=camera is not None
+    )
     assert result.probabilities == pytest.approx(expected, abs=1e-5)
     assert result.confidence_features["similarity"] == result.score
-    assert result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
+    assert (
+        result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
+    )
     assert len(result.probabilities) == len(result.hypotheses)
     assert sum(result.probabilities) + result.none == pytest.approx(1.0)
 
@@ -188,23 +241,33 @@ def test_evidence_is_measured_at_the_reported_pose(camera):
     for h in registrar([image], box[None], camera)[0].hypotheses:
         distance = torch.tensor([h.distance], dtype=torch.float64)
         view = describer.descriptors(h.allocentric_rotation[None], distance)
-        assert h.score == pytest.approx(float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5)
+        assert h.score == pytest.approx(
+            float(torch.nn.functional.cosine_similarity(view, query)), abs=1e-5
+        )
         T, K = h.projection
         assert h.distance == pytest.approx(float((T[:3, :3] @ describer.centre + T[:3, 3]).norm()))
         crops = EdgeCrops.cut([image], box[None], describer.settings.margin)
         support = contour_support(describer.contours, crops, K[None], T[None], torch.tensor([0]))
         assert h.edge_support == pytest.approx(float(support), abs=0.03)
-        assert (h.evidence["edge_support"], h.evidence["appearance"]) == (h.edge_support, 0.0)  # without that term
+        # without that term
+        assert (h.evidence["edge_support"], h.evidence["appearance"]) == (h.edge_support, 0.0)
 
 
 def test_symmetries_of_the_shape_count_for_an_exact_mesh_only():
     views = sample_views(azimuth_step=45, elevations=[20])
-    cuboid = ViewBank.build(trimesh.creation.box((1, 2, 3)), views, pipeline=PRESETS["classical"], progress=False)
+    cuboid = ViewBank.build(
+        trimesh.creation.box((1, 2, 3)), views, pipeline=PRESETS["classical"], progress=False
+    )
     assert len(Registrar(cuboid).symmetries_of(exact=True)) == 4
     assert Registrar(cuboid).symmetries_of(exact=False) is None
     assert len(Registrar(cuboid, symmetries=torch.eye(4)[None]).symmetries_of(exact=True)) == 1
-    result = Registrar(cuboid)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]), CAMERA)[0]
-    turned = torch.stack([h.rotation for h in result.hypotheses])[:, None] @ mesh_symmetries(cuboid.mesh)[:, :3, :3]
+    result = Registrar(cuboid)(torch.rand(1, 3, 48, 64), torch.tensor([[4.0, 4, 40, 30]]), CAMERA)[
+        0
+    ]
+    turned = (
+        torch.stack([h.rotation for h in result.hypotheses])[:, None]
+        @ mesh_symmetries(cuboid.mesh)[:, :3, :3]
+    )
     for h, hypothesis in enumerate(result.hypotheses):
         others = torch.cat([turned[:h], turned[h + 1 :]])
         assert not len(others) or float(rotation_error(hypothesis.rotation, others).min()) > 10

@@ -32,10 +32,12 @@ FIRST = torch.tensor([0])
 
 
 class ParabolicEdges:
-    """Edges of given heights at (E, P) distances in px along the normals: parabolas 1.5 px wide to both sides."""
+    """Edges of given heights at (E, P) distances in px along the normals: parabolas 1.5 px wide to
+    both sides."""
 
     def __init__(self, distances: Tensor, heights: list[float]) -> None:
-        self.distances, self.heights = distances, torch.tensor(heights, dtype=torch.float64)
+        self.distances = distances
+        self.heights = torch.tensor(heights, dtype=torch.float64)
 
     def strength(self, uv: Tensor, normals: Tensor, offsets: Tensor, image_index: Tensor) -> Tensor:
         apart = (offsets - self.distances[:, :, None]) / 1.5
@@ -54,7 +56,9 @@ def problem(distances: Tensor, heights: list[float]) -> ContourProblem:
 def state(count: int, valid: int | None = None) -> ContourState:
     generator = torch.Generator().manual_seed(0)
     model = CENTRE + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
-    normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
+    normals = F.normalize(
+        torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
+    )
     mask = torch.arange(count)[None] < (count if valid is None else valid)
     return ContourState(T, T, ContourPoints(model, normals, mask, mask))
 
@@ -67,29 +71,39 @@ def twist_of(one: ContourProblem, points: ContourPoints, radius: float) -> Tenso
     """(6,) by which a step moves the pose, to first order."""
     moved = one.step(points, T, radius)
     turn = moved[0, :3, :3] @ T[0, :3, :3].T
-    w = 0.5 * torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    w = 0.5 * torch.stack(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
     shift = (moved[0, :3, :3] @ CENTRE + moved[0, :3, 3]) - (T[0, :3, :3] @ CENTRE + T[0, :3, 3])
     return torch.cat([w, shift])
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_edges_are_measured_to_a_fraction_of_a_pixel(side):
-    measured = problem(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).measured_edges(state(9, valid=7), 4.0)
-    torch.testing.assert_close(measured.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64))
+    measured = problem(at(9, 1.2 * side, -2.0 * side), [0.5, 0.6]).measured_edges(
+        state(9, valid=7), 4.0
+    )
+    torch.testing.assert_close(
+        measured.distance[0, :7, 0], torch.full((7,), 1.2 * side, dtype=torch.float64)
+    )
     strength = 0.5 * (1.0 - (0.2 / 1.5) ** 2)  # at the nearest whole pixel
     tukey = (1.0 - (1.2 / 4.0) ** 2) ** 2
     assert measured.weight[0, :, 0].tolist() == pytest.approx([strength * tukey] * 7 + [0.0] * 2)
 
 
 def test_edge_support_is_the_mean_strength_near_valid_points():
-    half, beside = torch.tensor([[0.0, 50.0] * 4]).double(), 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)
+    half = torch.tensor([[0.0, 50.0] * 4]).double()
+    beside = 0.7 * (1 - 1 / 2.25) * math.exp(-2.0)
     cases = (at(8, 0.0), 4, 0.7), (at(8, -3.0), 4, beside), (half, 4, 0.35), (half, 0, 0.0)
     for distances, valid, expected in cases:
-        assert float(problem(distances, [0.7]).edge_support(state(8, valid=valid))) == pytest.approx(expected)
+        assert float(
+            problem(distances, [0.7]).edge_support(state(8, valid=valid))
+        ) == pytest.approx(expected)
 
 
 def test_step_undoes_a_motion_despite_stronger_wrong_edges():
-    """Edges at the points of the moved object, and for every third point a stronger one 4 px beside it."""
+    """Edges at the points of the moved object, and for every third point a stronger one 4 px beside
+    it."""
     points = state(120).points
     motion = torch.tensor([0.006, -0.008, 0.01, 0.01, -0.015, 0.06], dtype=torch.float64)
     distance = project(points.model, points.normals, T, K[None], CENTRE)[1] @ motion
@@ -105,7 +119,8 @@ def test_edge_strength_peaks_on_a_slanted_edge():
     n = torch.tensor([[[0.8, 0.6]]], dtype=torch.float64)
     image = torch.sigmoid(4 * (0.8 * x + 0.6 * y - 44.0))[None, None]
     here = torch.tensor([[[32.0, 31.0]]], dtype=torch.float64)  # 0.2 px from the edge
-    edges, offsets = EdgeField(image), torch.arange(-5, 6, dtype=torch.float64)
+    edges = EdgeField(image)
+    offsets = torch.arange(-5, 6, dtype=torch.float64)
     across = edges.strength(here, n, offsets, FIRST)[0, 0]
     assert int(across.argmax()) == 5
     assert float(across[0]) < 0.1 * float(across[5])
@@ -118,7 +133,9 @@ def test_edge_strength_peaks_on_a_slanted_edge():
 def test_edge_strength_falls_with_the_fifth_power_of_the_cosine_in_the_strongest_channel(sign):
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
     ramp = sign * torch.tensor([0.004, 0.01, -0.005])[:, None, None] * (0.8 * x + 0.6 * y)
-    angles = math.atan2(0.6, 0.8) + torch.tensor([0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi], dtype=torch.float64)
+    angles = math.atan2(0.6, 0.8) + torch.tensor(
+        [0.0, 0.3, -0.6, 1.0, math.pi / 2, math.pi], dtype=torch.float64
+    )
     n = torch.stack([angles.cos(), angles.sin()], dim=-1)[None]
     here = torch.tensor([31.5, 30.2]).double().expand(1, 6, 2)
     strength = EdgeField(ramp[None]).strength(here, n, torch.zeros(1), FIRST)[0, :, 0].double()
@@ -133,13 +150,21 @@ def test_edges_outside_the_photograph_do_not_count():
     inside[..., :32] = 1.0
     edges = EdgeField(torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0)), inside)
     uv = torch.tensor([[[10.0, 20.0], [12.0, 40.0], [50.0, 20.0]]], dtype=torch.float64)
-    n, valid = torch.tensor([1.0, 0.0]).double().expand(1, 3, 2), torch.ones(1, 3, dtype=torch.bool)
-    assert (edges.strength(uv, n, torch.zeros(1).double(), FIRST)[0, :, 0] > 0).tolist() == [True, True, False]
+    n = torch.tensor([1.0, 0.0]).double().expand(1, 3, 2)
+    valid = torch.ones(1, 3, dtype=torch.bool)
+    assert (edges.strength(uv, n, torch.zeros(1).double(), FIRST)[0, :, 0] > 0).tolist() == [
+        True,
+        True,
+        False,
+    ]
     assert edges.counts(uv, valid, FIRST).tolist() == [[True, True, False]]
-    few = uv.index_fill(1, torch.tensor([1]), 50.0)  # with less than half of the points inside, all count
+    # with less than half of the points inside, all count
+    few = uv.index_fill(1, torch.tensor([1]), 50.0)
     assert edges.counts(few, valid, FIRST).tolist() == [[True, True, True]]
     # A box whose right half lies beyond the border of a photograph 20 px wide.
-    inside = inside_photographs([torch.zeros(3, 40, 20)], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0)
+    inside = inside_photographs(
+        [torch.zeros(3, 40, 20)], torch.tensor([[9.5, 9.5, 29.5, 29.5]]), 40, 0.0
+    )
     assert bool(inside[0, 0, :, :20].all())
     assert float(inside[0, 0, :, 21:].max()) == 0.0
 
@@ -153,19 +178,31 @@ def half_planes(*columns: int) -> ObjectMask:
 def row_of_points(outline: bool, direction: float, *, count: int = 1) -> ContourPoints:
     normals = torch.tensor([direction, 0.0], dtype=torch.float64).expand(count, 1, 2)
     there = torch.ones(count, 1, dtype=torch.bool)
-    return ContourPoints(torch.zeros(count, 1, 3, dtype=torch.float64), normals, there, there & outline)
+    return ContourPoints(
+        torch.zeros(count, 1, 3, dtype=torch.float64), normals, there, there & outline
+    )
 
 
 def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose():
     """At 20 px to the left of the border, on it, and at 20 px to the right."""
-    uv, offsets = torch.tensor([[[127.5, 90.0]]]).double(), torch.tensor([-20.0, 0.0, 20.0]).double()
-    outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])  # at the second the object lies outside
-    for outline, direction, expected in (*outlines, (False, 1.0, [1.0, 0.3, 0.3]), (False, -1.0, [0.3, 0.3, 1.0])):
-        weights = half_planes(128).weights(uv, row_of_points(outline, direction), offsets, FIRST, 256)
+    uv = torch.tensor([[[127.5, 90.0]]]).double()
+    offsets = torch.tensor([-20.0, 0.0, 20.0]).double()
+    # at the second the object lies outside
+    outlines = (True, 1.0, [0.6, 2.0, 0.6]), (True, -1.0, [0.6, 0.6, 0.6])
+    for outline, direction, expected in (
+        *outlines,
+        (False, 1.0, [1.0, 0.3, 0.3]),
+        (False, -1.0, [0.3, 0.3, 1.0]),
+    ):
+        weights = half_planes(128).weights(
+            uv, row_of_points(outline, direction), offsets, FIRST, 256
+        )
         assert weights[0, 0].tolist() == pytest.approx(expected)
-    # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both sides there.
+    # Borders at 128 and 64 of 256 px are at 64 and 32 of 128 px; the mask is read 3 px to both
+    # sides there.
     uv = torch.tensor([[[31.5, 50.0]], [[63.5, 50.0]], [[31.5, 50.0]]], dtype=torch.float64)
-    here, index = torch.zeros(1, dtype=torch.float64), torch.tensor([0, 0, 1])
+    here = torch.zeros(1, dtype=torch.float64)
+    index = torch.tensor([0, 0, 1])
     found = half_planes(128, 64).weights(uv, row_of_points(True, 1.0, count=3), here, index, 128)
     assert found.flatten().tolist() == pytest.approx([0.6, 2.0, 2.0])
     off = torch.tensor([-2.4, 2.4, -3.6, 3.6], dtype=torch.float64)
@@ -174,30 +211,42 @@ def test_mask_weights_within_at_the_border_and_beyond_in_the_crop_of_each_pose()
 
 
 def test_mask_weights_steps_and_comparison_and_not_the_reported_support():
-    """For two points of three the edge at 3 px is wrong; the mask gives it a tenth of the weight of the others."""
+    """For two points of three the edge at 3 px is wrong; the mask gives it a tenth of the weight of
+    the others."""
     wrong = torch.arange(120) % 3 > 0
     plain = problem(torch.where(wrong, 3.0, 0.0).double()[None], [0.6])
     weights = torch.where(wrong, 0.1, 1.5).double()[None]
-    mask: Any = SimpleNamespace(weights=lambda *_: weights[..., None], largest_weights=lambda _: 2.0 * weights)
+    mask: Any = SimpleNamespace(
+        weights=lambda *_: weights[..., None], largest_weights=lambda _: 2.0 * weights
+    )
     weighted = replace(plain, mask=mask)
     points = state(120)
     steps = [float(twist_of(one, points.points, 6.0).norm()) for one in (plain, weighted)]
     assert steps[1] < 0.2 * steps[0]
-    torch.testing.assert_close(weighted.measured_edges(points, 4.0).weight, plain.measured_edges(points, 4.0).weight)
+    torch.testing.assert_close(
+        weighted.measured_edges(points, 4.0).weight, plain.measured_edges(points, 4.0).weight
+    )
     assert float(weighted.edge_support(points)) == float(plain.edge_support(points))
     # Of the edges at 3 px, the flank at 2 px counts most.
-    by_hand = 0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / (2 * (40 * 1.5 + 80 * 0.1))
+    by_hand = (
+        0.6 * (40 * 1.5 + 80 * 0.1 * (1 - 1 / 2.25) * math.exp(-2.0)) / (2 * (40 * 1.5 + 80 * 0.1))
+    )
     assert float(weighted.supports(points)[1]) == pytest.approx(by_hand)
     assert float(plain.supports(points)[1]) == float(plain.edge_support(points))
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_fit_recovers_a_pose_three_degrees_and_three_per_cent_off(seed):
-    mesh, generator = example_mesh(), torch.Generator().manual_seed(seed)
-    size, camera = (360, 480), camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
+    mesh = example_mesh()
+    generator = torch.Generator().manual_seed(seed)
+    size = (360, 480)
+    camera = camera_matrix(600.0, 600.0, 239.5, 179.5, dtype=torch.float64)
     truth = random_pose(mesh, camera, size, generator, elevations=(10.0, 50.0))
-    black = torch.zeros(3, *size)  # darker than any shade of the object: its outline shows all around
-    image, box = synthesize_photograph(mesh, truth, camera, size, generator, background=black, texture=0.0)
+    # darker than any shade of the object: its outline shows all around
+    black = torch.zeros(3, *size)
+    image, box = synthesize_photograph(
+        mesh, truth, camera, size, generator, background=black, texture=0.0
+    )
     axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
     off = torch.cat([math.radians(3.0) * axis, 0.03 * truth[2, 3] * torch.tensor([0.1, 0.1, 0.99])])
     start = apply_twist(truth[None], off[None], mesh_centre(mesh))
@@ -228,7 +277,11 @@ def test_fit_begins_from_rotations_of_the_start_too(degrees):
 def test_fit_without_edges_returns_the_start():
     """In one colour, outside the crop, and behind the camera."""
     plain = torch.full((3, 128, 128), 0.4)
-    for image, position in ((plain, [0.0, 0.0, 8.0]), (noise(), [9.0, 0.0, 8.0]), (noise(), [0.0, 0.0, -8.0])):
+    for image, position in (
+        (plain, [0.0, 0.0, 8.0]),
+        (noise(), [9.0, 0.0, 8.0]),
+        (noise(), [0.0, 0.0, -8.0]),
+    ):
         start = pose([0.4, 0.5, 0.1], position)[None]
         fit = fitted(image, start)
         assert fit.transform.equal(start)
@@ -237,9 +290,13 @@ def test_fit_without_edges_returns_the_start():
 
 
 def several() -> tuple[list[Tensor], Tensor, Tensor, Tensor, Tensor]:
-    """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and one, shuffled."""
+    """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and
+    one, shuffled."""
     generator = torch.Generator().manual_seed(0)
-    images, boxes, cameras, starts = [], [], [], []
+    images = []
+    boxes = []
+    cameras = []
+    starts = []
     for i, size in enumerate([(100, 128), (128, 96), (120, 120)]):
         camera = camera_matrix(300.0 + 20 * i, 300.0, size[1] / 2, size[0] / 2, dtype=torch.float64)
         truth = random_pose(cube(), camera, size, generator)
@@ -247,8 +304,15 @@ def several() -> tuple[list[Tensor], Tensor, Tensor, Tensor, Tensor]:
         images.append((255 * image).round().byte())
         boxes.append(box)
         cameras.append(camera)
-        off = torch.tensor([[0.05, -0.03, 0.02, 0.0, 0.0, 0.05], [0.0, 0.4, 0.0, 0.0, 0.05, 0.0]], dtype=torch.float64)
-        starts.append(apply_twist(truth.repeat(2, 1, 1), off, torch.zeros(3, dtype=torch.float64))[: 2 - i // 2])
+        off = torch.tensor(
+            [[0.05, -0.03, 0.02, 0.0, 0.0, 0.05], [0.0, 0.4, 0.0, 0.0, 0.05, 0.0]],
+            dtype=torch.float64,
+        )
+        starts.append(
+            apply_twist(truth.repeat(2, 1, 1), off, torch.zeros(3, dtype=torch.float64))[
+                : 2 - i // 2
+            ]
+        )
     order = torch.tensor([3, 0, 4, 1, 2])
     return images, torch.stack(boxes), torch.stack(cameras), torch.cat(starts)[order], (order // 2)
 
@@ -258,22 +322,34 @@ def test_fits_of_a_batch_equal_single_fits():
     contours = MeshContours(cube())
     fit = fit_contours(contours, images, boxes, cameras, starts, image_index=image_index)
     for i, b in enumerate(image_index.tolist()):
-        alone = fit_contours(contours, images[b].float() / 255, boxes[b], cameras[b], starts[i : i + 1])
+        alone = fit_contours(
+            contours, images[b].float() / 255, boxes[b], cameras[b], starts[i : i + 1]
+        )
         assert not alone.transform[0].equal(starts[i])
-        # Crops are float32: the last bit depends on threads and vectors, which moves a fit of many steps by some 1e-7,
-        # and a point across the border of a covariance cell, worth 0.3 % of it. A round that is shared by mistake moves
-        # poses by 1e-2 and support by 1e-3.
-        tolerances = {"transform": 1e-4, "edge_support": 1e-4, "covariance": 0.02 * alone.covariance.max()}
+        # Crops are float32: the last bit depends on threads and vectors, which moves a fit of many
+        # steps by some 1e-7, and a point across the border of a covariance cell, worth 0.3 % of it.
+        # A round that is shared by mistake moves poses by 1e-2 and support by 1e-3.
+        tolerances = {
+            "transform": 1e-4,
+            "edge_support": 1e-4,
+            "covariance": 0.02 * alone.covariance.max(),
+        }
         for name, atol in tolerances.items():
-            torch.testing.assert_close(getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=atol)
+            torch.testing.assert_close(
+                getattr(fit, name)[i], getattr(alone, name)[0], rtol=0, atol=atol
+            )
 
 
 def test_fit_finishes_the_best_starts_of_each_photograph():
     images, boxes, cameras, starts, image_index = several()
     off = torch.tensor([0.6, 0.5, 0.7, 0.0, 0.0, 0.4], dtype=torch.float64).expand(5, 6)
     both = torch.cat([apply_twist(starts, off, mesh_centre(cube())), starts])
-    index, contours = torch.cat([image_index, image_index]), MeshContours(cube())
-    whole, one = (fit_contours(contours, images, boxes, cameras, both, image_index=index, finish=n) for n in (None, 1))
+    index = torch.cat([image_index, image_index])
+    contours = MeshContours(cube())
+    whole, one = (
+        fit_contours(contours, images, boxes, cameras, both, image_index=index, finish=n)
+        for n in (None, 1)
+    )
     same = (one.transform - whole.transform).abs().amax(dim=(1, 2)) < 1e-9
     assert torch.bincount(index[same], minlength=3).tolist() == [1, 1, 1]
     for b in range(3):
@@ -283,14 +359,23 @@ def test_fit_finishes_the_best_starts_of_each_photograph():
 
 def test_start_support_is_at_full_size_and_trustworthy_depends_on_support_or_gain():
     off = torch.tensor([[0.1, 0.1, 0.0, 0.05, 0.0, 0.1]], dtype=torch.float64)
-    start, image = apply_twist(CUBE_POSE[None], off, mesh_centre(cube())), silhouette(cube(), CUBE_POSE)
-    expected = contour_support(MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST)
+    start = apply_twist(CUBE_POSE[None], off, mesh_centre(cube()))
+    image = silhouette(cube(), CUBE_POSE)
+    expected = contour_support(
+        MeshContours(cube()), EdgeCrops.cut([image], BOX[None], 0.1), K[None], start, FIRST
+    )
     fit = fitted(image, start)
     torch.testing.assert_close(fit.start_support, expected)
     assert bool(fit.trustworthy)
     assert not bool(fitted(noise(), start).trustworthy)
-    none, supports = torch.zeros(4), (torch.tensor([0.51, 0.49, 0.35, 0.25]), torch.tensor([0.49, 0.45, 0.1, 0.1]))
-    assert ContourFit(none, none, *supports, none).trustworthy.tolist() == [True, False, True, False]
+    none = torch.zeros(4)
+    supports = (torch.tensor([0.51, 0.49, 0.35, 0.25]), torch.tensor([0.49, 0.45, 0.1, 0.1]))
+    assert ContourFit(none, none, *supports, none).trustworthy.tolist() == [
+        True,
+        False,
+        True,
+        False,
+    ]
 
 
 def test_fit_rejects_bad_input():
@@ -306,18 +391,27 @@ def test_fit_rejects_bad_input():
 
 
 def test_a_quick_fit_reaches_far_and_counts_the_mask():
-    """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size does not reach."""
-    image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
+    """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size
+    does not reach."""
+    image = silhouette(cube(), CUBE_POSE)
+    contours = MeshContours(cube())
     crops = EdgeCrops.cut([image], BOX[None], 0.1)
     crop = ContourProblem.of(contours, crops, K[None])
-    focal, depth = float(crop.K[0, 0, 0]), float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
+    focal = float(crop.K[0, 0, 0])
+    depth = float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
     beside = CUBE_POSE.clone()
     beside[0, 3] += 28.0 / focal * depth
-    right, far = quick_fit(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside]))[1].tolist()
+    right, far = quick_fit(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside]))[
+        1
+    ].tolist()
     assert far > 0.95 * right
     inside = crop_regions([image], BOX[None, None], size=64, margin=0.1)[0, :, :1].clamp(0, 1)
     with_mask, against = (
-        float(quick_fit(contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None])[1])
+        float(
+            quick_fit(
+                contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None]
+            )[1]
+        )
         for mask in (inside, 1.0 - inside)
     )
     assert with_mask > 1.5 * against
@@ -325,9 +419,12 @@ def test_a_quick_fit_reaches_far_and_counts_the_mask():
 
 def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
     """A pose that is fitted again moves only if fits around it end elsewhere."""
-    image, contours = silhouette(cube(), CUBE_POSE), MeshContours(cube())
+    image = silhouette(cube(), CUBE_POSE)
+    contours = MeshContours(cube())
     crops = EdgeCrops.cut([image], BOX[None], 0.1)
-    starts = apply_twist(CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(torch.eye(6).double()[:2] * 6), contours.centre)
+    starts = apply_twist(
+        CUBE_POSE.repeat(2, 1, 1), torch.deg2rad(torch.eye(6).double()[:2] * 6), contours.centre
+    )
     problem = contours, crops, K.expand(2, 3, 3)
     first = fit_to_edges(*problem, starts, FIRST.repeat(2))
     known = fit_to_edges(*problem, starts, FIRST.repeat(2), quick=quick_fit(*problem, starts)[0])
@@ -340,8 +437,11 @@ def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
 
 
 def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(monkeypatch):
-    angles, turned = [], contour_fit._turned
-    monkeypatch.setattr(contour_fit, "_turned", lambda T, c, a, **k: angles.append(tuple(a)) or turned(T, c, a, **k))
+    angles = []
+    turned = contour_fit._turned
+    monkeypatch.setattr(
+        contour_fit, "_turned", lambda T, c, a, **k: angles.append(tuple(a)) or turned(T, c, a, **k)
+    )
     crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
     for again in (False, True):
         problem = MeshContours(cube()), crops, K[None], CUBE_POSE[None], FIRST

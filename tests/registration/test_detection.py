@@ -11,7 +11,13 @@ import torch.nn.functional as F
 
 import curvireg_torch as cr
 from curvireg_torch.errors import InvalidInputError, LostObjectError
-from curvireg_torch.geometry import PosePrior, box_iou, projected_boxes, rotation_error, viewpoint_from_rotation
+from curvireg_torch.geometry import (
+    PosePrior,
+    box_iou,
+    projected_boxes,
+    rotation_error,
+    viewpoint_from_rotation,
+)
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
@@ -37,7 +43,8 @@ def detector():
 
 
 def pasted_scene(seed, corner, scale):
-    """The scene's truck with its background, pasted into other clutter: image (3, H, W) and box (4,)."""
+    """The scene's truck with its background, pasted into other clutter: image (3, H, W) and box
+    (4,)."""
     image, box, _ = scene(seed)
     small = F.interpolate(image[None], scale_factor=scale, mode="bilinear", antialias=True)[0]
     canvas = clutter(100 + seed)
@@ -65,14 +72,17 @@ def found(registrar):
 
 def fixed(boxes, responses):
     """A detector that always proposes the same boxes."""
-    return lambda *_, **__: Proposals(boxes, torch.tensor(responses), torch.zeros(len(boxes), dtype=torch.long))
+    return lambda *_, **__: Proposals(
+        boxes, torch.tensor(responses), torch.zeros(len(boxes), dtype=torch.long)
+    )
 
 
 @pytest.mark.parametrize(("seed", "corner", "scale"), [(5, (30, 60), 0.6), (7, (40, 10), 1.1)])
 def test_detected_pose_is_the_true_one(seed, corner, scale):
     """Pasted elsewhere at another scale; the camera of the scene is transformed accordingly."""
     image, box = pasted_scene(seed, corner, scale)
-    K, truth = CAMERA.clone(), scene(seed)[2]
+    K = CAMERA.clone()
+    truth = scene(seed)[2]
     K[:2, :2] *= scale
     K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5 + torch.tensor(corner)
     result = cr.Registrar(bank())([image], camera_matrices=K)[0]
@@ -86,7 +96,9 @@ def test_detection_with_camera_and_distance(registrar):
     result = registrar([image], camera_matrices=CAMERA)[0]
     assert (result.translation - truth[:3, 3]).norm() < 0.25 * truth[:3, 3].norm()
     far = float(truth[2, 3])
-    within = registrar([image], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(0.8 * far, 1.2 * far)))[0]
+    within = registrar(
+        [image], camera_matrices=CAMERA, prior=cr.PosePrior(distance=(0.8 * far, 1.2 * far))
+    )[0]
     assert 0.75 * far < float(within.translation[2]) < 1.3 * far
 
 
@@ -137,7 +149,9 @@ def test_the_most_certain_of_all_proposals_is_reported(registrar, found, monkeyp
 
 def as_found(result, **changes):
     where = result.detection
-    return replace(detection_module.Found(result, where.box, where.response, None, where.score), **changes)
+    return replace(
+        detection_module.Found(result, where.box, where.response, None, where.score), **changes
+    )
 
 
 def test_probabilities_are_those_of_a_right_box_times_its_score(found):
@@ -160,7 +174,11 @@ def test_an_object_at_no_convincing_place_is_lost(registrar, found, monkeypatch,
         assert len(result.error.with_subject("photo.jpg").detection.boxes) > 1
         assert isinstance(result.error, LostObjectError)
         place = corners(one.box.tolist())
-        message = f"at the most likely place, box {place}, the object is seen with a probability of 0.09; give a box"
+        message = (
+            f"at the most likely place, box {place}, the object is seen with a probability "
+            f"of "
+            f"0.09; give a box"
+        )
         assert str(result.error) == f"image 0: not found: {message}"
 
 
@@ -169,10 +187,16 @@ def test_bad_distances_raise(registrar, found):
     for boxes in (None, [[4.0, 4.0, 40.0, 40.0]]):
         (result,) = similar([found[0]], boxes, prior=cr.PosePrior(distance=(1.0, 2.0)))
         assert "distance: with a similar mesh, needs the camera" in str(result.error)
-    near, far = cr.PosePrior(distance=(1e-3, 2e-3)), cr.PosePrior(distance=(500.0, 900.0))
+    near = cr.PosePrior(distance=(1e-3, 2e-3))
+    far = cr.PosePrior(distance=(500.0, 900.0))
     for boxes, prior, message in (
         (None, far, "nothing of such a size fits"),
-        (None, near, "distance: at most 0.002 from the centre, the camera is inside the object, whose radius is 0.176"),
+        (
+            None,
+            near,
+            "distance: at most 0.002 from the centre, the camera is inside the object, whose "
+            "radius is 0.176",
+        ),
         ([[4.0, 4.0, 40.0, 40.0]], near, "distance: at most 0.002 from the centre"),
     ):
         with pytest.raises(InvalidInputError, match=f"image 0: {message}"):
@@ -180,7 +204,8 @@ def test_bad_distances_raise(registrar, found):
 
 
 def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registrar, monkeypatch):
-    """In a wide camera: the hint holds at the truck, and nowhere at the other proposals, which come first."""
+    """In a wide camera: the hint holds at the truck, and nowhere at the other proposals, which come
+    first."""
     image, box = pasted_scene(5, (200, 120), 0.45)
     K = cr.camera_matrix(150.0, 150.0, 159.5, 119.5, dtype=torch.float64)
     alone = registrar([image], box[None], K)[0]
@@ -193,12 +218,17 @@ def test_right_hint_that_leaves_no_view_at_some_proposals_does_not_fail(registra
 
 
 def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, found, monkeypatch):
-    image, azimuth = found[0], 200.0
+    image = found[0]
+    azimuth = 200.0
     prior = PosePrior(azimuth=(azimuth - 20, azimuth + 20))
     monkeypatch.setattr(registrar, "mesh_is", "similar")
     result = registrar([image], prior=prior)[0]
-    allowed = _allowed_views(registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior))
-    assert sorted(viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()) == [180.0, 210.0]
+    allowed = _allowed_views(
+        registrar, ImageItem(image, torch.tensor([0.0, 0.0, 9.0, 9.0]), None, prior)
+    )
+    assert sorted(
+        viewpoint_from_rotation(bank().rotations[allowed])[0].round().unique().tolist()
+    ) == [180.0, 210.0]
     located = registrar.detector(image, allowed=allowed)
     assert bool(allowed[located.views].all()), "each view of this small bank is its own template"
     assert set(result.detection.responses.tolist()) <= set(located.responses.tolist())
@@ -209,33 +239,44 @@ def test_detector_does_not_compare_views_that_the_prior_excludes(registrar, foun
 
 def test_allowed_views_are_those_of_any_place_in_the_photograph(registrar):
     """Half of the diagonal is 30 degrees wide; 7.5 more are the spacing of views."""
-    image, prior = scene(0)[0], PosePrior(rotation=bank().rotations[0], within=1.0)
+    image = scene(0)[0]
+    prior = PosePrior(rotation=bank().rotations[0], within=1.0)
     item = ImageItem(image, torch.tensor([-0.5, -0.5, 239.5, 179.5]), CAMERA, prior)
     degrees = rotation_error(bank().rotations, bank().rotations[0])
     half = math.degrees(math.atan(150 / 260))
     assert torch.equal(_allowed_views(registrar, item), degrees <= 8.5 + half)
     unknown = replace(item, camera_matrix=None)
-    assert torch.equal(_allowed_views(cr.Registrar(bank(), mesh_is="similar"), unknown), degrees <= 8.5)
+    assert torch.equal(
+        _allowed_views(cr.Registrar(bank(), mesh_is="similar"), unknown), degrees <= 8.5
+    )
     usual = math.degrees(math.atan(150 / (0.8 * 240)))
-    assert torch.equal(_allowed_views(registrar, unknown), degrees <= 8.5 + usual), "an unknown camera is a usual one"
+    assert torch.equal(_allowed_views(registrar, unknown), degrees <= 8.5 + usual), (
+        "an unknown camera is a usual one"
+    )
 
 
-@pytest.mark.parametrize(("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)])
+@pytest.mark.parametrize(
+    ("seed", "corner", "scale"), [(0, (10, 20), 0.8), (1, (100, 30), 0.8), (3, (40, 10), 1.1)]
+)
 def test_detector_finds_the_object(seed, corner, scale):
     image, box = pasted_scene(seed, corner, scale)
     located = detector()(image)
     assert box_iou(located.boxes, box[None])[:2].max() > 0.6
     assert located.responses.diff().max() <= 0
     assert (len(located.boxes), located.boxes.dtype) == (20, torch.float32)
-    assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), "boxes are distinct"
+    assert (box_iou(located.boxes, located.boxes) > 0.5).sum() == len(located.boxes), (
+        "boxes are distinct"
+    )
 
 
 def test_distance_limits_each_box_by_its_view():
     """To half a step of sizes, and what rounding a size to cells of 16 px adds."""
     image, _, T = scene(1)
-    low, high = 0.95 * float(T[2, 3]), 1.05 * float(T[2, 3])
+    low = 0.95 * float(T[2, 3])
+    high = 1.05 * float(T[2, 3])
     located = detector()(image, focal=FOCAL, distance=(low, high))
-    boxes, views = bank().boxes[located.views], located.views
+    boxes = bank().boxes[located.views]
+    views = located.views
     sides = (boxes[:, 2:] - boxes[:, :2]).amax(dim=1) * bank().distances[views]
     away = sides * FOCAL / (located.boxes[:, 2:] - located.boxes[:, :2]).amax(dim=1)
     assert len(away) > 5
@@ -251,13 +292,17 @@ def test_detector_rejects_bad_distances_images_and_settings():
         detector()(torch.rand(3, 60, 80), distance=(1.0, 2.0))
     with pytest.raises(InvalidInputError, match="images: expected"):
         detector()(torch.rand(2, 60, 80))
-    for settings, message in (({"min_size": 0.0}, "min_size"), ({"views": 0}, "views and proposals")):
+    for settings, message in (
+        ({"min_size": 0.0}, "min_size"),
+        ({"views": 0}, "views and proposals"),
+    ):
         with pytest.raises(InvalidInputError, match=message):
             cr.pipeline.DetectionSettings(**settings)
 
 
 def test_boxes_of_peaks_are_exact():
-    """The box of a peak is that of the view's projected hull, scaled and shifted with the template."""
+    """The box of a peak is that of the view's projected hull, scaled and shifted with the
+    template."""
     views = detector()._views
     describer = ViewDescriber(example_mesh(), replace(bank().settings, image_size=96))
     T, K, _ = describer.cameras(bank().rotations[views], bank().distances[views])
@@ -273,9 +318,12 @@ def test_boxes_of_peaks_are_exact():
         assert int(best.views[0]) == int(views[k])
 
 
-@pytest.mark.parametrize(("shape", "least"), [((60, 80), 32.0), ((20, 24), 24.0), ((900, 1200), None)])
+@pytest.mark.parametrize(
+    ("shape", "least"), [((60, 80), 32.0), ((20, 24), 24.0), ((900, 1200), None)]
+)
 def test_smallest_size(shape, least):
-    """32 px in small photographs, at most the whole photograph; a fraction of the longer side in large ones."""
+    """32 px in small photographs, at most the whole photograph; a fraction of the longer side in
+    large ones."""
     least = 1200 * detector().settings.min_size if least is None else least
     scales = detector()._scales(torch.zeros(3, *shape), None, None, 80.0)
     assert 80.0 / max(scales) == pytest.approx(least)
@@ -300,8 +348,11 @@ def test_an_object_replaces_those_that_it_overlaps_if_it_is_more_certain_than_ea
 
 
 @pytest.mark.parametrize(("gain", "kept"), [(-0.01, True), (0.01, False)])
-def test_box_around_the_pose_is_registered_where_it_is_more_certain(registrar, found, monkeypatch, gain, kept):
-    one, other = as_found(found[2]), as_found(found[2])
+def test_box_around_the_pose_is_registered_where_it_is_more_certain(
+    registrar, found, monkeypatch, gain, kept
+):
+    one = as_found(found[2])
+    other = as_found(found[2])
     again = SimpleNamespace(score=one.score + gain, register=lambda *_: other)
     monkeypatch.setattr(Candidate, "compared", lambda *_, **__: again)
     best = detection_module._refined(registrar, ImageItem(found[0], found[1], None), one)
@@ -313,7 +364,8 @@ def test_scores_are_relative_to_the_view_elsewhere_in_the_photograph():
     generator = torch.Generator().manual_seed(3)
     K = len(detector()._views)
     maps = [0.1 * torch.rand(K, *size, generator=generator) for size in ((15, 20), (21, 28))]
-    fits, ratios = [torch.ones(K, dtype=torch.bool)] * 2, [(1.0, 1.0), (1.4, 1.4)]
+    fits = [torch.ones(K, dtype=torch.bool)] * 2
+    ratios = [(1.0, 1.0), (1.4, 1.4)]
     gain, level = 0.5 + torch.rand(2, K, 1, 1, generator=generator)
     plain = detector()._peaks(maps, fits, ratios)
     biased = detector()._peaks([gain * m + level for m in maps], fits, ratios)

@@ -24,15 +24,21 @@ def near_scene():
     """image, box and true pose of the object of scene 0, at a distance of three radii."""
     T = scene(0)[2].clone()
     centre = truck_registrar().describer.centre
-    T[:3, 3] += torch.tensor([0.0, 0.0, 3.0 * truck_registrar().describer.radius]) - (T[:3, :3] @ centre + T[:3, 3])
-    image, box = synthesize_photograph(example_mesh(), T, NEAR, SIZE, torch.Generator().manual_seed(5))
+    T[:3, 3] += torch.tensor([0.0, 0.0, 3.0 * truck_registrar().describer.radius]) - (
+        T[:3, :3] @ centre + T[:3, 3]
+    )
+    image, box = synthesize_photograph(
+        example_mesh(), T, NEAR, SIZE, torch.Generator().manual_seed(5)
+    )
     return image, box, T
 
 
 def fitting_problem(image, box, K, factor=1):
     describer = truck_registrar().describer
     crops = EdgeCrops.cut([image], box[None], 0.1)
-    return ContourProblem.of(describer.contours, crops, K[None], torch.zeros(1, dtype=torch.long), factor=factor)
+    return ContourProblem.of(
+        describer.contours, crops, K[None], torch.zeros(1, dtype=torch.long), factor=factor
+    )
 
 
 def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
@@ -47,7 +53,9 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
         [0, 150.0 * zoom.exp().item(), 89.5],
         [0, 0, 1],
     ]
-    before, after = (projected(centre[None], pose, K)[0] for pose, K in ((T, NEAR[None]), (moved, longer)))
+    before, after = (
+        projected(centre[None], pose, K)[0] for pose, K in ((T, NEAR[None]), (moved, longer))
+    )
     torch.testing.assert_close(before, after)
     turn = focal._motion_with_focal_length(T, centre)[0, :3] * 0.01
     assert float(rotation_error(moved[0, :3, :3], T[0, :3, :3])) == pytest.approx(
@@ -58,7 +66,9 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
 def test_derivative_by_the_focal_length():
     image, box, T = near_scene()
     problem = fitting_problem(image, box, NEAR)
-    T = apply_twist(T[None], torch.tensor([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]).double(), problem.centre)
+    T = apply_twist(
+        T[None], torch.tensor([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]).double(), problem.centre
+    )
     state = problem.state(T)
     step = torch.tensor([1e-5], dtype=torch.float64)
 
@@ -81,7 +91,9 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     guess = focal.scaled_cameras(NEAR[None], torch.tensor([wrong]).double().log())[0]
     problem = fitting_problem(image, box, guess)
     start = focal._moved_away(T[None], torch.tensor([wrong]).double().log(), problem.centre)
-    fit = focal.fit_focal_length(problem, start, focal.FocalPrior.usual(guess[None], SIZE), focal.FULL_RADII)
+    fit = focal.fit_focal_length(
+        problem, start, focal.FocalPrior.usual(guess[None], SIZE), focal.FULL_RADII
+    )
     assert wrong * float(fit.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
     assert float(rotation_error(fit.state.T[0, :3, :3], T[:3, :3])) < 1.5
     information, _ = focal.focal_information(fit.problem, fit.state, 2.0)
@@ -103,13 +115,17 @@ def test_covariance_and_deviation_of_the_focal_length():
     describer = truck_registrar().describer
     crops = EdgeCrops.cut([image], box[None], 0.1)
     one = torch.zeros(1, dtype=torch.long)
-    poses = Poses.at(T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64))
+    poses = Poses.at(
+        T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
+    )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     item = replace(image_item(image, box, NEAR), focal_deviation=0.05, camera_source="exif")
     covariance, deviation = focal.focal_covariance(describer, crops, poses, item)
     assert 0.0 < deviation < 0.05, "the prior and the photograph together"
     z = float((T[:3, :3] @ describer.centre + T[:3, 3])[2])
-    assert float(covariance[0, 5, 5].sqrt()) == pytest.approx(deviation * z, rel=0.5), "the distance grows with it"
+    assert float(covariance[0, 5, 5].sqrt()) == pytest.approx(deviation * z, rel=0.5), (
+        "the distance grows with it"
+    )
     assert int(torch.linalg.matrix_rank(covariance[0])) == 1
 
 
@@ -122,7 +138,9 @@ def test_an_unknown_camera_is_estimated():
     assert abs(ratio - 1.0) < max(0.1, 3.0 * result.camera.focal_deviation)
     assert float(rotation_error(result.rotation, T[:3, :3])) < 5.0
     position = result.transform[:3, 3] / ratio - T[:3, 3]
-    assert float(position.norm()) < 0.1 * float(T[:3, 3].norm()), "the distance is proportional to the focal length"
+    assert float(position.norm()) < 0.1 * float(T[:3, 3].norm()), (
+        "the distance is proportional to the focal length"
+    )
     given = learned_registrar()([image], box[None], NEAR)[0]
     assert (given.camera.source, given.camera.focal_deviation) == ("given", 0.0)
     assert result.standard_deviations[1][2] > given.standard_deviations[1][2]

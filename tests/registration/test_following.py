@@ -1,4 +1,5 @@
-"""Following: generated sequences with bounded errors, frames without the object, and starts that are wrong."""
+"""Following: generated sequences with bounded errors, frames without the object, and starts that
+are wrong."""
 
 import json
 import math
@@ -50,7 +51,8 @@ def test_follower_starts_from_a_known_pose_without_registering(monkeypatch):
 
 
 def answering(monkeypatch, registrar, answers):
-    """Let the registrar give these confidences, one a call, for the true pose of the frame's object."""
+    """Let the registrar give these confidences, one a call, for the true pose of the frame's
+    object."""
     given = iter(answers)
     register = type(registrar).__call__
 
@@ -65,17 +67,23 @@ def answering(monkeypatch, registrar, answers):
 @pytest.mark.parametrize("first", [0.015, BELIEVED_CONFIDENCE - 0.01])
 def test_a_pose_that_is_not_believed_is_not_followed(monkeypatch, first):
     """It is registered again in the next frames, and no confidence rises by being followed."""
-    frames, registrar = sequence(4), truck_registrar()
+    frames = sequence(4)
+    registrar = truck_registrar()
     answering(monkeypatch, registrar, [first, first, 0.8])
     follow = Follower(registrar, CAMERA)
     results = [follow(image, box) for image, box, _ in frames]
     assert [r.confidence for r in results[:3]] == [first, first, 0.8]
-    assert set(results[3].confidence_features) == {"edge_support", "region", "flow", "keyframe"}, "tracked"
+    assert set(results[3].confidence_features) == {"edge_support", "region", "flow", "keyframe"}, (
+        "tracked"
+    )
     assert results[3].confidence <= 0.8
 
 
-def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_the_same_frame(monkeypatch):
-    frames, found = sequence(2), []
+def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_the_same_frame(
+    monkeypatch,
+):
+    frames = sequence(2)
+    found = []
     for first in (1.0, 0.7):
         registrar = truck_registrar()
         with monkeypatch.context() as patch:
@@ -99,7 +107,9 @@ def test_a_wrong_start_never_becomes_believed():
     follow._base = 0.45  # doubtful
     for image, _, T in frames[1:]:
         result = follow(image)
-        assert not result.ok or errors(result, T)[0] < 5.0 or result.confidence < BELIEVED_CONFIDENCE
+        assert (
+            not result.ok or errors(result, T)[0] < 5.0 or result.confidence < BELIEVED_CONFIDENCE
+        )
 
 
 def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
@@ -122,12 +132,17 @@ def test_a_doubtful_pose_that_is_kept_does_not_gain_confidence(monkeypatch):
 
 
 def test_dark_frame_keeps_or_doubts_the_pose():
-    """A frame at a third of the brightness is followed, or its confidence falls below what is believed."""
+    """A frame at a third of the brightness is followed, or its confidence falls below what is
+    believed."""
     frames = sequence(3)
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
     result = follow(frames[1][0] / 3.0)
-    assert not result.ok or errors(result, frames[1][2])[0] < 5.0 or (result.confidence or 0.0) < BELIEVED_CONFIDENCE
+    assert (
+        not result.ok
+        or errors(result, frames[1][2])[0] < 5.0
+        or (result.confidence or 0.0) < BELIEVED_CONFIDENCE
+    )
     after = follow(frames[2][0])
     assert errors(after, frames[2][2])[0] < 5.0
 
@@ -136,12 +151,19 @@ def test_follower_refines_where_tracking_is_doubtful(monkeypatch):
     """The object jumps by 11 degrees and a tenth of its distance."""
     image, _, T = sequence(1)[0]
     jumped = T.clone()
-    jumped[:3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)) @ T[:3, :3]
+    jumped[:3, :3] = (
+        rotation_from_axis_angle(torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)) @ T[:3, :3]
+    )
     jumped[0, 3] += 0.1 * T[2, 3]
-    there = synthesize_photograph(example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9))[0]
-    calls, refine_item = [], following.refine_item
+    there = synthesize_photograph(
+        example_mesh(), jumped, CAMERA, SIZE, torch.Generator().manual_seed(9)
+    )[0]
+    calls = []
+    refine_item = following.refine_item
     monkeypatch.setattr(following, "TRUSTED_CONFIDENCE", 1.1)  # whatever the tracker says
-    monkeypatch.setattr(following, "refine_item", lambda *a, **k: calls.append(a) or refine_item(*a, **k))
+    monkeypatch.setattr(
+        following, "refine_item", lambda *a, **k: calls.append(a) or refine_item(*a, **k)
+    )
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(image, T)
     assert errors(follow(there), jumped)[0] < 4.0
@@ -153,9 +175,13 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
     frames = sequence(2)
     follow = Follower(truck_registrar(), CAMERA)
     follow.start(frames[0][0], frames[0][2])
-    monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked)
+    monkeypatch.setattr(
+        "curvireg_torch.registration.tracker.tracking_confidence", lambda _: tracked
+    )
     monkeypatch.setattr(following, "refine_item", LOST)
-    monkeypatch.setattr(Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))])
+    monkeypatch.setattr(
+        Registrar, "__call__", lambda *_, **__: [FailedRegistration(LostObjectError("no"))]
+    )
     result = follow(frames[1][0])
     assert result.ok == kept
     assert not kept or result.confidence == pytest.approx(tracked)
@@ -163,7 +189,8 @@ def test_doubtful_pose_is_kept_above_a_limit(monkeypatch, tracked, kept):
 
 @pytest.mark.parametrize(("confidence", "used"), [(0.89, False), (0.95, True)])
 def test_a_lost_frame_is_registered_and_counts_if_that_is_reliable(monkeypatch, confidence, used):
-    frames, registrar = sequence(2), truck_registrar()
+    frames = sequence(2)
+    registrar = truck_registrar()
     follow = Follower(registrar, CAMERA)
     follow.start(frames[0][0], frames[0][2])
     monkeypatch.setattr("curvireg_torch.registration.tracker.tracking_confidence", lambda _: 0.1)
@@ -202,8 +229,12 @@ def test_frames_below_one_half_are_checked_and_a_start_of_no_confidence_is_kept(
         follow = Follower(learned_registrar(), CAMERA)
         follow.start(frames[0][0], frames[0][2], confidence=confidence)
         refined = following.refine_item
-        monkeypatch.setattr(following, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1])
-        monkeypatch.setattr(follow, "_registered", lambda *_: pytest.fail("the given pose was dropped"))
+        monkeypatch.setattr(
+            following, "refine_item", lambda *a, f=refined, c=calls: (c.append(1), f(*a))[1]
+        )
+        monkeypatch.setattr(
+            follow, "_registered", lambda *_: pytest.fail("the given pose was dropped")
+        )
         result = follow(frames[1][0])
         monkeypatch.undo()
         assert len(calls) == checks

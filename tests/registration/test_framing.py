@@ -6,7 +6,12 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import camera_matrix
-from curvireg_torch.registration.framing import border_sides, clipped, outside_fraction, outside_warnings
+from curvireg_torch.registration.framing import (
+    border_sides,
+    clipped,
+    outside_fraction,
+    outside_warnings,
+)
 from curvireg_torch.registration.inputs import image_item
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 
@@ -21,11 +26,14 @@ def at(x: float, y: float, z: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "expected"), [(0.0, 0.0, 0.0), (1.0, 0.0, 0.5), (0.0, 0.8, 0.5), (-1.0, -0.8, 0.75), (9.0, 0.0, 1.0)]
+    ("x", "y", "expected"),
+    [(0.0, 0.0, 0.0), (1.0, 0.0, 0.5), (0.0, 0.8, 0.5), (-1.0, -0.8, 0.75), (9.0, 0.0, 1.0)],
 )
 def test_outside_fraction_of_a_square_of_50_px(x, y, expected):
     """In a photograph of 100 x 80 px: its middle on a border, in a corner, or far away."""
-    assert outside_fraction(SQUARE, at(x, y, 2.0), K, (80, 100)) == pytest.approx(expected, abs=2e-3)
+    assert outside_fraction(SQUARE, at(x, y, 2.0), K, (80, 100)) == pytest.approx(
+        expected, abs=2e-3
+    )
 
 
 def test_outside_fraction_does_not_depend_on_the_unit_and_behind_the_camera_nothing_is_seen():
@@ -53,8 +61,14 @@ def test_warnings_begin_at_a_tenth():
 )
 def test_boxes_are_clipped_to_the_photograph(box, part, sides):
     item = image_item(torch.rand(3, 80, 100), torch.tensor(box, dtype=torch.float32))
-    assert item.box.tolist() == list(part) == clipped(torch.tensor(box).double(), (80, 100)).tolist()
-    assert border_sides(item.box, (80, 100)) == border_sides(torch.tensor(box).double(), (80, 100)) == sides
+    assert (
+        item.box.tolist() == list(part) == clipped(torch.tensor(box).double(), (80, 100)).tolist()
+    )
+    assert (
+        border_sides(item.box, (80, 100))
+        == border_sides(torch.tensor(box).double(), (80, 100))
+        == sides
+    )
 
 
 def test_a_cut_object_has_a_warning_and_is_not_reliable():

@@ -1,4 +1,5 @@
-"""Photographs, boxes and cameras as callers have them: decoded once, and questioned where they look like mistakes."""
+"""Photographs, boxes and cameras as callers have them: decoded once, and questioned where they look
+like mistakes."""
 
 import weakref
 
@@ -8,7 +9,14 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.registration import inputs
 from curvireg_torch.registration.inputs import ImageItem, camera_warnings, image_items
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_registrar, write_photo
+from tests._support.scenes import (
+    CAMERA,
+    SIZE,
+    learned_registrar,
+    scene,
+    truck_registrar,
+    write_photo,
+)
 
 VGA = (480, 640)
 
@@ -16,7 +24,8 @@ VGA = (480, 640)
 def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
     for camera, size, parts in (
         ((325, 325, 572, 573), VGA, ["(572, 573) lies outside", "640 x 480", "seem to be swapped"]),
-        ((572, 700, 573, 650), VGA, ["near the centre"]),  # inside the picture, but no swapped camera
+        # inside the picture, but no swapped camera
+        ((572, 700, 573, 650), VGA, ["near the centre"]),
         ((1450, 1450, 960, 540), VGA, ["belong to a picture of about 1921 x 1081 px; scale it"]),
         ((600, 600, 0, 0), VGA, ["(0, 0) lies outside", "near the centre"]),
         ((35, 35, 319.5, 239.5), VGA, ["35 px gives", "1.7e+02 degrees; it is in px"]),
@@ -56,12 +65,16 @@ def test_result_with_a_questionable_camera_is_never_reliable(monkeypatch):
     assert not bad.reliable
     assert bad.covariance is None
     assert bad.to_dict()["warnings"] == camera_warnings(far, SIZE)
-    refined = registrar.refine([image[:, :, :100]], CAMERA, [T])[0]  # half the picture: its centre lies outside
+    # half the picture: its centre lies outside
+    refined = registrar.refine([image[:, :, :100]], CAMERA, [T])[0]
     assert refined.ok is False or refined.warnings
 
 
 def test_photographs_are_decoded_once_and_not_kept(tmp_path, monkeypatch):
-    read_photo, alive, most, decoded = inputs.read_photo, weakref.WeakSet(), [0], []
+    read_photo = inputs.read_photo
+    alive = weakref.WeakSet()
+    most = [0]
+    decoded = []
 
     def counted(path, **options):
         photo = read_photo(path, **options)

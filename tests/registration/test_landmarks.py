@@ -17,7 +17,11 @@ from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration import landmarks as landmarks_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, MIN_LANDMARKS, detection_probability
+from curvireg_torch.registration.confidence import (
+    LANDMARK_PROBABILITY,
+    MIN_LANDMARKS,
+    detection_probability,
+)
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
 from curvireg_torch.registration.landmarks import LandmarkMatches, Landmarks, _pose
@@ -47,7 +51,9 @@ def carton(seed: int = 0) -> trimesh.Trimesh:
         uv[3 * face : 3 * face + 3] = (at + np.array([side % 3, side // 3])) / np.array([3, 2])
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture))
     visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
-    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), visual=visual, process=False)
+    return trimesh.Trimesh(
+        corners, np.arange(len(corners)).reshape(-1, 3), visual=visual, process=False
+    )
 
 
 @cache
@@ -107,11 +113,19 @@ def test_photograph_may_be_dark():
     most, found = (landmarks().matches(image, K, box_of(T)).poses()[0] for image in (bright, dark))
     assert found.count > 0.5 * most.count
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
-    assert not len(landmarks().matches(torch.full_like(bright, 0.3), K).uv)  # nor does one of a single colour fail
+    # nor does one of a single colour fail
+    assert not len(landmarks().matches(torch.full_like(bright, 0.3), K).uv)
     alone = render_colour(mesh(), T[None], K[None], SIZE)[0]
     alone = torch.where(alone.amin(dim=0) < 0.999, alone, torch.full_like(alone, 0.1))
-    wide = torch.nn.functional.pad(alone, (800, 800, 600, 600), value=0.1)  # the bright object covers 0.3 %
-    assert landmarks().matches(wide, K + torch.tensor([[0, 0, 800], [0, 0, 600], [0, 0, 0]])).poses()[0].count > 50
+    # the bright object covers 0.3 %
+    wide = torch.nn.functional.pad(alone, (800, 800, 600, 600), value=0.1)
+    assert (
+        landmarks()
+        .matches(wide, K + torch.tensor([[0, 0, 800], [0, 0, 600], [0, 0, 0]]))
+        .poses()[0]
+        .count
+        > 50
+    )
 
 
 def test_each_copy_has_a_pose():
@@ -119,7 +133,9 @@ def test_each_copy_has_a_pose():
     found = landmarks().matches(photograph(*there), K).poses()
     assert len(found) == 2
     assert found[0].count >= found[1].count
-    errors = torch.stack([rotation_error(one.T[:3, :3], torch.stack(there)[:, :3, :3]) for one in found])
+    errors = torch.stack(
+        [rotation_error(one.T[:3, :3], torch.stack(there)[:, :3, :3]) for one in found]
+    )
     assert sorted(errors.argmin(dim=1).tolist()) == [0, 1]
     assert float(errors.amin(dim=1).max()) < 3.0
 
@@ -127,7 +143,8 @@ def test_each_copy_has_a_pose():
 def test_nothing_is_found_where_the_print_is_not():
     T = pose(20.0, 0.4, 4.0)
     other = photograph(T, shown=as_mesh(carton(seed=1)))
-    plain, missing = torch.full((1, 40, 40), 0.5), torch.full((3, 40, 40), torch.nan)
+    plain = torch.full((1, 40, 40), 0.5)
+    missing = torch.full((3, 40, 40), torch.nan)
     for image, box in ((photograph(), None), (other, box_of(T)), (plain, None), (missing, None)):
         matches = landmarks().matches(image, K, box)
         assert matches.poses() == []
@@ -135,34 +152,52 @@ def test_nothing_is_found_where_the_print_is_not():
 
 
 def test_landmarks_agree_with_the_poses_of_their_object():
-    T, other = pose(20.0, -0.9, 4.5), pose(150.0, 0.9, 4.5)
+    T = pose(20.0, -0.9, 4.5)
+    other = pose(150.0, 0.9, 4.5)
     matches = landmarks().matches(photograph(T, other), K)
     off = torch.stack(
-        [apply_twist(T[None], twist[None], mesh_centre(mesh()))[0] for twist in 0.4 * torch.eye(6).double()]
+        [
+            apply_twist(T[None], twist[None], mesh_centre(mesh()))[0]
+            for twist in 0.4 * torch.eye(6).double()
+        ]
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
     assert float(counts[:2].min()) >= MIN_LANDMARKS
     assert float(counts[2:].max()) < 0.5 * float(counts[0])
-    twice = replace(matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0))
+    twice = replace(
+        matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0)
+    )
     assert twice.agreeing(T[None]) == counts[0]
     assert matches.agreeing(-T[None]) < 4  # behind the camera
 
 
 def test_landmarks_decide_where_most_of_the_object_is_hidden():
-    T, around = pose(65.0, 0.4, 4.0), cr.sample_views(azimuth_step=45, elevations=[0, 45])
-    image, box = photograph(T), box_of(T)
-    image[:, int(box[1] + 0.4 * (box[3] - box[1])) :] = photograph()[:, int(box[1] + 0.4 * (box[3] - box[1])) :]
+    T = pose(65.0, 0.4, 4.0)
+    around = cr.sample_views(azimuth_step=45, elevations=[0, 45])
+    image = photograph(T)
+    box = box_of(T)
+    image[:, int(box[1] + 0.4 * (box[3] - box[1])) :] = photograph()[
+        :, int(box[1] + 0.4 * (box[3] - box[1])) :
+    ]
     result = cr.Registrar(mesh(), views=around, mesh_is="exact")([image], box[None], K)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 5.0
-    assert result.hypotheses[0].evidence["landmarks"] > max(h.evidence["landmarks"] for h in result.hypotheses[1:])
+    assert result.hypotheses[0].evidence["landmarks"] > max(
+        h.evidence["landmarks"] for h in result.hypotheses[1:]
+    )
 
 
 def test_many_landmarks_outweigh_what_an_occluder_takes_away_and_one_does_not():
-    seen, hidden = [0.0, 0.4, 0.3, 0.0, 0.0, 0.0], [0.0, 0.1, 0.1, -4.0, math.log1p(20), 0.0]
-    fits, nearly = [0.0, 0.8, 0.5, 0.0, 0.0, 0.0], [0.0, 0.6, 0.3, -0.5, math.log1p(1), 0.0]
+    seen = [0.0, 0.4, 0.3, 0.0, 0.0, 0.0]
+    hidden = [0.0, 0.1, 0.1, -4.0, math.log1p(20), 0.0]
+    fits = [0.0, 0.8, 0.5, 0.0, 0.0, 0.0]
+    nearly = [0.0, 0.6, 0.3, -0.5, math.log1p(1), 0.0]
     counts = torch.tensor([0.0, 1.0, 2.0, 3.0, 22.0])
-    torch.testing.assert_close(landmark_evidence(counts).expm1(), torch.tensor([0.0, 0.0, 0.0, 1.0, 20.0]))
-    order = pose_scores(torch.tensor([seen, hidden, fits, nearly]), exact=True).argsort(descending=True)
+    torch.testing.assert_close(
+        landmark_evidence(counts).expm1(), torch.tensor([0.0, 0.0, 0.0, 1.0, 20.0])
+    )
+    order = pose_scores(torch.tensor([seen, hidden, fits, nearly]), exact=True).argsort(
+        descending=True
+    )
     assert order.tolist() == [2, 3, 1, 0]
 
 
@@ -172,7 +207,11 @@ def test_a_fit_that_leaves_the_landmarks_is_not_kept(monkeypatch):
     def fit_elsewhere(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
         twist = torch.tensor([[0.0, 0.0, 1.5, 0.0, 0.0, 0.0]], dtype=torch.float64)
-        return placed(fitted, apply_twist(fitted.T, twist.expand(len(fitted), 6), describer.centre), describer.centre)
+        return placed(
+            fitted,
+            apply_twist(fitted.T, twist.expand(len(fitted), 6), describer.centre),
+            describer.centre,
+        )
 
     monkeypatch.setattr(registrar_module, "fit_poses", fit_elsewhere)
     monkeypatch.setattr(registrar_module, "fit_texture_of", lambda *_: None)
@@ -196,7 +235,8 @@ def test_a_pose_needs_enough_landmarks_at_different_places():
 
 def test_origin_of_the_mesh_may_be_far_away():
     """Behind the camera, and a thousand object radii off."""
-    T, away = pose(20.0, 0.4, 4.0), torch.tensor([0.0, 0.0, 1000.0], dtype=torch.float64)
+    T = pose(20.0, 0.4, 4.0)
+    away = torch.tensor([0.0, 0.0, 1000.0], dtype=torch.float64)
     moved = as_mesh(carton().apply_translation(away.numpy()))
     (found,) = Landmarks(ViewDescriber(moved, BankSettings())).matches(photograph(T), K).poses()
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 2.0
@@ -206,22 +246,28 @@ def test_origin_of_the_mesh_may_be_far_away():
 @cache
 def registrar() -> cr.Registrar:
     """Of views from far away directions."""
-    return cr.Registrar(mesh(), views=cr.sample_views(azimuth_step=180, elevations=[-60]), mesh_is="exact")
+    return cr.Registrar(
+        mesh(), views=cr.sample_views(azimuth_step=180, elevations=[-60]), mesh_is="exact"
+    )
 
 
 def test_registration_starts_from_landmarks_too(monkeypatch):
     """No view of the bank is near the pose."""
     T = pose(65.0, 0.4, 4.0)
-    image, box = photograph(T), box_of(T)
+    image = photograph(T)
+    box = box_of(T)
     assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) < 1.0
     monkeypatch.setattr(LandmarkMatches, "poses", lambda *_: [])
     assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) > 10.0
 
 
 def test_a_pose_outside_the_limits_is_no_start():
-    T, other = pose(65.0, 0.4, 4.0), pose(155.0, 0.4, 4.0)
+    T = pose(65.0, 0.4, 4.0)
+    other = pose(155.0, 0.4, 4.0)
     limits = cr.PosePrior(rotation=other[:3, :3], within=40.0)
-    around = cr.Registrar(mesh(), views=cr.sample_views(azimuth_step=30, elevations=[25]), mesh_is="exact")
+    around = cr.Registrar(
+        mesh(), views=cr.sample_views(azimuth_step=30, elevations=[25]), mesh_is="exact"
+    )
     result = around([photograph(T)], box_of(T)[None], K, prior=limits)[0]
     assert min(float(rotation_error(h.rotation, T[:3, :3])) for h in result.hypotheses) > 40.0
 
@@ -229,7 +275,9 @@ def test_a_pose_outside_the_limits_is_no_start():
 def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmarks():
     T = pose(65.0, 0.4, 4.0)
     item = image_items([photograph(T)], box_of(T)[None], K)[0]
-    grey = cr.Registrar(trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0]))
+    grey = cr.Registrar(
+        trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0])
+    )
     assert grey.landmark_matches(item) is None
     assert registrar().landmark_matches(replace(item, camera_matrix=None)) is None
     poses, count = grey.landmark_poses(None)
@@ -245,25 +293,33 @@ def test_boxes_of_landmarks_are_the_first_proposals_less_certain_with_a_rival():
     assert proposals.by_landmarks == len(counts)
     assert proposals.responses[: len(counts)].tolist() == counts
     (found,) = detect(registrar(), [item.image], K)[0]
-    assert found.detection.score == detection_probability(counts[0], 0.5, rival=max(counts[1:], default=0))
+    assert found.detection.score == detection_probability(
+        counts[0], 0.5, rival=max(counts[1:], default=0)
+    )
     near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
     assert propose(registrar(), near).by_landmarks == 0
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
     # As two objects with similar prints do.
-    alone, first, second = (detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40)))
+    alone, first, second = (
+        detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40))
+    )
     assert alone == LANDMARK_PROBABILITY
     assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.25, 0.5), (0.4, -0.3)])
 def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
-    """Gaussian blobs of known centres: OpenCV's default puts features 0.25 px too far right and down."""
+    """Gaussian blobs of known centres: OpenCV's default puts features 0.25 px too far right and
+    down."""
     axis = torch.arange(256, dtype=torch.float64)
     random = np.random.default_rng(2)
-    picture, centres = torch.zeros(256, 256, dtype=torch.float64), []
+    picture = torch.zeros(256, 256, dtype=torch.float64)
+    centres = []
     for x in range(24, 250, 48):
         for y in range(24, 250, 48):
-            u, v, size = x + shift[0], y + shift[1], random.uniform(1.5, 6.0)
+            u = x + shift[0]
+            v = y + shift[1]
+            size = random.uniform(1.5, 6.0)
             picture += torch.exp(-((axis - u) ** 2 + (axis[:, None] - v) ** 2) / (2 * size**2))
             centres.append((u, v))
     found = landmarks_module._Features.of(picture.float()[None], tones=(0.0, 1.0)).uv
@@ -275,9 +331,15 @@ def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
 
 
 def test_landmarks_are_where_the_mesh_shows_them() -> None:
-    """Of several photographs: the median distance in px of matched features from their landmarks."""
+    """Of several photographs: the median distance in px of matched features from their
+    landmarks."""
     residuals = []
-    for turn, side, distance in ((20.0, 0.4, 4.0), (75.0, -0.3, 3.2), (150.0, 0.1, 4.4), (260.0, -0.2, 3.5)):
+    for turn, side, distance in (
+        (20.0, 0.4, 4.0),
+        (75.0, -0.3, 3.2),
+        (150.0, 0.1, 4.4),
+        (260.0, -0.2, 3.5),
+    ):
         T = pose(turn, side, distance)
         matches = landmarks().matches(photograph(T), K)
         projected = (torch.from_numpy(matches.points) @ T[:3, :3].T + T[:3, 3]) @ K.T

@@ -1,4 +1,5 @@
-"""Least squares over poses: derivatives, bounded steps, the covariance in closed form and against injected noise."""
+"""Least squares over poses: derivatives, bounded steps, the covariance in closed form and against
+injected noise."""
 
 from dataclasses import replace
 
@@ -19,15 +20,19 @@ ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 def test_project_and_its_derivative():
-    points, normals = torch.rand(1, 7, 3, dtype=torch.float64), torch.rand(1, 7, 2, dtype=torch.float64)
-    T, centre = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None], torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
+    points = torch.rand(1, 7, 3, dtype=torch.float64)
+    normals = torch.rand(1, 7, 2, dtype=torch.float64)
+    T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 4.0])[None]
+    centre = torch.tensor([0.4, 0.5, 0.6], dtype=torch.float64)
 
     def moved(step: torch.Tensor) -> torch.Tensor:
         uv, _ = ls.project(points, normals, ls.apply_twist(T, step[None], centre), K[None], centre)
         return (uv * normals).sum(dim=-1)[0]
 
     # Not at zero, where the angle of an axis-angle vector is not differentiable.
-    expected = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
+    expected = torch.autograd.functional.jacobian(
+        moved, torch.full((6,), 1e-7, dtype=torch.float64)
+    )
     uv, derivative = ls.project(points, normals, T, K[None], centre)
     torch.testing.assert_close(uv[0], project_points(points[0], T[0], K))
     torch.testing.assert_close(ls.pixels(points, T, K[None], centre), uv)
@@ -36,14 +41,22 @@ def test_project_and_its_derivative():
 
 @pytest.mark.parametrize(
     ("rotation", "translation", "fraction"),
-    [([0.1, 0, 0], [0, 0, 0.05], 1.0), ([0, 0.3, 0.4], [0, 0, 0.01], 0.4), ([0.1, 0, 0], [0.3, 0, 0.4], 0.2)],
+    [
+        ([0.1, 0, 0], [0, 0, 0.05], 1.0),
+        ([0, 0.3, 0.4], [0, 0, 0.01], 0.4),
+        ([0.1, 0, 0], [0.3, 0, 0.4], 0.2),
+    ],
 )
 def test_long_steps_are_shortened(rotation, translation, fraction):
-    """Translations are given as fractions of the distance of the centre, which lies half a unit behind the origin."""
-    T, centre = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None], torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
+    """Translations are given as fractions of the distance of the centre, which lies half a unit
+    behind the origin."""
+    T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 6.0])[None]
+    centre = torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
     step = torch.tensor([[*rotation, *(6.5 * t for t in translation)]], dtype=torch.float64)
     A = torch.eye(6, dtype=torch.float64)[None]
-    torch.testing.assert_close(ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step)
+    torch.testing.assert_close(
+        ls.least_squares_step(A, step[..., None], T, centre, 0.0), fraction * step
+    )
 
 
 def test_damping_shortens_each_direction_alike():
@@ -54,8 +67,11 @@ def test_damping_shortens_each_direction_alike():
 
 
 def test_points_need_a_minimum_of_matches():
-    T, truth = pose([0.0] * 3, [0.0, 0.0, 6.0])[None], pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
-    points = torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
+    truth = pose([0.02, 0.0, 0.01], [0.05, 0.0, 6.1])[None]
+    points = (
+        torch.rand(1, 20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.5
+    )
     uv = ls.pixels(points, truth, K[None], ZERO)
     for count, expected in ((ls.MIN_MATCHES - 1, T), (ls.MIN_MATCHES, truth)):
         weight = (torch.arange(20) < count).double()[None]
@@ -66,7 +82,8 @@ def test_points_need_a_minimum_of_matches():
 def test_inlier_ratio_counts_all_points():
     T = pose([0.0] * 3, [0.0, 0.0, 6.0])[None]
     points = torch.rand(1, 10, 3, dtype=torch.float64) - 0.5
-    uv, weight = ls.pixels(points, T, K[None], ZERO), torch.ones(1, 10)
+    uv = ls.pixels(points, T, K[None], ZERO)
+    weight = torch.ones(1, 10)
     uv[:, :2], uv[:, 2] = uv[:, :2] + 500.0, uv[:, 2] + torch.tensor([2.0, 0.0])
     weight[:, 3:5] = 0.0  # not found
     ratio = ls.PointMatches(points, uv, weight).inlier_ratio(T, K[None], ZERO)
@@ -81,11 +98,15 @@ def test_nearest_rigid_pose_is_orthogonal():
 
 
 def cloud(count: int) -> tuple[ContourPoints, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along the normals."""
+    """Points in a cube with random normals, a pose, the cube's centre, and the derivatives along
+    the normals."""
     generator = torch.Generator().manual_seed(0)
-    T, centre = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None], torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
+    T = pose([0.3, -0.5, 0.2], [-1.6, -0.4, 6.0])[None]
+    centre = torch.tensor([2.0, 0.5, 0.6], dtype=torch.float64)
     model = centre + 2.0 * torch.rand(1, count, 3, generator=generator, dtype=torch.float64) - 1.0
-    normals = F.normalize(torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1)
+    normals = F.normalize(
+        torch.randn(1, count, 2, generator=generator, dtype=torch.float64), dim=-1
+    )
     _, J = ls.project(model, normals, T, K[None], centre)
     everywhere = torch.ones(1, count, dtype=torch.bool)
     return ContourPoints(model, normals, everywhere, everywhere), T, centre, J
@@ -103,9 +124,17 @@ def test_covariance_in_closed_form():
         R = rotation_from_axis_angle(step[None, :3])[0] @ T[0, :3, :3]
         return project_points(points.model[0], transform(R, T[0, :3, 3] + step[3:]), K)
 
-    derivative = torch.autograd.functional.jacobian(moved, torch.full((6,), 1e-7, dtype=torch.float64))
-    rows, w, r = (points.normals[0, :, None] @ derivative)[:, 0], W[0], d[0]
-    B = rows.T @ (w * w * rows) * (ls.POINT_ERROR**2 + ls.SHARED_ERROR * float((w * r * r).sum() / w.sum()))
+    derivative = torch.autograd.functional.jacobian(
+        moved, torch.full((6,), 1e-7, dtype=torch.float64)
+    )
+    rows = (points.normals[0, :, None] @ derivative)[:, 0]
+    w = W[0]
+    r = d[0]
+    B = (
+        rows.T
+        @ (w * w * rows)
+        * (ls.POINT_ERROR**2 + ls.SHARED_ERROR * float((w * r * r).sum() / w.sum()))
+    )
     cells = (project_points(points.model[0], T[0], K) / ls.CELL_SIDE).floor()
     for cell in cells.unique(dim=0):
         g = (w * r * rows)[(cells == cell).all(dim=1)].sum(dim=0)
@@ -117,14 +146,18 @@ def test_covariance_in_closed_form():
 @pytest.mark.parametrize(("factor", "known"), [(0.95, False), (1.05, True)])
 def test_covariance_needs_a_minimum_of_weight(factor, known):
     points, T, centre, J = cloud(60)
-    W, d = torch.full((1, 60, 1), factor * 0.1, dtype=torch.float64), torch.full((1, 60, 1), 0.1, dtype=torch.float64)
-    C, directions = ls.pose_covariance(ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7)
+    W = torch.full((1, 60, 1), factor * 0.1, dtype=torch.float64)
+    d = torch.full((1, 60, 1), 0.1, dtype=torch.float64)
+    C, directions = ls.pose_covariance(
+        ls.Measurements(J, d, W), points, T, K[None], centre, radius=1.7
+    )
     assert bool(C.isfinite().all()) == bool(directions > 0) == known
 
 
 @pytest.mark.parametrize("axis_angle", [[1.0, 0.3, 0.2], [1.9, -0.4, 0.3]])
 def test_covariance_of_a_cylinder_has_unknown_rotation_about_its_axis(axis_angle):
-    mesh, T = trimesh.creation.cylinder(0.5, 1.4, sections=96), pose(axis_angle, [0.1, 0.0, 8.0])
+    mesh = trimesh.creation.cylinder(0.5, 1.4, sections=96)
+    T = pose(axis_angle, [0.1, 0.0, 8.0])
     off = torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.1, 0.2]], dtype=torch.float64)
     fit = fitted(silhouette(mesh, T), ls.apply_twist(T[None], off, mesh_centre(mesh)), mesh=mesh)
     assert 4 <= int(fit.observable) <= 5
@@ -152,7 +185,9 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
     S = torch.tensor([1.0, 1.0, 1.0, unit, unit, unit], dtype=torch.float64)
     larger = replace(points, model=unit * points.model)
     measured = ls.Measurements(J / S, d, W)
-    found, directions = ls.pose_covariance(measured, larger, scaled, K[None], unit * centre, radius=1.7 * unit)
+    found, directions = ls.pose_covariance(
+        measured, larger, scaled, K[None], unit * centre, radius=1.7 * unit
+    )
     assert int(directions) == int(known) == (6 if not across else int(known))
     assert int(known) < 6 or not across
     torch.testing.assert_close(found / S[:, None] / S, C, rtol=1e-4, atol=1e-9)
@@ -160,6 +195,7 @@ def test_covariance_follows_the_unit_of_the_mesh(unit, across):
 
 @pytest.mark.parametrize("unit", [1e-3, 80.0])
 def test_long_steps_are_shortened_by_the_distance_in_any_unit(unit):
-    T, centre = pose([0.0, 0.0, 0.0], [0.0, 0.0, 3.0 * unit])[None], unit * torch.tensor([0.0, 0.0, 0.5]).double()
+    T = pose([0.0, 0.0, 0.0], [0.0, 0.0, 3.0 * unit])[None]
+    centre = unit * torch.tensor([0.0, 0.0, 0.5]).double()
     step = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]], dtype=torch.float64)
     assert ls.step_fraction(step, T, centre).tolist() == [pytest.approx(ls.MAX_TRANSLATION)]

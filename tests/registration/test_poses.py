@@ -20,7 +20,8 @@ def rotation(x: float, y: float, z: float) -> Tensor:
 
 def poses(degrees: list[float]) -> Poses:
     """Poses that differ by rotations about one axis."""
-    number, R = torch.arange(len(degrees)), torch.stack([rotation(0.0, angle, 0.0) for angle in degrees])
+    number = torch.arange(len(degrees))
+    R = torch.stack([rotation(0.0, angle, 0.0) for angle in degrees])
     return Poses(**{**{f.name: number for f in fields(Poses)}, "rotation": R})
 
 
@@ -37,15 +38,22 @@ def test_best_views_are_distinct_and_ranked_relative_to_the_best():
     scores[0, [4, 5, 60]] = torch.tensor([0.8, 0.7, 0.2])  # 4 and 5 are neighbours
     ranking = Ranking(scores, scores.argsort(dim=1, descending=True, stable=True), {}, None)
     view, rank = best_views(ranking, truck_bank(), count=2)
-    assert (view.tolist(), rank.tolist()) == ([4, 60], pytest.approx([0.0, math.log(0.25)], abs=1e-6))
+    assert (view.tolist(), rank.tolist()) == (
+        [4, 60],
+        pytest.approx([0.0, math.log(0.25)], abs=1e-6),
+    )
 
 
 def test_poses_fill_their_box():
     describer, (_, box, T) = truck_registrar().describer, scene(0)
     none = torch.zeros(1, dtype=torch.long)
     exact = Poses.at(T[None], CAMERA[None], describer.centre, none, none)
-    torch.testing.assert_close(exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None])
+    torch.testing.assert_close(
+        exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None]
+    )
     again = Poses.in_box(describer, box, CAMERA, exact.rotation, exact.distance, none, none)
     assert float(rotation_error(again.T[0, :3, :3], T[:3, :3])) < 2.0
     assert float((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
-    torch.testing.assert_close(again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None])
+    torch.testing.assert_close(
+        again.distance, (again.T[0, :3, :3] @ describer.centre + again.T[0, :3, 3]).norm()[None]
+    )

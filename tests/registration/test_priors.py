@@ -1,4 +1,5 @@
-"""Pose priors in a registration: views, search, contour fit and report keep within what is known of the pose."""
+"""Pose priors in a registration: views, search, contour fit and report keep within what is known of
+the pose."""
 
 import math
 
@@ -7,7 +8,12 @@ import torch
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, rotation_towards, viewpoint_from_rotation
+from curvireg_torch.geometry import (
+    rotation_error,
+    rotation_from_axis_angle,
+    rotation_towards,
+    viewpoint_from_rotation,
+)
 from curvireg_torch.geometry.pose_prior import PosePrior
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.poses import Poses
@@ -15,7 +21,8 @@ from curvireg_torch.registration.priors import Limits
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
 IMAGE, BOX, T = scene(0)
-ONE, TRUTH = ([IMAGE], BOX[None], CAMERA), T[:3, :3]
+ONE = ([IMAGE], BOX[None], CAMERA)
+TRUTH = T[:3, :3]
 AZIMUTH = float(viewpoint_from_rotation(TRUTH)[0])
 
 
@@ -51,7 +58,8 @@ def limits_of(prior, box=(100.0, 60.0, 140.0, 100.0)):
 
 def test_limits_hold_in_the_camera_of_the_photograph():
     """It sees a box at the border 25 degrees off its axis."""
-    bank, box = truck_bank(), (200.0, 20.0, 238.0, 60.0)
+    bank = truck_bank()
+    box = (200.0, 20.0, 238.0, 60.0)
     ray = torch.linalg.solve(CAMERA, torch.tensor([219.0, 40.0, 1.0], dtype=torch.float64))
     R = rotation_towards(ray) @ bank.rotations[5].double()
     allowed = limits_of(PosePrior(rotation=R, within=0.1), box).allowed()
@@ -64,17 +72,26 @@ def test_limits_hold_in_the_camera_of_the_photograph():
 def pose_at(away=1.5, degrees=0.0) -> Poses:
     """A pose whose centre is so far away, off the optical axis, rotated about the axis."""
     describer = truck_registrar().describer
-    index, one = torch.zeros(1, dtype=torch.long), torch.ones(1, dtype=torch.float64)
+    index = torch.zeros(1, dtype=torch.long)
+    one = torch.ones(1, dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)[None].clone()
-    pose[0, :3, :3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64))
-    pose[0, :3, 3] = away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64) - pose[0, :3, :3] @ describer.centre
+    pose[0, :3, :3] = rotation_from_axis_angle(
+        torch.tensor([0.0, 0.0, math.radians(degrees)], dtype=torch.float64)
+    )
+    pose[0, :3, 3] = (
+        away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
+        - pose[0, :3, :3] @ describer.centre
+    )
     return Poses.at(pose, CAMERA[None], describer.centre, index, one)
 
 
-def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():
+def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():  # noqa: E501
     limits = limits_of(PosePrior(rotation=torch.eye(3, dtype=torch.float64), within=10.0))
     assert [bool(limits.keeps(pose_at(degrees=d))) for d in (12.9, 13.1)] == [True, False]
-    words = [limits.contradiction(pose_at(degrees=d), pose_at(), better_outside=False) for d in (8.9, 9.1, 11.0)]
+    words = [
+        limits.contradiction(pose_at(degrees=d), pose_at(), better_outside=False)
+        for d in (8.9, 9.1, 11.0)
+    ]
     assert words == [None, "at the limit", "at the limit"]
 
 
@@ -83,9 +100,11 @@ COMBINED = PosePrior(azimuth=(20.0, 40.0), elevation=(50.0, 70.0), theta=(-5.0, 
 
 
 def test_poses_are_turned_into_all_limits_about_their_centre():
-    limits, describer = limits_of(COMBINED), truck_registrar().describer
+    limits = limits_of(COMBINED)
+    describer = truck_registrar().describer
     rotation = truck_bank().rotations.double()[::7]
-    view, box = torch.arange(len(rotation)), torch.tensor([200.0, 20.0, 238.0, 60.0])
+    view = torch.arange(len(rotation))
+    box = torch.tensor([200.0, 20.0, 238.0, 60.0])
     poses = Poses.in_box(describer, box, CAMERA, rotation, torch.ones(len(view)), view, 0.0 * view)
     moved = limits.moved_inside(poses)
     assert float(COMBINED.excess(moved.T[:, :3, :3]).max()) < 0.01
@@ -106,7 +125,8 @@ def test_no_hypothesis_exceeds_combined_limits_by_more_than_the_fit_may(seed):
 
 
 def test_only_rival_outside_tells_whether_a_tight_right_hint_is_wrong():
-    """A hint within which no other view lies is no reason for doubt, and one on the far side is contradicted."""
+    """A hint within which no other view lies is no reason for doubt, and one on the far side is
+    contradicted."""
     registrar = learned_registrar()
     free = registrar(*ONE)[0]
     tight = registrar(*ONE, prior=PosePrior(rotation=TRUTH, within=6.0))[0]
@@ -130,14 +150,17 @@ def test_every_hypothesis_lies_at_an_allowed_distance(pipeline, factors):
     near, far = (factor * DISTANCE for factor in factors)
     result = registrar(*ONE, prior=PosePrior(distance=(near, far)))[0]
     for hypothesis in result.hypotheses:
-        distance = float((hypothesis.rotation @ registrar.describer.centre + hypothesis.translation).norm())
+        distance = float(
+            (hypothesis.rotation @ registrar.describer.centre + hypothesis.translation).norm()
+        )
         assert 0.97 * near <= distance <= 1.03 * far
     assert result.prior_contradiction == "better outside"
     assert not result.reliable
 
 
 def test_limits_on_the_distance_keep_contradict_and_move_poses():
-    """Fitted poses up to 3 % too far are kept, and others move along their ray; a box may ask for 10 % more."""
+    """Fitted poses up to 3 % too far are kept, and others move along their ray; a box may ask for
+    10 % more."""
     limits = limits_of(PosePrior(distance=(1.0, 2.0)))
     kept = [bool(limits.keeps(pose_at(away))) for away in (0.969, 0.972, 2.055, 2.065)]
     assert kept == [False, True, True, False]

@@ -1,5 +1,6 @@
-"""Real photographs and a video, default pipeline: the poses agree with the annotations in frame and unit.
-They are registered correctly by a wide margin; docs/accuracy.md has fractions. The tests take two minutes on a core."""
+"""Real photographs and a video, default pipeline: the poses agree with the annotations in frame and
+unit. They are registered correctly by a wide margin; docs/accuracy.md has fractions. The tests take
+two minutes on a core."""
 
 import json
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ pytestmark = pytest.mark.data
 
 @dataclass(frozen=True)
 class Case:
-    """Photographs of one mesh by set and keys, and the largest errors: degrees up to symmetries, and fractions of the
-    distance across and along the optical axis."""
+    """Photographs of one mesh by set and keys, and the largest errors: degrees up to symmetries,
+    and fractions of the distance across and along the optical axis."""
 
     name: str
     keys: tuple[str, ...]
@@ -46,15 +47,22 @@ SIMILAR = [
 
 
 def registered(benchmark, case):
-    """(annotation, result) of each photograph, registered alone to the bank of their common mesh."""
-    pairs = {entry.key: (entry, known) for entry, known in zip(benchmark.entries, benchmark.samples, strict=True)}
+    """(annotation, result) of each photograph, registered alone to the bank of their common
+    mesh."""
+    pairs = {
+        entry.key: (entry, known)
+        for entry, known in zip(benchmark.entries, benchmark.samples, strict=True)
+    }
     chosen = [pairs[key] for key in case.keys]
     assert len({entry.meshes for entry, _ in chosen}) == 1
     mesh = cr.load_mesh(chosen[0][0].meshes[0], unit=benchmark.unit)
     pipeline = cr.Pipeline().with_pose_prior(benchmark.protocol.pose)
     registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
     for entry, known in chosen:
-        yield known, registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], entry.camera)[0]
+        yield (
+            known,
+            registrar([read_image(entry.photo)], torch.tensor(entry.box)[None], entry.camera)[0],
+        )
 
 
 @pytest.mark.parametrize("case", EXACT, ids=lambda case: case.name)
@@ -63,8 +71,11 @@ def test_poses_of_exact_meshes(case):
     benchmark = BOPBenchmark(BOPDataset(real_data(f"bop/{case.name}")), Protocol(pose="any"))
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
         symmetries = symmetry_transforms(known["model_info"])[:, :3, :3]
-        R, t = result.rotation.double(), known["translation"].double()
-        error = float(symmetric_rotation_error(R[None], known["rotation"].double()[None], symmetries)[0])
+        R = result.rotation.double()
+        t = known["translation"].double()
+        error = float(
+            symmetric_rotation_error(R[None], known["rotation"].double()[None], symmetries)[0]
+        )
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
         shift = (result.translation.double() - t) / t[2]
         assert float(shift[:2].norm()) < case.sideways, f"{key}: {shift.tolist()} of the distance"
@@ -79,30 +90,43 @@ def test_viewpoints_of_similar_meshes(case):
     for key, (known, result) in zip(case.keys, registered(benchmark, case), strict=True):
         error = float(rotation_error(result.rotation.double(), known["rotation"].double()))
         assert error < case.rotation, f"{key}: {error:.1f} degrees"
-        reported = cr.rotation_from_viewpoint(*(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint))
+        reported = cr.rotation_from_viewpoint(
+            *(torch.as_tensor(v, dtype=torch.float64) for v in result.viewpoint)
+        )
         assert float(rotation_error(reported, known["rotation"].double())) < case.rotation, key
         assert result.translation is None
 
 
 @pytest.fixture(scope="module")
 def cube():
-    """The first twelve frames of a real video, with poses, and a follower's registrar and camera."""
+    """The first twelve frames of a real video, with poses, and a follower's registrar and
+    camera."""
     folder = real_data("rbt/cube")
     K = json.loads((folder / "camera.json").read_text())
     truth = list(json.loads((folder / "truth.json").read_text()).items())[:12]
-    poses = [transform(*(torch.tensor(pose[name]).double() for name in ("R", "t"))) for _, pose in truth]
+    poses = [
+        transform(*(torch.tensor(pose[name]).double() for name in ("R", "t"))) for _, pose in truth
+    ]
     images = [read_image(folder / "frames" / f"{name}.jpg") for name, _ in truth]
     registrar = cr.Registrar(cr.load_mesh(folder / "mesh.ply", unit="mm"))
-    return registrar, cr.camera_matrix(*(K[name] for name in ("fx", "fy", "cx", "cy"))), images, poses
+    return (
+        registrar,
+        cr.camera_matrix(*(K[name] for name in ("fx", "fy", "cx", "cy"))),
+        images,
+        poses,
+    )
 
 
 def test_video_is_followed_from_a_box(cube):
     registrar, K, images, poses = cube
     box = projected_boxes(registrar.describer.hull, poses[0][None], K)[0]
-    follow, symmetries = Follower(registrar, K), registrar.symmetries_of(exact=True)
+    follow = Follower(registrar, K)
+    symmetries = registrar.symmetries_of(exact=True)
     for k, (image, T) in enumerate(zip(images, poses, strict=True)):
         result = follow(image, box if k == 0 else None)
-        error = symmetric_rotation_error(result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3])
+        error = symmetric_rotation_error(
+            result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3]
+        )
         assert float(error[0]) < 5.0
         assert float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
         assert result.confidence >= BELIEVED_CONFIDENCE
@@ -111,12 +135,15 @@ def test_video_is_followed_from_a_box(cube):
 def test_video_without_a_box_believes_no_wrong_pose(cube):
     """The cube stands among other things on a desk, and is not found."""
     registrar, K, images, poses = cube
-    follow, symmetries = Follower(registrar, K), registrar.symmetries_of(exact=True)
+    follow = Follower(registrar, K)
+    symmetries = registrar.symmetries_of(exact=True)
     for image, T in zip(images[::4], poses[::4], strict=True):  # each search takes seconds
         result = follow(image)
         if not result.ok:
             assert isinstance(result.error, LostObjectError)
             continue
-        error = symmetric_rotation_error(result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3])
+        error = symmetric_rotation_error(
+            result.rotation[None], T[None, :3, :3], symmetries[:, :3, :3]
+        )
         beside = float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm())
         assert (float(error[0]) < 5.0 and beside < 0.05) or result.confidence < BELIEVED_CONFIDENCE

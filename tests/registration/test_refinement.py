@@ -1,4 +1,5 @@
-"""Refinement of known poses: a start near the truth ends at the truth, and an object that is not there is lost."""
+"""Refinement of known poses: a start near the truth ends at the truth, and an object that is not
+there is lost."""
 
 import pytest
 import torch
@@ -19,16 +20,24 @@ def registrar():
 
 def moved(T, degrees=0.0, distance=0.0, axis=(0.6, 0.0, 0.8)):
     out = T.clone()
-    vector = torch.tensor(axis, dtype=torch.float64) * torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    vector = torch.tensor(axis, dtype=torch.float64) * torch.deg2rad(
+        torch.tensor(degrees, dtype=torch.float64)
+    )
     out[:3, :3] = rotation_from_axis_angle(vector) @ T[:3, :3]
     out[:3, 3] *= 1.0 + distance
     return out
 
 
-CHANGES = [(seed, change) for seed in (0, 1, 3) for change in ({"degrees": 10}, {"distance": 0.1}, {"distance": -0.1})]
+CHANGES = [
+    (seed, change)
+    for seed in (0, 1, 3)
+    for change in ({"degrees": 10}, {"distance": 0.1}, {"distance": -0.1})
+]
 
 
-@pytest.mark.parametrize(("seed", "change"), [*CHANGES, (2, {"degrees": 20, "axis": (0.0, 1.0, 0.0)})], ids=str)
+@pytest.mark.parametrize(
+    ("seed", "change"), [*CHANGES, (2, {"degrees": 20, "axis": (0.0, 1.0, 0.0)})], ids=str
+)
 def test_refine_ends_at_the_truth(registrar, seed, change):
     image, _, T = scene(seed)
     result = registrar.refine([image], CAMERA, [moved(T, **change)])[0]
@@ -52,7 +61,9 @@ def test_refine_loses_or_doubts_an_object_that_is_not_there(seed):
     empty = procedural_background((192, 256), torch.Generator().manual_seed(seed))
     result = learned_registrar().refine([empty], CAMERA, [T])[0]
     assert not result.ok or result.confidence < 0.3
-    assert result.ok or (isinstance(result.error, LostObjectError) and "image 0" in str(result.error))
+    assert result.ok or (
+        isinstance(result.error, LostObjectError) and "image 0" in str(result.error)
+    )
 
 
 def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(registrar):
@@ -88,7 +99,8 @@ TURNED = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
 
 
 def test_a_half_turn_does_not_become_believed_by_being_refined():
-    """The fit alone trusts contours that look alike from behind; all views of the bank, ranked again, do not."""
+    """The fit alone trusts contours that look alike from behind; all views of the bank, ranked
+    again, do not."""
     registrar = learned_registrar()
     for seed in (0, 1, 2, 3):
         image, box, T = scene(seed)
@@ -120,8 +132,12 @@ def test_poses_that_look_alike_are_confirmed_by_the_same_registration():
 def test_confidence_never_exceeds_that_of_the_start(start_confidence):
     registrar, (image, _, T) = learned_registrar(), scene(0)
     free = registrar.refine([image], CAMERA, [T])[0]
-    limited = cr.registration.refine(registrar, [image], CAMERA, [T], start_confidences=[start_confidence])[0]
-    again = cr.registration.refine(registrar, [image], CAMERA, [limited.transform], start_confidences=[None])[0]
+    limited = cr.registration.refine(
+        registrar, [image], CAMERA, [T], start_confidences=[start_confidence]
+    )[0]
+    again = cr.registration.refine(
+        registrar, [image], CAMERA, [limited.transform], start_confidences=[None]
+    )[0]
     assert free.confidence > start_confidence
     assert limited.confidence == start_confidence
     assert torch.equal(limited.rotation, free.rotation)

@@ -8,7 +8,14 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
-from curvireg_torch import ImageGradient, Registrar, ViewBank, ViewMatcher, rotation_error, sample_views
+from curvireg_torch import (
+    ImageGradient,
+    Registrar,
+    ViewBank,
+    ViewMatcher,
+    rotation_error,
+    sample_views,
+)
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
@@ -21,7 +28,15 @@ from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.inputs import ImageItem, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene, truck_bank, truck_registrar, unrefined
+from tests._support.scenes import (
+    CAMERA,
+    SIZE,
+    learned_registrar,
+    scene,
+    truck_bank,
+    truck_registrar,
+    unrefined,
+)
 
 IMAGES, BOXES, TRUTHS = zip(*(scene(seed) for seed in range(6)), strict=True)
 IMAGE, BOX, TRUTH = scene(0)
@@ -32,7 +47,9 @@ def test_poses_of_synthetic_scenes():
     registrars = truck_registrar(contours=False), truck_registrar()
     registered = [registrar(IMAGES, torch.stack(BOXES), CAMERA) for registrar in registrars]
     coarse, fine = (
-        torch.stack([rotation_error(r.rotation, T[:3, :3]) for r, T in zip(results, TRUTHS, strict=True)])
+        torch.stack(
+            [rotation_error(r.rotation, T[:3, :3]) for r, T in zip(results, TRUTHS, strict=True)]
+        )
         for results in registered
     )
     right = coarse < 20
@@ -40,7 +57,9 @@ def test_poses_of_synthetic_scenes():
     assert float(fine[right].median()) < 4
     assert float(fine[right].median()) <= float(coarse[right].median())
     for result, T, is_right in zip(registered[1], TRUTHS, right, strict=True):
-        assert not is_right or float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
+        assert (
+            not is_right or float((result.translation - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.05
+        )
 
 
 def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
@@ -60,7 +79,9 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
 
 def test_flat_mesh_without_colours_warns():
     plate = trimesh.creation.box((1.0, 0.6, 1e-5))
-    bank = ViewBank.build(plate, sample_views(azimuth_step=90, elevations=[20]), image_size=64, progress=False)
+    bank = ViewBank.build(
+        plate, sample_views(azimuth_step=90, elevations=[20]), image_size=64, progress=False
+    )
     assert "front and back look alike" in Registrar(bank).mesh_warnings[0]
     assert truck_registrar().mesh_warnings == ()
 
@@ -68,11 +89,21 @@ def test_flat_mesh_without_colours_warns():
 def test_failed_photographs_do_not_affect_others(tmp_path):
     nan = IMAGE.clone()
     nan[1, int(BOX[1]) + 9, int(BOX[0]) + 9] = torch.nan
-    grey, four = torch.full((3, 50, 50), 0.3), torch.zeros(4, 9, 9)
+    grey = torch.full((3, 50, 50), 0.3)
+    four = torch.zeros(4, 9, 9)
     images = [IMAGE, grey, nan, IMAGE, tmp_path / "none.png", IMAGE * 255, four, IMAGE]
     boxes = torch.stack([BOX, torch.tensor([5.0, 5, 40, 40]), BOX, -BOX, BOX, BOX, BOX, BOX])
     results = truck_registrar(contours=False)(images, boxes, CAMERA)
-    assert [result.ok for result in results] == [True, False, False, False, False, False, False, True]
+    assert [result.ok for result in results] == [
+        True,
+        False,
+        False,
+        False,
+        False,
+        False,
+        False,
+        True,
+    ]
     assert results[0].rotation.equal(results[7].rotation)
     messages = ["one colour", "NaN", "X0 < X1", "none.png: no such file", r"\[0, 1\]", "channels"]
     for i, (result, message) in enumerate(zip(results[1:7], messages, strict=True), start=1):
@@ -82,7 +113,8 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
 
 
 def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
-    fit_poses, counts = registrar_module.fit_poses, []
+    fit_poses = registrar_module.fit_poses
+    counts = []
 
     def counted(describer, images, poses, **options):
         counts.append(len(poses))
@@ -95,13 +127,17 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
 
 @pytest.mark.parametrize("weight", [0.0, registrar_module.SCREENING_WEIGHT])
 def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight):
-    registrar, item = truck_registrar(), ImageItem(IMAGE, BOX, CAMERA)
+    registrar = truck_registrar()
+    item = ImageItem(IMAGE, BOX, CAMERA)
     query = registrar.matcher.query([IMAGE], BOX[None])
-    ranking, bank = registrar.matcher.rank(query), registrar.bank
+    ranking = registrar.matcher.rank(query)
+    bank = registrar.bank
     right = rotation_error(bank.rotations, bank.rotations[ranking.order[0, 0]]) < 50
     seventh = distinct_views(ranking.order[0], bank.rotations, count=7)[-1]
     scores = torch.where(right, 0.999 * ranking.scores[0, seventh], ranking.scores[0])[None] ** 0.1
-    lowered = replace(ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True))
+    lowered = replace(
+        ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True)
+    )
     monkeypatch.setattr(registrar_module, "SCREENING_WEIGHT", weight)
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
     result = registrar.register(item, query)
@@ -117,9 +153,15 @@ def test_the_best_pose_is_not_one_outside_the_limits():
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
-def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(monkeypatch, shift, calls):
-    """The descriptions: of all poses, of the one that is fitted again if it moves, and of those that merged."""
-    registrar, quick_fit, fits, described = truck_registrar(), contour_fit.quick_fit, [], []
+def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
+    monkeypatch, shift, calls
+):
+    """The descriptions: of all poses, of the one that is fitted again if it moves, and of those
+    that merged."""
+    registrar = truck_registrar()
+    quick_fit = contour_fit.quick_fit
+    fits = []
+    described = []
     features_of = type(registrar).features_of
 
     def counted(contours, crops, K, T, *index):
@@ -145,7 +187,9 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
 
     def pretended(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
-        other = replace(fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support))
+        other = replace(
+            fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support)
+        )
         return other if options.get("again") else fitted
 
     monkeypatch.setattr(registrar_module, "fit_poses", pretended)
@@ -178,10 +222,13 @@ def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
 
 def test_origin_of_the_mesh_may_be_far_away():
     """A million radii, as in geographic coordinates."""
-    mesh, away = example_mesh(), torch.tensor([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0]).double()
+    mesh = example_mesh()
+    away = torch.tensor([1e6 * float(mesh_radius(example_mesh())), 0.0, 0.0]).double()
     mesh.apply_translation(away.numpy())
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
-    result = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))([IMAGE], BOX[None], CAMERA)[0]
+    result = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))(
+        [IMAGE], BOX[None], CAMERA
+    )[0]
     assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 2.0
     position = result.rotation @ away + result.translation
     assert float((position - TRUTH[:3, 3]).norm() / TRUTH[:3, 3].norm()) < 0.02
@@ -191,13 +238,23 @@ def test_registrar_accepts_tensors_arrays_and_paths_and_rejects_bad_calls(tmp_pa
     pixels = (IMAGE * 255).round().byte()
     array = pixels.permute(1, 2, 0).numpy()
     cv2.imwrite(str(tmp_path / "photo.png"), array[..., ::-1])
-    images = [pixels, array, array.astype("float32") / 255, tmp_path / "photo.png", str(tmp_path / "photo.png")]
+    images = [
+        pixels,
+        array,
+        array.astype("float32") / 255,
+        tmp_path / "photo.png",
+        str(tmp_path / "photo.png"),
+    ]
     first, *others = truck_registrar(contours=False)(images, [BOX.tolist()] * 5)
     for result in others:
-        torch.testing.assert_close(result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(
+            result.ranking.scores, first.ranking.scores, atol=1e-5, rtol=1e-4
+        )
     registrar = truck_registrar(contours=False)
     with pytest.raises(InvalidInputError, match="focal"):
-        _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[0].rotation
+        _ = registrar([IMAGE], BOX[None], torch.eye(3).double() * torch.tensor([0.0, 1, 1]))[
+            0
+        ].rotation
     for images, boxes, camera, message in (
         ([IMAGE], BOX[None], CAMERA.expand(2, 3, 3), r"expected \(3, 3\) or \(1, 3, 3\)"),
         ([IMAGE], BOX.expand(3, 4), None, r"shape \(1, 4\), one for each image, got \(3, 4\)"),
@@ -225,7 +282,11 @@ def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
     registrar = learned_registrar()
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
     assert result.reliable == (limit == 0.0)
-    assert (result.covariance is not None) == (result.standard_deviations is not None) == (limit == 0.0)
+    assert (
+        (result.covariance is not None)
+        == (result.standard_deviations is not None)
+        == (limit == 0.0)
+    )
     similar = Registrar(registrar.bank, mesh_is="similar")
     assert similar([IMAGE], BOX[None])[0].covariance is None
     unknown = replace(result, hypotheses=(replace(result.hypotheses[0], covariance=None),))
@@ -233,7 +294,8 @@ def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
 
 
 def test_progress_reports_stages_and_may_cancel(monkeypatch):
-    views, calls = sample_views(azimuth_step=90, elevations=[0, 30]), []
+    views = sample_views(azimuth_step=90, elevations=[0, 30])
+    calls = []
     pipeline = replace(PRESETS["classical"], hypotheses=1)
     options = {"pipeline": pipeline, "image_size": 64, "progress": lambda *call: calls.append(call)}
     monkeypatch.setattr("curvireg_torch.matching.bank.VIEWS_AT_A_TIME", 3)
@@ -273,15 +335,24 @@ def test_wrong_box_is_corrected():
 
 
 @pytest.mark.parametrize(
-    ("better", "evidence"), [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"landmarks": 2.0})]
+    ("better", "evidence"),
+    [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"landmarks": 2.0})],
 )
 def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evidence):
     """Evidence that depends on the box, as the rank does, is not compared."""
     registrar = truck_registrar()
     one = truck_registrar(box_jitter=0.0)([IMAGE], BOX[None], CAMERA)[0]
     first, other = (
-        replace(one, hypotheses=(replace(one.hypotheses[0], evidence=one.hypotheses[0].evidence | {**known}),))
-        for known in ({"similarity": 0.7, "rank": 0.0}, {"similarity": 0.7, "rank": -3.0} | evidence)
+        replace(
+            one,
+            hypotheses=(
+                replace(one.hypotheses[0], evidence=one.hypotheses[0].evidence | {**known}),
+            ),
+        )
+        for known in (
+            {"similarity": 0.7, "rank": 0.0},
+            {"similarity": 0.7, "rank": -3.0} | evidence,
+        )
     )
     answers = iter([first, other])
     monkeypatch.setattr(registrar, "_register_box", lambda _: next(answers))
@@ -290,11 +361,14 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
     assert (result.corrected_box is None) != better
 
 
-AZIMUTHS = (15.0, 45.0, 75.0, 225.0)  # Half-way between two views of a coarse bank, so that both lead to the same pose
+# Half-way between two views of a coarse bank, so that both lead to the same pose
+AZIMUTHS = (15.0, 45.0, 75.0, 225.0)
 
 
 def test_hypotheses_that_merge_are_put_back_and_come_last():
-    mesh, images, boxes = example_mesh(), [], []
+    mesh = example_mesh()
+    images = []
+    boxes = []
     for azimuth in AZIMUTHS:
         R = rotation_from_viewpoint(azimuth, 20.0, 0.0).double()
         T = transform(R, torch.tensor([0.0, 0.0, 3.5 * mesh_radius(mesh)]) - R @ mesh_centre(mesh))
@@ -302,22 +376,32 @@ def test_hypotheses_that_merge_are_put_back_and_come_last():
         images.append(image)
         boxes.append(box)
     views = sample_views(azimuth_step=30, elevations=[20])
-    registrar = Registrar(ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False))
+    registrar = Registrar(
+        ViewBank.build(mesh, views, pipeline=PRESETS["classical"], image_size=96, progress=False)
+    )
     restored = 0
     for result in registrar(images, torch.stack(boxes), CAMERA):
         starts = (registrar.bank.rotations[h.view].double() for h in result.hypotheses)
-        moves = (rotation_error(h.allocentric_rotation, R) for h, R in zip(result.hypotheses, starts, strict=True))
+        moves = (
+            rotation_error(h.allocentric_rotation, R)
+            for h, R in zip(result.hypotheses, starts, strict=True)
+        )
         is_moved = [float(degrees) > 0.01 for degrees in moves]
         assert is_moved[0]
         assert is_moved == sorted(is_moved, reverse=True)
         assert result.hypotheses[0].covariance is not None
-        assert all(h.covariance is None for h, moved in zip(result.hypotheses, is_moved, strict=True) if not moved)
+        assert all(
+            h.covariance is None
+            for h, moved in zip(result.hypotheses, is_moved, strict=True)
+            if not moved
+        )
         restored += is_moved.count(False)
     assert restored > 0
 
 
 def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
-    outside, allowed = r"outside \[0, 1\]", ((0.4, 0.4 + 2.0 / 255.0, None), (-0.0005, 1.0005, None))
+    outside = r"outside \[0, 1\]"
+    allowed = ((0.4, 0.4 + 2.0 / 255.0, None), (-0.0005, 1.0005, None))
     refused = (0.4, 0.4 + 0.9 / 255.0, "one colour"), (0.2, 1.01, outside), (-0.01, 0.8, outside)
     for low, high, message in (*refused, *allowed):
         crop = torch.full((3, 8, 8), low)
@@ -328,18 +412,22 @@ def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
 
 def test_boxes_are_compared_inside_the_photograph():
     for size, given, box, expected in (
-        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),  # cut off by the right border
+        # cut off by the right border
+        ((100, 200), (150.0, 20.0, 199.5, 80.0), (150.0, 20.0, 260.0, 80.0), False),
         ((100, 200), (150.0, 20.0, 199.5, 80.0), (130.0, 20.0, 240.0, 80.0), True),
         ((80, 120), (0.0, 10.0, 100.0, 60.0), (12.0, 10.0, 112.0, 60.0), True),  # IoU 0.79
-        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),  # outside: not used
+        # outside: not used
+        ((80, 120), (-0.5, 10.0, 60.0, 79.5), (-300.0, 10.0, -20.0, 79.5), False),
     ):
         item = ImageItem(torch.zeros(3, *size), torch.tensor(given), CAMERA)
         assert item.shows_other_part(torch.tensor(box, dtype=torch.float64)) == expected
 
 
 def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
-    """Photographs of a rig, registered to two meshes; if both are absent, the error is that of the first."""
-    both, found = Registrar([truck_bank(), truck_bank()]), truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
+    """Photographs of a rig, registered to two meshes; if both are absent, the error is that of the
+    first."""
+    both = Registrar([truck_bank(), truck_bank()])
+    found = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     absent = {both}
 
     def register(registrar, *_):

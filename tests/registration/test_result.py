@@ -1,4 +1,5 @@
-"""Made-up registrations: what is reliable, ambiguous, and how results become JSON and plain words."""
+"""Made-up registrations: what is reliable, ambiguous, and how results become JSON and plain
+words."""
 
 import json
 from dataclasses import replace
@@ -28,8 +29,17 @@ def registration(covariance=None, confidence=0.9, detection=None):
     terms = {"hog": torch.tensor([[0.5, 0.4]]), "appearance": torch.tensor([[0.3, torch.nan]])}
     ranking = Ranking(torch.tensor([[0.9, 0.8]]), torch.tensor([[0, 1]]), terms)
     eye = torch.eye(3, dtype=torch.float64)
-    common = {"rotation": eye, "translation": 2.0 * eye[2], "allocentric_rotation": eye, "distance": 2.0}
-    common |= {"evidence": {"rank": 0.0}, "projection": (torch.eye(4).double(), eye), "covariance": covariance}
+    common = {
+        "rotation": eye,
+        "translation": 2.0 * eye[2],
+        "allocentric_rotation": eye,
+        "distance": 2.0,
+    }
+    common |= {
+        "evidence": {"rank": 0.0},
+        "projection": (torch.eye(4).double(), eye),
+        "covariance": covariance,
+    }
     hypotheses = tuple(Hypothesis(**common, score=0.7 - 0.1 * view, view=view) for view in (0, 1))
     return Registration(hypotheses, (confidence, 0.0), ranking, detection=detection)
 
@@ -53,7 +63,11 @@ def test_to_dict_replaces_unbounded_deviations_by_null():
     document = registration(torch.diag(variances)).to_dict()
     degrees = 180.0 / torch.pi
     deviations = document["standard_deviations"]
-    assert deviations["rotation_deg"] == [pytest.approx(0.5 * degrees), pytest.approx(0.9 * degrees), None]
+    assert deviations["rotation_deg"] == [
+        pytest.approx(0.5 * degrees),
+        pytest.approx(0.9 * degrees),
+        None,
+    ]
     assert deviations["translation"] == [pytest.approx(0.9), pytest.approx(0.99), None]
     json.dumps(document, allow_nan=False)
 
@@ -69,20 +83,36 @@ def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
 
 
 def test_detection_document_reports_the_score_of_the_most_certain_instance():
-    boxes, responses = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double(), torch.tensor([7.0, 6.5])
-    found = [Detection(box, p, r, boxes, responses) for box, p, r in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)]
-    document = detection_document([registration(detection=one, confidence=0.5 * one.score) for one in found])
+    boxes = torch.tensor([[1.0, 2, 30, 40], [50, 2, 80, 40]]).double()
+    responses = torch.tensor([7.0, 6.5])
+    found = [
+        Detection(box, p, r, boxes, responses)
+        for box, p, r in zip(boxes, (0.9, 0.4), (7.0, 6.5), strict=True)
+    ]
+    document = detection_document(
+        [registration(detection=one, confidence=0.5 * one.score) for one in found]
+    )
     assert document["score"] == 0.9
-    assert [(one["score"], one["confidence"]) for one in document["instances"]] == [(0.9, 0.45), (0.4, 0.2)]
+    assert [(one["score"], one["confidence"]) for one in document["instances"]] == [
+        (0.9, 0.45),
+        (0.4, 0.2),
+    ]
     assert [one["box"] for one in document["proposals"]] == boxes.tolist()
     assert [one["response"] for one in document["proposals"]] == [7.0, 6.5]
 
 
 def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels():
     prior = {"azimuth": [0, 9], "contradiction": None}
-    assert remarks({"corrected_box": None}) == remarks({"corrected_box": None, "prior": prior}) == []
-    for contradiction, words in (("better outside", "much better outside"), ("at the limit", "at one of")):
-        (line,) = remarks({"corrected_box": None, "prior": {**prior, "contradiction": contradiction}})
+    assert (
+        remarks({"corrected_box": None}) == remarks({"corrected_box": None, "prior": prior}) == []
+    )
+    for contradiction, words in (
+        ("better outside", "much better outside"),
+        ("at the limit", "at one of"),
+    ):
+        (line,) = remarks(
+            {"corrected_box": None, "prior": {**prior, "contradiction": contradiction}}
+        )
         assert words in line
     (line,) = remarks({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
     assert line.endswith(": 1 3 30 41")
@@ -91,8 +121,15 @@ def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels(
 def test_pose_and_verdict_in_words():
     for viewpoint, words in (
         ((0, 0, 0), "seen from the front (azimuth 0°), level"),
-        ((88, -12, 5), "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left"),
-        ((225, 30, -40), "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the right"),
+        (
+            (88, -12, 5),
+            "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left",
+        ),
+        (
+            (225, 30, -40),
+            "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the "
+            "right",
+        ),
         ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
         ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
     ):
@@ -100,7 +137,8 @@ def test_pose_and_verdict_in_words():
         assert pose_in_words(R) == words
         for up, front in (("y", None), ("-x", None), ("z", "x")):
             assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
-    # A high confidence that is not reliable, because of a questionable camera, is no reason to be sure.
+    # A high confidence that is not reliable, because of a questionable camera, is no reason to be
+    # sure.
     assert (verdict(0.95, 0.03, True), verdict(0.95, 0.03, False)) == ("likely", "unsure")
     assert (verdict(0.4, 0.39, False), verdict(0.4, 0.41, False)) == ("unsure", "no match")
     assert verdict(None, None, False) == "unsure"
@@ -118,7 +156,13 @@ def turned(*degrees: float, elevation: float = 0.0) -> torch.Tensor:
 
 def test_ambiguity():
     azimuths = (10.0,), (10.0, 190.0), (40.0, 320.0), (40.0, 100.0), (0.0, 120.0, 240.0)
-    assert [ambiguity(turned(*some)) for some in azimuths] == [None, "half turn", "mirror", "several", "several"]
+    assert [ambiguity(turned(*some)) for some in azimuths] == [
+        None,
+        "half turn",
+        "mirror",
+        "several",
+        "several",
+    ]
     # Rivals that are half as probable:
     found = registration()
     pairs = zip(found.hypotheses, turned(40.0, 320.0), strict=True)
@@ -131,7 +175,10 @@ def test_ambiguity():
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():
     sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.9, 0.0))
     assert sure.reliable
-    changes = [{"warnings": ("the camera is questionable",)}, {"prior_contradiction": "better outside"}]
+    changes = [
+        {"warnings": ("the camera is questionable",)},
+        {"prior_contradiction": "better outside"},
+    ]
     for change in (
         {"probabilities": (0.89, 0.0)},
         {"probabilities": (torch.nan, 0.0)},
@@ -143,7 +190,9 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
     # Not where all three rotations are unknown, as those of a sphere.
     variances = torch.tensor([9.0, 9.0, 9.0, 1e-4, 1e-4, 1e-4], dtype=torch.float64)
     sphere = registration(covariance=torch.diag(variances), confidence=0.95)
-    fitted = replace(sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses))
+    fitted = replace(
+        sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses)
+    )
     assert not fitted.reliable
     variances[0] = 1e-4
     known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)

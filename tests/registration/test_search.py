@@ -29,7 +29,13 @@ def test_coherent_views_are_connected_with_the_best_by_neighbours():
     angles = torch.tensor([[10.0, 20, 0], [30, 20, 0], [50, 60, 0], [90, 20, 0], [10, 20, 90]])
     assert search.coherent_views(angles).tolist() == [True, True, True, False, False]
     assert search.coherent_views(angles[[0, 2, 3]]).tolist() == [True, False, False]
-    assert search.coherent_views(angles, (5.0, 5.0, 5.0)).tolist() == [True, False, False, False, False]
+    assert search.coherent_views(angles, (5.0, 5.0, 5.0)).tolist() == [
+        True,
+        False,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_angles_near_run_on_past_the_pole():
@@ -40,7 +46,9 @@ def test_angles_near_run_on_past_the_pole():
     torch.testing.assert_close(before, after, rtol=0, atol=1e-6)
     assert same[20].tolist() == angles[20].tolist()
     past = 2 * 18 + 2  # elevation 100 degrees, above elevation 50 with the same azimuth
-    assert torch.allclose(same[past] - same[20], torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64), atol=1e-4)
+    assert torch.allclose(
+        same[past] - same[20], torch.tensor([0.0, 50.0, 0.0], dtype=torch.float64), atol=1e-4
+    )
 
 
 def test_divided_contains_both_ends():
@@ -50,8 +58,11 @@ def test_divided_contains_both_ends():
 
 
 def test_motion_is_the_frobenius_norm_of_the_relative_transform_in_radii():
-    R, S = rotation_from_viewpoint(torch.tensor([20.0, 50.0]).double(), 10.0, torch.tensor([0.0, 4.0]).double())
-    first, second = torch.eye(4).double(), torch.eye(4).double()
+    R, S = rotation_from_viewpoint(
+        torch.tensor([20.0, 50.0]).double(), 10.0, torch.tensor([0.0, 4.0]).double()
+    )
+    first = torch.eye(4).double()
+    second = torch.eye(4).double()
     first[:3, :3], second[:3, :3] = R, S
     first[2, 3], second[2, 3] = 5.0, 5.4
     E = torch.linalg.matrix_norm(torch.linalg.inv(first) @ second - torch.eye(4).double())
@@ -59,11 +70,14 @@ def test_motion_is_the_frobenius_norm_of_the_relative_transform_in_radii():
 
 
 class Peak:
-    """A matcher that knows the best view: the nearer a view is to it, in angle and distance, the better."""
+    """A matcher that knows the best view: the nearer a view is to it, in angle and distance, the
+    better."""
 
     def __init__(self, bank: Any, truth: Tensor, distance: float) -> None:
-        self.bank, self.compared = bank, []
-        self.truth, self.distance = truth, distance
+        self.bank = bank
+        self.compared = []
+        self.truth = truth
+        self.distance = distance
 
     def scores(self, views: Any) -> Tensor:
         angle = rotation_error(views.rotations, self.truth.float())
@@ -75,12 +89,17 @@ class Peak:
 
 
 def searched(
-    *truth: float, camera: str = "perspective", frame: str = "own", allowed: tuple[float, float] = (0.0, 360.0)
+    *truth: float,
+    camera: str = "perspective",
+    frame: str = "own",
+    allowed: tuple[float, float] = (0.0, 360.0),
 ) -> tuple[float, float, Any]:
-    """Error of the rotation in degrees and distance in radii that the search finds on a bank of neighbours, some
-    of which are allowed, and the matcher."""
+    """Error of the rotation in degrees and distance in radii that the search finds on a bank of
+    neighbours, some of which are allowed, and the matcher."""
     mesh = trimesh.creation.box((1, 2, 3))
-    pipeline = Pipeline(views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera))
+    pipeline = Pipeline(
+        views=ViewPolicy(frame=frame), bank=BankSettings(image_size=32, camera=camera)
+    )
     turn = principal_rotation(mesh) if frame == "principal" else torch.eye(3).double()
     grid = sample_views(azimuth_step=20, elevations=[0, 50], distances=[3.0, 4.5])
     views = grid.in_frame(turn)
@@ -113,13 +132,16 @@ def test_search_is_between_allowed_views():
 def test_search_is_in_the_frame_of_the_views():
     error, _, matcher = searched(207.0, 0.0, 3.7, frame="principal")
     assert error < 2.1
-    azimuth, elevation, _ = viewpoint_from_rotation(matcher.compared[0].rotations.double() @ matcher.turn.T)
+    azimuth, elevation, _ = viewpoint_from_rotation(
+        matcher.compared[0].rotations.double() @ matcher.turn.T
+    )
     assert sorted(set(azimuth.round().tolist())) == [200, 205, 210, 215, 220]
     assert set(elevation.round().abs().tolist()) == {0}
 
 
 def test_search_stops_by_the_motion(monkeypatch):
-    rounds, errors = [], []
+    rounds = []
+    errors = []
     for stop in (1e9, 0.2, 0.05):
         monkeypatch.setattr(search, "STOP_MOTION", stop)
         error, distance, matcher = searched(207.0, 0.0, 3.7)
@@ -132,7 +154,8 @@ def test_search_stops_by_the_motion(monkeypatch):
 def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
     _, distance, matcher = searched(207.0, 20.0, 3.0, camera="orthographic")
     assert set(matcher.compared[0].distance.tolist()) == {3.0}
-    assert sorted(set(matcher.compared[0].elevation.round().tolist()))[:3] == [0, 5, 10]  # three directions
+    # three directions
+    assert sorted(set(matcher.compared[0].elevation.round().tolist()))[:3] == [0, 5, 10]
     assert distance == pytest.approx(3.0)
 
 
@@ -144,14 +167,22 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     def refused(*_: Any, **__: Any) -> Any:
         raise AssertionError("not a stage of the paper")
 
-    for name in ("fit_poses", "with_quick_fit", "with_edge_support", "fit_texture_of", "landmark_evidence"):
+    for name in (
+        "fit_poses",
+        "with_quick_fit",
+        "with_edge_support",
+        "fit_texture_of",
+        "landmark_evidence",
+    ):
         monkeypatch.setattr(registrar, name, refused)
     monkeypatch.setattr(registrar, "EdgeCrops", refused)
     monkeypatch.setattr(poses, "fit_to_edges", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
     stages: list[str] = []
-    bank = ViewBank.build(truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: stages.append(x[0]))
+    bank = ViewBank.build(
+        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: stages.append(x[0])
+    )
     image, box, _ = scene(0)
     result = Registrar(bank, progress=lambda *x: stages.append(x[0]))([image], box[None], CAMERA)[0]
     assert list(dict.fromkeys(stages)) == ["bank", "ranking", "search"]
@@ -160,18 +191,33 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     assert result.confidence is None
     assert result.hypotheses[0].edge_support is None
     paper = bank.pipeline
-    assert (paper.field, paper.box_jitter, paper.search, paper.contours) == ("MFC", 0.0, True, False)
-    assert (len(bank), bank.settings.camera, bank.settings.formula) == (756, "orthographic", "paper")
+    assert (paper.field, paper.box_jitter, paper.search, paper.contours) == (
+        "MFC",
+        0.0,
+        True,
+        False,
+    )
+    assert (len(bank), bank.settings.camera, bank.settings.formula) == (
+        756,
+        "orthographic",
+        "paper",
+    )
 
 
 def test_paper_views_are_those_of_the_principal_axes_and_poses_those_of_the_mesh():
-    """A rotated copy of the mesh has the same views, and its pose in the same photograph is rotated alike."""
+    """A rotated copy of the mesh has the same views, and its pose in the same photograph is rotated
+    alike."""
     turn = rotation_from_viewpoint(70.0, 25.0, 40.0).double()
     T = torch.eye(4).double()
     T[:3, :3] = turn
     copy = truck_bank().mesh.copy().apply_transform(T.numpy())
-    one, other = (ViewBank.build(m, pipeline=PRESETS["paper"], progress=False) for m in (truck_bank().mesh, copy))
-    torch.testing.assert_close(other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5)
+    one, other = (
+        ViewBank.build(m, pipeline=PRESETS["paper"], progress=False)
+        for m in (truck_bank().mesh, copy)
+    )
+    torch.testing.assert_close(
+        other.rotations.double() @ turn, one.rotations.double(), rtol=0, atol=1e-5
+    )
     in_frame = one.rotations.double() @ principal_rotation(one.mesh).T
     torch.testing.assert_close(in_frame, paper_views().rotations.double(), rtol=0, atol=1e-5)
     image, box, _ = scene(0)
@@ -184,10 +230,14 @@ def test_the_search_comes_nearer_than_its_views():
     settings = {"views": upright, "bank": BankSettings(), "field": "focus"}
     errors: dict[bool, list[float]] = {}
     for with_search in (True, False):
-        given = replace(PRESETS["classical"], box_jitter=0.0, contours=False, search=with_search, **settings)
+        given = replace(
+            PRESETS["classical"], box_jitter=0.0, contours=False, search=with_search, **settings
+        )
         one = Registrar(truck_bank().mesh, pipeline=given)
         results = [(one([image], box[None])[0], T) for image, box, T in map(scene, range(4))]
-        errors[with_search] = [float(rotation_error(result.rotation, T[:3, :3])) for result, T in results]
+        errors[with_search] = [
+            float(rotation_error(result.rotation, T[:3, :3])) for result, T in results
+        ]
     assert sum(errors[True]) < sum(errors[False])
 
 

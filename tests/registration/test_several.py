@@ -17,7 +17,8 @@ from curvireg_torch.synthetic import example_mesh, procedural_background, synthe
 from tests._support.scenes import CAMERA, SIZE, learned_registrar
 
 EASY = ((100.0, 1), (135.0, 2), (175.0, 3))
-# Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the wrong way round
+# Azimuths and seeds of photographs; those of the second rig, with strong noise, are registered the
+# wrong way round
 IN_DOUBT = ((335.0, 100), (329.0, 105), (190.0, 107))
 # True T_world_from_model
 TURN = rotation_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]).double())
@@ -27,7 +28,8 @@ WORLD = transform(TURN, torch.tensor([0.2, 0.1, -0.4]).double())
 
 @cache
 def photograph(azimuth: float, seed: int, noise: float) -> tuple[Tensor, Tensor, Tensor]:
-    """(3, H, W), its box (4,) and the true ``T_cam_from_model``, from six radii away and slightly above."""
+    """(3, H, W), its box (4,) and the true ``T_cam_from_model``, from six radii away and slightly
+    above."""
     generator = torch.Generator().manual_seed(seed)
     mesh = example_mesh()
     R = rotation_from_viewpoint(azimuth, 8.0, 0.0).double()
@@ -37,7 +39,9 @@ def photograph(azimuth: float, seed: int, noise: float) -> tuple[Tensor, Tensor,
     return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0, 1), box, T
 
 
-def rig_of(which: tuple[tuple[float, int], ...], noise: float = 0.1) -> tuple[list[Tensor], list[Tensor], Tensor]:
+def rig_of(
+    which: tuple[tuple[float, int], ...], noise: float = 0.1
+) -> tuple[list[Tensor], list[Tensor], Tensor]:
     """Photographs, boxes, and ``T_cam_from_world`` (V, 4, 4)."""
     images, boxes, poses = zip(*(photograph(*one, noise) for one in which), strict=True)
     return list(images), list(boxes), torch.stack(poses) @ torch.linalg.inv(WORLD)
@@ -81,17 +85,23 @@ def test_photographs_prefer_a_pose_without_rivals_by_all_points(monkeypatch):
 
 
 def test_half_turns_in_doubt_are_decided_together():
-    """Views of the two ends differ by half a turn, but not of the same world: only the truth is common to all."""
+    """Views of the two ends differ by half a turn, but not of the same world: only the truth is
+    common to all."""
     images, boxes, cameras = rig_of(IN_DOUBT, noise=0.36)
     alone = learned_registrar()(images, torch.stack(boxes), CAMERA)
-    errors = [float(rotation_error(r.rotation, (c @ WORLD)[:3, :3])) for r, c in zip(alone, cameras, strict=True)]
+    errors = [
+        float(rotation_error(r.rotation, (c @ WORLD)[:3, :3]))
+        for r, c in zip(alone, cameras, strict=True)
+    ]
     assert sorted(errors)[1] > 150, "two of three"
     check_pose(registered(images, boxes, cameras), degrees=3.0, shift=0.2)
 
 
 def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(monkeypatch):
     """On full shelves the coarse fit moved right poses by 1 to 8 degrees."""
-    given, moved, fitted = [], [], Rig.fitted
+    given = []
+    moved = []
+    fitted = Rig.fitted
 
     def watched(rig, problem, T, radii):
         found = fitted(rig, problem, T, radii)
@@ -109,17 +119,24 @@ def test_photographs_that_fail_are_reported_and_change_nothing(easy, tmp_path):
     images, boxes, cameras = rig_of(EASY)
     other, box, T = photograph(60.0, 4, 0.1)
     empty = procedural_background(SIZE, torch.Generator().manual_seed(5))
-    more = torch.stack([T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)])
-    result = registered([*images, empty, tmp_path / "none.png"], [*boxes, box, box], torch.cat([cameras, more]))
+    more = torch.stack(
+        [T @ torch.linalg.inv(WORLD), photograph(220.0, 4, 0.1)[2] @ torch.linalg.inv(WORLD)]
+    )
+    result = registered(
+        [*images, empty, tmp_path / "none.png"], [*boxes, box, box], torch.cat([cameras, more])
+    )
     assert [view.failure is None for view in result.views] == [True, True, True, False, False]
     assert "not seen where" in result.views[3].failure or "lies outside" in result.views[3].failure
     assert "no such file" in result.views[4].failure
     assert result.views[4].box is None
     assert result.views[3].contribution == result.views[4].contribution == 0
     torch.testing.assert_close(result.transform, easy.transform, atol=1e-6, rtol=0)
-    torch.testing.assert_close(result.views[4].T_cam_from_model, more[1] @ easy.transform, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        result.views[4].T_cam_from_model, more[1] @ easy.transform, atol=1e-6, rtol=0
+    )
     away = transform(HALF_TURN, torch.zeros(3).double()) @ cameras[:1]
-    result = registered([*images, other], [*boxes, box], torch.cat([cameras, away]))  # it looks the other way
+    # it looks the other way
+    result = registered([*images, other], [*boxes, box], torch.cat([cameras, away]))
     assert [view.failure is None for view in result.views] == [True, True, True, False]
     check_pose(result, degrees=1.0, shift=0.05)
     shown = registered([*images, other], [*boxes, box], torch.cat([cameras, more[:1]]))
@@ -158,7 +175,9 @@ def test_one_photograph_gives_the_answer_of_the_registrar():
 def test_covariance_shrinks_with_photographs_but_not_with_copies(easy):
     images, boxes, cameras = rig_of(EASY)
     two = registered(images[:2], boxes[:2], cameras[:2])
-    deviations = [torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (two, easy)]
+    deviations = [
+        torch.linalg.eigvalsh(r.hypotheses[0].covariance[3:, 3:]).sqrt() for r in (two, easy)
+    ]
     alone = registered(images[:1], boxes[:1], cameras[:1])
     largest = torch.linalg.eigvalsh(alone.hypotheses[0].covariance[3:, 3:])[-1].sqrt()
     assert float(deviations[0][-1]) < 0.5 * float(largest)  # the depth is seen from the side
@@ -194,17 +213,31 @@ def in_another_unit(T: Tensor, factor: float) -> Tensor:
 
 def test_bad_rigs_name_the_photograph():
     for change, message in (
-        (lambda T: in_another_unit(T, 1000.0), "image 0: T_cam_from_world: by its size .* mesh's unit"),
-        (lambda T: in_another_unit(T, 0.001), "image 0: T_cam_from_world: by its size .* mesh's unit"),
+        (
+            lambda T: in_another_unit(T, 1000.0),
+            "image 0: T_cam_from_world: by its size .* mesh's unit",
+        ),
+        (
+            lambda T: in_another_unit(T, 0.001),
+            "image 0: T_cam_from_world: by its size .* mesh's unit",
+        ),
         (lambda T: T[[0, 1, 1]], "image 2: T_cam_from_world: the same as of image 1"),
-        (lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]), "image 1: T_cam_from_world: expected rigid"),
-        (lambda T: T.index_fill(0, torch.tensor([2]), torch.nan), "image 2: T_cam_from_world: expected finite"),
+        (
+            lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]),
+            "image 1: T_cam_from_world: expected rigid",
+        ),
+        (
+            lambda T: T.index_fill(0, torch.tensor([2]), torch.nan),
+            "image 2: T_cam_from_world: expected finite",
+        ),
         (lambda T: T[:2], r"T_cam_from_world: expected shape \(3, 4, 4\)"),
     ):
         images, boxes, cameras = rig_of(EASY)
         with pytest.raises(InvalidInputError, match=message):
             registered(images, boxes, change(cameras))
-    with pytest.raises(InvalidInputError, match=r"no photograph can be registered: image 0: .*one colour"):
+    with pytest.raises(
+        InvalidInputError, match=r"no photograph can be registered: image 0: .*one colour"
+    ):
         registered([torch.zeros(3, *SIZE)], boxes[:1], cameras[:1])
     with pytest.raises(InvalidInputError, match=r"boxes: expected shape \(3, 4\)"):
         registered(images, boxes[:2], cameras)
@@ -218,7 +251,10 @@ def test_copies_of_a_photograph_are_no_evidence():
     thrice = registered(images[:1] * 3, boxes[:1] * 3, cameras[:1].repeat(3, 1, 1))
     assert thrice.probabilities == pytest.approx(once.probabilities)
     assert torch.equal(thrice.transform, once.transform)
-    assert [view.failure for view in thrice.views] == [None, *["a copy of image 0, which counts once"] * 2]
+    assert [view.failure for view in thrice.views] == [
+        None,
+        *["a copy of image 0, which counts once"] * 2,
+    ]
 
 
 def test_rigs_compare_rivals_that_are_not_reported():

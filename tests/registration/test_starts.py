@@ -18,10 +18,17 @@ def pose(*translation):
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0, 0.001])  # a mesh in m, in mm, and in km
 def test_the_likely_mistake_is_named(scale):
-    hull = scale * 0.05 * (torch.rand(20, 3, generator=torch.manual_seed(0), dtype=torch.float64) - 0.5)
+    hull = (
+        scale
+        * 0.05
+        * (torch.rand(20, 3, generator=torch.manual_seed(0), dtype=torch.float64) - 0.5)
+    )
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     right = pose(0.02 * scale, 0.01 * scale, 0.4 * scale)
-    for factor, words in ((0.001, "1000 times too small, as metres"), (1000.0, "1000 times too large, as mm")):
+    for factor, words in (
+        (0.001, "1000 times too small, as metres"),
+        (1000.0, "1000 times too large, as mm"),
+    ):
         wrong = right.clone()
         wrong[:3, 3] *= factor
         assert f"{words} beside a mesh in m" in why_outside(hull, wrong, K, SIZE)

@@ -1,4 +1,5 @@
-"""Texture fit: a label determines the rotation of a can, and a pose without the label in the photograph stays."""
+"""Texture fit: a label determines the rotation of a can, and a pose without the label in the
+photograph stays."""
 
 from dataclasses import replace
 
@@ -17,16 +18,24 @@ from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.registration.contour_fit import ContourProblem
 from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.registration.least_squares import apply_twist
-from curvireg_torch.registration.texture_fit import _TextureRounds, fit_texture, match_patches, turned
+from curvireg_torch.registration.texture_fit import (
+    _TextureRounds,
+    fit_texture,
+    match_patches,
+    turned,
+)
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support.cans import can, photograph
 from tests._support.scenes import CAMERA
 
 MESH = can()
-R = rotation_from_viewpoint(*torch.tensor((17.0, 22.0, 0.0), dtype=torch.float64)) @ up_rotation("y")
+R = rotation_from_viewpoint(*torch.tensor((17.0, 22.0, 0.0), dtype=torch.float64)) @ up_rotation(
+    "y"
+)
 TRUTH = transform(R[None], torch.tensor([[0.1, -0.05, 7.0]], dtype=torch.float64))
-CENTRE, CONTOURS = mesh_centre(MESH), MeshContours(MESH)
+CENTRE = mesh_centre(MESH)
+CONTOURS = MeshContours(MESH)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +56,9 @@ def fit(renderer, image, starts, mesh=MESH) -> ContourFit | None:
 
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     crops = EdgeCrops.cut([image], box.float(), 0.1)
-    return fit_texture(draw, renderer, ContourProblem.of(CONTOURS, crops, CAMERA[None]), crops.crops[0], starts)
+    return fit_texture(
+        draw, renderer, ContourProblem.of(CONTOURS, crops, CAMERA[None]), crops.crops[0], starts
+    )
 
 
 def error(found: ContourFit) -> float:
@@ -66,7 +77,8 @@ def test_label_determines_the_rotation_about_the_axis(renderer, degrees):
 
 
 def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
-    image, start = photograph(MESH, TRUTH), turned_can(28.0)
+    image = photograph(MESH, TRUTH)
+    start = turned_can(28.0)
     alone = fit(renderer, image, start)
     assert alone is None or error(alone) > 5.0
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
@@ -80,16 +92,22 @@ def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
 
 
 def test_turned_starts_need_an_axis_that_contours_do_not_determine():
-    covariance = torch.diag(torch.tensor([0.1, 9.0, 0.1, 1e-4, 1e-4, 1e-4], dtype=torch.float64))[None]
+    covariance = torch.diag(torch.tensor([0.1, 9.0, 0.1, 1e-4, 1e-4, 1e-4], dtype=torch.float64))[
+        None
+    ]
 
     def contours(covariance, observable):
-        return ContourFit(TRUTH, covariance, torch.ones(1), torch.ones(1), torch.tensor([observable]))
+        return ContourFit(
+            TRUTH, covariance, torch.ones(1), torch.ones(1), torch.tensor([observable])
+        )
 
     assert turned(contours(covariance, 6), CENTRE).equal(TRUTH)
     assert turned(contours(covariance * torch.nan, 0), CENTRE).equal(TRUTH)
     starts = turned(contours(covariance, 5), CENTRE)
     assert rotation_error(starts[:, :3, :3], R).round().tolist() == [0, 16, 16]
-    assert torch.allclose((starts[1, :3, :3] @ R.mT)[1], torch.tensor([0.0, 1, 0], dtype=torch.float64))
+    assert torch.allclose(
+        (starts[1, :3, :3] @ R.mT)[1], torch.tensor([0.0, 1, 0], dtype=torch.float64)
+    )
     assert float(rotation_error(starts[1, :3, :3], starts[2, :3, :3])) == pytest.approx(32.0)
 
 
@@ -110,23 +128,36 @@ def test_fit_may_lose_a_little_edge_support(monkeypatch, renderer, after, counts
 @pytest.mark.parametrize(("before", "counts"), [(1.0, False), (0.0, True)])
 def test_fit_must_find_more_corners_than_the_start(monkeypatch, renderer, before, counts):
     search = _TextureRounds.round
-    monkeypatch.setattr(_TextureRounds, "round", lambda *given: replace(search(*given), before=before))
+    monkeypatch.setattr(
+        _TextureRounds, "round", lambda *given: replace(search(*given), before=before)
+    )
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
-@pytest.mark.parametrize(("coarse", "fine", "counts"), [(0.02, 0.5, False), (0.04, 0.14, False), (0.04, 0.16, True)])
+@pytest.mark.parametrize(
+    ("coarse", "fine", "counts"), [(0.02, 0.5, False), (0.04, 0.14, False), (0.04, 0.16, True)]
+)
 def test_fit_must_find_enough_corners(monkeypatch, renderer, coarse, fine, counts):
-    search, ratios = _TextureRounds.round, iter([coarse, fine])
-    monkeypatch.setattr(_TextureRounds, "round", lambda *given: replace(search(*given), before=0.0, after=next(ratios)))
+    search = _TextureRounds.round
+    ratios = iter([coarse, fine])
+    monkeypatch.setattr(
+        _TextureRounds,
+        "round",
+        lambda *given: replace(search(*given), before=0.0, after=next(ratios)),
+    )
     assert (fit(renderer, photograph(MESH, TRUTH), turned_can(5.0)) is not None) == counts
 
 
 def test_label_does_not_pull_a_pose_out_of_its_limits():
     """They are 10 degrees away from the true rotation."""
-    registrar = cr.Registrar(MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y"))
+    registrar = cr.Registrar(
+        MESH, views=cr.sample_views(azimuth_step=30, elevations=[20]).for_up("y")
+    )
     prior = cr.PosePrior(rotation=turned_can(16.0)[0, :3, :3], within=6.0)
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
-    free, limited = (registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior))
+    free, limited = (
+        registrar([photograph(MESH, TRUTH)], box, CAMERA, prior=p)[0] for p in (None, prior)
+    )
     assert float(rotation_error(free.rotation, R)) < 1.0
     assert float(prior.excess(limited.rotation)) <= 3.0
     assert limited.hypotheses[0].covariance is not None, "its contours are fitted"
@@ -136,7 +167,8 @@ def test_match_finds_patches_that_moved_by_fractions_of_pixels_unless_they_slide
     rng = np.random.default_rng(0)
     view = cv2.GaussianBlur(rng.random((96, 96, 3)).astype(np.float32), (0, 0), 2.0)
     shift = np.array([[1, 0, 3.3], [0, 1, -4.6]])
-    photograph = 0.2 + 0.5 * cv2.warpAffine(view, shift, (96, 96), flags=cv2.INTER_CUBIC)  # in other light
+    # in other light
+    photograph = 0.2 + 0.5 * cv2.warpAffine(view, shift, (96, 96), flags=cv2.INTER_CUBIC)
     offset, weight = match_patches(view, photograph, np.array([[30, 40], [48, 50], [60, 36]]), 8)
     assert np.abs(offset - (3.3, -4.6)).max() < 0.1
     assert weight.min() > 0.9

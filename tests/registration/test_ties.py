@@ -1,4 +1,5 @@
-"""Poses that look the same: named, never believed; and small features that tell which one is right."""
+"""Poses that look the same: named, never believed; and small features that tell which one is
+right."""
 
 from functools import cache
 
@@ -19,7 +20,8 @@ from tests._support.scenes import CAMERA, SIZE
 
 @cache
 def hollow_box() -> trimesh.Trimesh:
-    """A box of 200 x 120 x 90, one half of which is hollow from below: from above it looks like a plain box."""
+    """A box of 200 x 120 x 90, one half of which is hollow from below: from above it looks like a
+    plain box."""
     outer = trimesh.creation.box((200, 120, 90))
     cavity = trimesh.creation.box((80, 90, 70))
     cavity.apply_translation((44, 0, -10))
@@ -47,7 +49,9 @@ def registrar_of(mesh: trimesh.Trimesh, **options: object) -> Registrar:
     return Registrar(ViewBank.build(mesh, views, image_size=96, progress=False), **options)
 
 
-def photograph(mesh: trimesh.Trimesh, azimuth: float, elevation: float, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+def photograph(
+    mesh: trimesh.Trimesh, azimuth: float, elevation: float, seed: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """(3, H, W), its box (4,) and the true ``T_cam_from_model``."""
     generator = torch.Generator().manual_seed(seed)
     R = rotation_from_viewpoint(azimuth, elevation, 0.0).double()
@@ -56,14 +60,18 @@ def photograph(mesh: trimesh.Trimesh, azimuth: float, elevation: float, seed: in
     return (*synthesize_photograph(mesh, T, CAMERA, SIZE, generator), T)
 
 
-def registered(registrar: Registrar, azimuth: float, elevation: float, seed: int) -> tuple[Registration, float]:
+def registered(
+    registrar: Registrar, azimuth: float, elevation: float, seed: int
+) -> tuple[Registration, float]:
     """The result and its error in degrees."""
     image, box, T = photograph(registrar.bank.mesh, azimuth, elevation, seed)
     result = registrar([image], box[None], CAMERA)[0]
     return result, float(rotation_error(result.rotation, T[:3, :3]))
 
 
-@pytest.mark.parametrize(("azimuth", "elevation", "seed"), [(35.0, 25.0, 0), (160.0, 40.0, 1), (250.0, 15.0, 2)])
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "seed"), [(35.0, 25.0, 0), (160.0, 40.0, 1), (250.0, 15.0, 2)]
+)
 def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimuth, elevation, seed):
     assert len(mesh_symmetries(hollow_box())) == 1
     result, error = registered(registrar_of(hollow_box()), azimuth, elevation, seed)
@@ -78,7 +86,9 @@ def test_half_turn_that_nothing_in_view_decides_is_named_and_not_reliable(azimut
 
 def test_rig_that_sees_only_what_looks_the_same_names_the_tie():
     registrar = registrar_of(hollow_box())
-    images, boxes, poses = zip(*(photograph(hollow_box(), a, 30.0, int(a)) for a in (20.0, 65.0, 110.0)), strict=True)
+    images, boxes, poses = zip(
+        *(photograph(hollow_box(), a, 30.0, int(a)) for a in (20.0, 65.0, 110.0)), strict=True
+    )
     result = registrar.register_views(list(images), list(boxes), CAMERA, torch.stack(poses))
     assert result.ambiguous == "half turn"
     assert not result.reliable
@@ -103,7 +113,8 @@ def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_diffe
 
 
 def test_given_symmetries_are_trusted():
-    bank, group = registrar_of(marked_box()).bank, mesh_symmetries(marked_box())
+    bank = registrar_of(marked_box()).bank
+    group = mesh_symmetries(marked_box())
     result, _ = registered(Registrar(bank, symmetries=group), 20.0, 35.0, 20)
     turned = result.rotation @ group[1:, :3, :3].double()
     for hypothesis in result.hypotheses[1:]:
@@ -111,7 +122,8 @@ def test_given_symmetries_are_trusted():
 
 
 def test_telling_symmetries_are_those_that_a_feature_breaks():
-    box, cylinder = trimesh.creation.box((200, 120, 80)), trimesh.creation.cylinder(40, 150, sections=72)
+    box = trimesh.creation.box((200, 120, 80))
+    cylinder = trimesh.creation.cylinder(40, 150, sections=72)
     for mesh in (box, cylinder):
         assert len(telling_symmetries(mesh, mesh_symmetries(mesh))) == 1, "nothing to measure"
     group = mesh_symmetries(marked_box())
@@ -127,5 +139,7 @@ def test_spread_keeps_few_symmetries_far_apart():
     group = mesh_symmetries(trimesh.creation.cylinder(40, 150, sections=72))
     some = spread(group)
     assert (len(group), len(some)) == (72, MAX_SIBLINGS)
-    apart = rotation_error(some[:, None, :3, :3], some[None, :, :3, :3]) + 360.0 * torch.eye(MAX_SIBLINGS)
+    apart = rotation_error(some[:, None, :3, :3], some[None, :, :3, :3]) + 360.0 * torch.eye(
+        MAX_SIBLINGS
+    )
     assert float(apart.min()) >= 30.0

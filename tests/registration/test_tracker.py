@@ -1,4 +1,5 @@
-"""The tracker: each measurement alone on drawn objects and in closed form, and together on generated sequences."""
+"""The tracker: each measurement alone on drawn objects and in closed form, and together on
+generated sequences."""
 
 import math
 from types import SimpleNamespace
@@ -56,7 +57,9 @@ def moved(T, angles, shift):
 def drawn(T, inside=(0.8, 0.2, 0.2), outside=(0.2, 0.5, 0.3)):
     """A cube of one colour on a background of another."""
     mask = make_renderer(cube()).render(T[None], K, SIZE)[0] > 0
-    return torch.where(mask, torch.tensor(inside)[:, None, None], torch.tensor(outside)[:, None, None])
+    return torch.where(
+        mask, torch.tensor(inside)[:, None, None], torch.tensor(outside)[:, None, None]
+    )
 
 
 def shift_in_pixels(T, truth):
@@ -67,15 +70,19 @@ def shift_in_pixels(T, truth):
 
 
 def plate(x: float = 0.0, y: float = 0.0):
-    """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and depth."""
-    T = transform(torch.eye(3, dtype=torch.float64), torch.tensor([x, y, 5.0], dtype=torch.float64))[None]
+    """A plate with a print, 160 px wide, moved in its plane by (x, y): its window, pose, and
+    depth."""
+    T = transform(
+        torch.eye(3, dtype=torch.float64), torch.tensor([x, y, 5.0], dtype=torch.float64)
+    )[None]
     size = (CROP_SIZE, CROP_SIZE)
     depth = make_renderer(trimesh.creation.box((2.0, 2.0, 0.01))).render(T, WINDOW_K, size)
     rough = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0))
     smooth = torch.nn.functional.interpolate(rough, size=1024, mode="bicubic")[0, 0]
     v, u = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
     shift = 80.0 * torch.tensor([x, y])
-    look = smooth[(v - shift[1] + 300).long(), (u - shift[0] + 300).long()]  # shifts of whole pixels
+    # shifts of whole pixels
+    look = smooth[(v - shift[1] + 300).long(), (u - shift[0] + 300).long()]
     grey = (255 * torch.where(depth[0, 0] > 0, look, 0.5)).clamp(0, 255).byte().numpy()
     return framed(grey), T, depth
 
@@ -166,7 +173,8 @@ def test_tracker_follows_a_generated_sequence_until_the_object_is_absent():
 
 def test_covariance_counts_edges_near_the_pose():
     """At a pose that is 5 % too near, all edges are some 4 px inside its outline."""
-    follow, near = make_tracker(cube()), START.clone()
+    follow = make_tracker(cube())
+    near = START.clone()
     near[2, 3] *= 0.95
     follow.start(drawn(START), K, START)
     there, beside = (follow.covariance(follow.measure(drawn(START), K, T)) for T in (START, near))
@@ -191,13 +199,16 @@ def test_frames_from_other_directions_become_keyframes():
     follow.start(frames[0][0], CAMERA, frames[0][2])
     for image, _, T in frames[1:]:
         follow.accept(follow.measure(image, CAMERA, T))
-    angles = [float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes]
+    angles = [
+        float(rotation_error(k.T[0, :3, :3], frames[0][2][:3, :3])) for k in follow._keyframes
+    ]
     assert angles == pytest.approx([0.0, 8.02, 16.04, 24.06, 32.09], abs=0.05)
 
 
 def test_posterior_is_that_of_bayes():
     ratio = torch.tensor([[0.3, -0.2, 0.9, -1.1, 0.4]], dtype=torch.float64)
-    likelihood = [math.exp(0.3), math.exp(0.1), math.exp(1.0), math.exp(-0.1)]  # ends at -1.5, -0.5, 0.5, 1.5
+    # ends at -1.5, -0.5, 0.5, 1.5
+    likelihood = [math.exp(0.3), math.exp(0.1), math.exp(1.0), math.exp(-0.1)]
     p = torch.tensor(likelihood) / sum(likelihood)
     d = torch.tensor([-1.5, -0.5, 0.5, 1.5])
     mean, variance = line_posterior(ratio, 2)
@@ -206,7 +217,8 @@ def test_posterior_is_that_of_bayes():
 
 
 def halves():
-    """A red left half and a green right half; pixel columns of 8 lines that point to the right from the middle."""
+    """A red left half and a green right half; pixel columns of 8 lines that point to the right from
+    the middle."""
     colours = torch.zeros(1, 3, 16, 16)
     colours[:, 0, :, :8], colours[:, 1, :, 8:] = 1.0, 1.0
     y, x = torch.meshgrid(torch.arange(4.0, 12.0), torch.arange(16.0), indexing="ij")
@@ -215,12 +227,14 @@ def halves():
 
 def test_log_ratio_has_the_sign_of_the_learned_colours():
     bins, uv = halves()
-    model, zero = RegionModel(), torch.zeros(8)
+    model = RegionModel()
+    zero = torch.zeros(8)
     model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten())
     ratio = model.log_ratio(bins, uv, zero)
     assert (ratio[:, :8] > 0.3).all()
     assert (ratio[:, 8:] < -0.3).all()
-    opposite = model.log_ratio(bins, uv, zero + math.pi)  # nothing learned there but the mean of all directions
+    # nothing learned there but the mean of all directions
+    opposite = model.log_ratio(bins, uv, zero + math.pi)
     assert (opposite[:, :8] > 0.1).all()
     assert (opposite[:, :8] < ratio[:, :8]).all()
     outside = model.log_ratio(bins, uv - 100.0, zero)
@@ -229,8 +243,10 @@ def test_log_ratio_has_the_sign_of_the_learned_colours():
 
 def test_histograms_move_by_the_rate_towards_new_colours():
     bins, uv = halves()
-    model, directions = RegionModel(), torch.zeros(128)
-    red, green = bins[0, 0], bins[0, 15]
+    model = RegionModel()
+    directions = torch.zeros(128)
+    red = bins[0, 0]
+    green = bins[0, 15]
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten())
     assert float(model._histograms[0, 0, red]) == 1.0
     model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten())  # the colours swap

@@ -46,7 +46,8 @@ def orthographic(request: pytest.FixtureRequest) -> bool:
 def camera(
     count: int, *, radius: float = 1.0, centre: Tensor | None = None, orthographic: bool = False
 ) -> tuple[Tensor, Tensor, tuple[int, int]]:
-    """Views from all around: off-centre camera, rectangular pixels, wide image, object partly outside."""
+    """Views from all around: off-centre camera, rectangular pixels, wide image, object partly
+    outside."""
     R = uniform_views(count).rotations.double()
     centre = torch.zeros(3, dtype=torch.float64) if centre is None else centre
     t = -(R @ centre)
@@ -72,7 +73,8 @@ def interior(a: Tensor, b: Tensor) -> Tensor:
 
 
 def smooth(depth: Tensor, *, bend: float) -> Tensor:
-    """Pixels around which second differences of depth stay below ``bend``: no crease, no occlusion."""
+    """Pixels around which second differences of depth stay below ``bend``: no crease, no
+    occlusion."""
     padded = F.pad(depth, (1, 1, 1, 1), mode="replicate")
     H, W = depth.shape[-2:]
     worst = torch.zeros_like(depth)

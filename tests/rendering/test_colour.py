@@ -11,38 +11,54 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 
-COLOURS = [(230, 20, 20), (20, 220, 30), (30, 40, 240), (240, 230, 10), (10, 230, 230), (220, 20, 230)]
+COLOURS = [
+    (230, 20, 20),
+    (20, 220, 30),
+    (30, 40, 240),
+    (240, 230, 10),
+    (10, 230, 230),
+    (220, 20, 230),
+]
 SIZE = (72, 96)
 K = torch.tensor([[150.0, 0, 47.5], [0, 150.0, 35.5], [0, 0, 1]], dtype=torch.float64)
 
 
 def camera(azimuth: float, elevation: float, theta: float = 0.0, distance: float = 5.0) -> Tensor:
-    R = rotation_from_viewpoint(*(torch.tensor([a], dtype=torch.float64) for a in (azimuth, elevation, theta)))
+    R = rotation_from_viewpoint(
+        *(torch.tensor([a], dtype=torch.float64) for a in (azimuth, elevation, theta))
+    )
     return transform(R, torch.tensor([[0.0, 0.0, distance]], dtype=torch.float64))
 
 
 def textured_box() -> trimesh.Trimesh:
-    """A box whose six sides show six stripes of one texture; the left and the lower half of each are darker."""
+    """A box whose six sides show six stripes of one texture; the left and the lower half of each
+    are darker."""
     picture = np.zeros((16, 6 * 32, 3), np.uint8)
     for i, colour in enumerate(COLOURS):
         picture[:, 32 * i : 32 * (i + 1)] = colour
         picture[:, 32 * i : 32 * i + 16] //= 2
     picture[8:] //= 2
-    vertices, faces, uv = [], [], []
+    vertices = []
+    faces = []
+    uv = []
     for i in range(6):
-        axis, sign = i // 2, 1 if i % 2 else -1
+        axis = i // 2
+        sign = 1 if i % 2 else -1
         for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
             vertices.append(np.roll([sign, a, b], axis) * 0.5)
             uv.append(((i + 0.5 + 0.5 * a) / 6, 0.5 + 0.4 * b))
         faces += [[4 * i, 4 * i + 1, 4 * i + 2], [4 * i, 4 * i + 2, 4 * i + 3]]
-    material = trimesh.visual.material.SimpleMaterial(image=Image.fromarray(picture), diffuse=[255] * 4)
+    material = trimesh.visual.material.SimpleMaterial(
+        image=Image.fromarray(picture), diffuse=[255] * 4
+    )
     visual = trimesh.visual.TextureVisuals(uv=np.array(uv), material=material)
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
 def expected_albedo(points: np.ndarray) -> np.ndarray:
     """Colour of points on the box, from their side and halves."""
-    side, index = np.abs(points).argmax(axis=1), np.arange(len(points))
+    side = np.abs(points).argmax(axis=1)
+    index = np.arange(len(points))
     colour = np.array(COLOURS)[2 * side + (points[index, side] > 0)]
     for k in (1, 2):
         colour = np.where(points[index, (side + k) % 3, None] < 0, colour // 2, colour)
@@ -50,12 +66,20 @@ def expected_albedo(points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("view", [(20.0, 30.0, 0.0), (140.0, -40.0, 25.0), (260.0, 10.0, -70.0)])
-def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float, float], orthographic: bool) -> None:
-    mesh, T = textured_box(), camera(*view)
+def test_render_colour_shows_the_texture_of_every_side(
+    view: tuple[float, float, float], orthographic: bool
+) -> None:
+    mesh = textured_box()
+    T = camera(*view)
     intrinsics = K.clone()
     if orthographic:
         intrinsics[:2, :2] /= 5.0
-    picture = render_colour(mesh, T, intrinsics, SIZE, orthographic=orthographic)[0].permute(1, 2, 0).double().numpy()
+    picture = (
+        render_colour(mesh, T, intrinsics, SIZE, orthographic=orthographic)[0]
+        .permute(1, 2, 0)
+        .double()
+        .numpy()
+    )
     depth = make_renderer(mesh).render(T, intrinsics, SIZE, orthographic=orthographic)
     grey = shade(depth, intrinsics, orthographic=orthographic)[0, 0].double().numpy()
     z = depth[0, 0].double().numpy()
@@ -64,7 +88,8 @@ def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float,
     points = np.c_[rays[:, :2], z[v, u]] if orthographic else rays * z[v, u, None]
     points = (points - T[0, :3, 3].numpy()) @ T[0, :3, :3].numpy()
     order = np.sort(np.abs(points), axis=1)
-    clear = (order[:, 1] < 0.38) & (order[:, 0] > 0.12)  # away from edges and from the lines between the halves
+    # away from edges and from the lines between the halves
+    clear = (order[:, 1] < 0.38) & (order[:, 0] > 0.12)
     sides = np.unique(np.abs(points).argmax(axis=1)[clear])
     assert clear.sum() > 200
     assert len(sides) >= 2
@@ -77,7 +102,8 @@ def test_render_colour_shows_the_texture_of_every_side(view: tuple[float, float,
 
 
 def test_render_colour_is_grey_without_colours_or_faces() -> None:
-    mesh, T = textured_box(), camera(20.0, 30.0)
+    mesh = textured_box()
+    T = camera(20.0, 30.0)
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert has_colours(mesh)
     assert not has_colours(bare)
@@ -89,13 +115,20 @@ def test_render_colour_is_grey_without_colours_or_faces() -> None:
 
 def test_cleaning_preserves_vertex_and_face_colours() -> None:
     box = trimesh.creation.box()
-    faces = np.concatenate([[[0, 0, 1]], box.faces])  # cleaning removes the degenerate face, which shifts the others
-    by_face = np.concatenate([[[9, 9, 9, 255]], np.tile([[0, 0, 250, 255]], (12, 1))]).astype(np.uint8)
+    # cleaning removes the degenerate face, which shifts the others
+    faces = np.concatenate([[[0, 0, 1]], box.faces])
+    by_face = np.concatenate([[[9, 9, 9, 255]], np.tile([[0, 0, 250, 255]], (12, 1))]).astype(
+        np.uint8
+    )
     mesh = trimesh.Trimesh(box.vertices, faces, face_colors=by_face, process=False)
     middle = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0, :, 36, 48]
     assert middle.tolist() == pytest.approx([0.0, 0.0, 0.9 * 250 / 255], abs=0.02)
-    by_vertex = np.c_[np.where(box.vertices[:, 2:] > 0, [[255, 0, 0]], [[0, 255, 0]]), np.full(8, 255)]
-    mesh = trimesh.Trimesh(box.vertices, box.faces, vertex_colors=by_vertex.astype(np.uint8), process=False)
+    by_vertex = np.c_[
+        np.where(box.vertices[:, 2:] > 0, [[255, 0, 0]], [[0, 255, 0]]), np.full(8, 255)
+    ]
+    mesh = trimesh.Trimesh(
+        box.vertices, box.faces, vertex_colors=by_vertex.astype(np.uint8), process=False
+    )
     picture = render_colour(mesh, camera(0.0, 0.0), K, SIZE)[0]
     assert picture[0, 24, 48] > 2 * picture[1, 24, 48]  # red above
     assert picture[1, 47, 48] > 2 * picture[0, 47, 48]  # green below
@@ -108,7 +141,11 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
     material = trimesh.visual.material
     # Factors of glTF are linear: 0.2 of it is 124 of sRGB.
     rgba = np.array([255, 51, 0, 255] if suffix == ".glb" else [255, 124, 0, 255], np.uint8)
-    plain = material.PBRMaterial(baseColorFactor=rgba) if suffix == ".glb" else material.SimpleMaterial(diffuse=rgba)
+    plain = (
+        material.PBRMaterial(baseColorFactor=rgba)
+        if suffix == ".glb"
+        else material.SimpleMaterial(diffuse=rgba)
+    )
     red.visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(red.vertices), 2)), material=plain)
     scene = trimesh.Scene()
     scene.add_geometry(textured_box(), geom_name="printed")
@@ -130,8 +167,12 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
     expected = surface_colours(box)
     assert expected is not None
     by_centre = {tuple(np.round(c, 4)): i for i, c in enumerate(box.triangles_center)}
-    match = np.array([by_centre[tuple(np.round(c, 4))] for c in mesh.triangles_center[~is_red]], np.int32)
-    np.testing.assert_allclose(found[~is_red], expected.at(match, centre[:12], centre[:12]), atol=0.02)
+    match = np.array(
+        [by_centre[tuple(np.round(c, 4))] for c in mesh.triangles_center[~is_red]], np.int32
+    )
+    np.testing.assert_allclose(
+        found[~is_red], expected.at(match, centre[:12], centre[:12]), atol=0.02
+    )
 
 
 def test_load_mesh_warns_of_a_damaged_texture(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Unusual meshes and cameras: inside out, doubled, degenerate, in parts, tiny, huge, behind the camera."""
+"""Unusual meshes and cameras: inside out, doubled, degenerate, in parts, tiny, huge, behind the
+camera."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -32,17 +33,26 @@ def test_render_ignores_face_orientation_and_doubled_and_degenerate_faces(backen
     for flipped in (slice(None), slice(0, None, 2)):
         faces = mesh.faces.copy()
         faces[flipped] = faces[flipped, ::-1]
-        assert_same_depth(render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend), render(mesh, backend))
+        assert_same_depth(
+            render(trimesh.Trimesh(mesh.vertices, faces, process=False), backend),
+            render(mesh, backend),
+        )
     inner = mesh.copy().apply_scale(0.5)
-    vertices = np.concatenate([mesh.vertices, inner.vertices, [[np.nan] * 3]])  # no face uses the last one
-    bridge = [[0, 1, len(mesh.vertices) + 5], [0, 1, len(mesh.vertices) + 9]]  # a hidden edge with four faces
+    # no face uses the last one
+    vertices = np.concatenate([mesh.vertices, inner.vertices, [[np.nan] * 3]])
+    # a hidden edge with four faces
+    bridge = [[0, 1, len(mesh.vertices) + 5], [0, 1, len(mesh.vertices) + 9]]
     degenerate = [[3, 3, 3], [4, 4, 7], [0, 0, 1]]
-    faces = np.concatenate([mesh.faces, mesh.faces[::3], inner.faces + len(mesh.vertices), bridge, degenerate])
+    faces = np.concatenate(
+        [mesh.faces, mesh.faces[::3], inner.faces + len(mesh.vertices), bridge, degenerate]
+    )
     damaged = trimesh.Trimesh(vertices, faces, process=False, validate=False)
     assert_same_depth(render(damaged, backend), render(mesh, backend))
 
 
-def test_render_with_the_camera_inside_and_the_object_behind(backend: str, orthographic: bool) -> None:
+def test_render_with_the_camera_inside_and_the_object_behind(
+    backend: str, orthographic: bool
+) -> None:
     renderer = make_renderer(trimesh.creation.box((2.0, 2.0, 2.0)), backend)
     wide = torch.tensor([[30.0, 0, 19.5], [0, 30.0, 14.5], [0, 0, 1]])
     near = 2e-3 * 3**0.5
@@ -71,7 +81,9 @@ def test_render_batches(backend: str) -> None:
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-4, [0.0, 0, 0]), (1e3, [2e6, -1e6, 5e5])])
-def test_render_is_precise_for_tiny_and_distant_objects(backend: str, scale: float, shift: list[float]) -> None:
+def test_render_is_precise_for_tiny_and_distant_objects(
+    backend: str, scale: float, shift: list[float]
+) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=2)
     T, one, size = camera(4)
     moved = mesh.copy().apply_scale(scale).apply_translation(shift)
@@ -86,7 +98,10 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
     box = trimesh.creation.box()
     not_finite = T.clone()
     not_finite[1, 0, 3] = torch.nan
-    calls = [((not_finite, one, size), "finite"), ((T, one.expand(3, 3, 3), size), "one or 2 matrices")]
+    calls = [
+        ((not_finite, one, size), "finite"),
+        ((T, one.expand(3, 3, 3), size), "one or 2 matrices"),
+    ]
     for arguments, message in (*calls, ((T, one, (0, 5)), "size")):
         with pytest.raises(InvalidInputError, match=message):
             cr.render_depth(box, *arguments)
@@ -96,10 +111,14 @@ def test_render_depth_refuses_bad_arguments_and_replaces_no_renderer_that_fails(
         cr.render_depth(trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False), T, one, size)
     fail = Mock(side_effect=MemoryError("out of memory"))
     with pytest.raises(RenderingError, match="out of memory"):
-        cr.render_depth(trimesh.creation.box(), *camera(2), renderer=SimpleNamespace(name="mine", render=fail))
+        cr.render_depth(
+            trimesh.creation.box(), *camera(2), renderer=SimpleNamespace(name="mine", render=fail)
+        )
 
 
-def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     used: list[int] = []
     lengths = contours_module._Level.lengths_in_crop
 
@@ -108,11 +127,14 @@ def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(monkeypatch: pytes
         return lengths(level, *arguments)
 
     monkeypatch.setattr(contours_module._Level, "lengths_in_crop", watched)
-    contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))  # 20 480 faces
+    # 20 480 faces
+    contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))
     T = torch.eye(4, dtype=torch.float64)[None]
     T[0, 2, 3] = 4.0
     for size in (100, 128, 129, 256, 400):
-        K = torch.tensor([[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]], dtype=torch.float64)
+        K = torch.tensor(
+            [[[size, 0, (size - 1) / 2], [0, size, (size - 1) / 2], [0, 0, 1]]], dtype=torch.float64
+        )
         points = contours.points(T, K, size)
         assert (points.model.norm(dim=-1)[points.valid] - 1.0).abs().max() < 0.005
     assert used == [2500, 2500, 8000, 8000, 8000]

@@ -34,12 +34,15 @@ def crossed_prism() -> trimesh.Trimesh:
 
 MESHES = {
     "parts": example_mesh,
-    "fine": lambda: trimesh.creation.icosphere(subdivisions=4, radius=40.0).apply_translation([300.0, -20.0, 5.0]),
+    "fine": lambda: trimesh.creation.icosphere(subdivisions=4, radius=40.0).apply_translation(
+        [300.0, -20.0, 5.0]
+    ),
     "knot": lambda: trimesh.creation.torus(1.0, 0.3, major_sections=60, minor_sections=30),
     "open": lambda: half(trimesh.creation.icosphere(subdivisions=4)),
     "inside out": lambda: inside_out(trimesh.creation.icosphere(subdivisions=4)),
     "partly inside out": lambda: trimesh.util.concatenate(
-        trimesh.creation.torus(1.0, 0.3), inside_out(trimesh.creation.icosphere(subdivisions=2, radius=0.6))
+        trimesh.creation.torus(1.0, 0.3),
+        inside_out(trimesh.creation.icosphere(subdivisions=2, radius=0.6)),
     ),
     "inside out in a tube": lambda: trimesh.util.concatenate(
         trimesh.creation.annulus(0.35, 0.5, 2.0), inside_out(trimesh.creation.cylinder(0.2, 1.5))
@@ -56,7 +59,8 @@ def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) ->
     radius = mesh_radius(mesh)
     T, K, size = camera(6, radius=radius, centre=mesh_centre(mesh), orthographic=orthographic)
     a, b = (
-        make_renderer(mesh, backend, many_views=True).render(T, K, size, orthographic=orthographic) for backend in pair
+        make_renderer(mesh, backend, many_views=True).render(T, K, size, orthographic=orthographic)
+        for backend in pair
     )
     inside = interior(a, b)
     assert int(((a > 0) != (b > 0))[inside].sum()) == 0
@@ -69,13 +73,17 @@ def test_backends_agree(pair: tuple[str, str], name: str, orthographic: bool) ->
 @pytest.mark.parametrize("name", MESHES)
 def test_back_faces_of_closed_surfaces_are_not_drawn(name: str) -> None:
     assert make_renderer(MESHES[name]()).draws_back_faces, "both sides of a face are visible"
-    assert make_renderer(MESHES[name](), many_views=True).draws_back_faces == (name not in ("parts", "fine", "knot"))
+    assert make_renderer(MESHES[name](), many_views=True).draws_back_faces == (
+        name not in ("parts", "fine", "knot")
+    )
 
 
 def test_depth_of_a_sphere(backend: str, orthographic: bool) -> None:
     mesh = trimesh.creation.icosphere(subdivisions=6)  # flat by at most 1.5e-4 between vertices
     T, K, size = camera(2, orthographic=orthographic)
-    depth = make_renderer(mesh, backend).render(T, K, size, orthographic=orthographic)[:, 0].double()
+    depth = (
+        make_renderer(mesh, backend).render(T, K, size, orthographic=orthographic)[:, 0].double()
+    )
     rays = pixel_grid(size) @ torch.linalg.inv(K).T
     if orthographic:  # x^2 + y^2 + (z - 4)^2 = 1
         inside = 1.0 - rays[..., 0] ** 2 - rays[..., 1] ** 2
@@ -94,16 +102,20 @@ def test_silhouette_agrees_with_project_points(backend: str, orthographic: bool)
     triangle = trimesh.Trimesh([[-0.7, -0.5, 0.1], [0.8, -0.3, -0.2], [0.1, 0.9, 0.3]], [[0, 1, 2]])
     T, K, size = camera(5, orthographic=orthographic)
     mask = make_renderer(triangle, backend).render(T, K, size, orthographic=orthographic)[:, 0] > 0
-    corners = project_points(torch.from_numpy(triangle.vertices.copy()), T, K, orthographic=orthographic)
+    corners = project_points(
+        torch.from_numpy(triangle.vertices.copy()), T, K, orthographic=orthographic
+    )
     u, v, _ = pixel_grid(size).unbind(-1)
     distances = []  # px from each edge
     for i in range(3):
-        a, b = corners[:, i], corners[:, (i + 1) % 3]
+        a = corners[:, i]
+        b = corners[:, (i + 1) % 3]
         d = (b - a)[:, None, None]
         cross = (u - a[:, 0, None, None]) * d[..., 1] - (v - a[:, 1, None, None]) * d[..., 0]
         distances.append(cross / d.norm(dim=-1))
     edges = torch.stack(distances)
-    inside, outside = edges.amin(0).maximum(-edges.amax(0)), -edges.amin(0).maximum(-edges.amax(0))
+    inside = edges.amin(0).maximum(-edges.amax(0))
+    outside = -edges.amin(0).maximum(-edges.amax(0))
     assert bool(mask[inside > 0.005].all())
     assert not bool(mask[outside > 0.005].any())
     assert int(mask.sum()) > 1000

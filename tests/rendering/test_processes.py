@@ -47,14 +47,19 @@ for backend in sys.argv[1:]:
     _, status = os.waitpid(child, 0)
     assert torch.equal(renderer.render(T, K, (30, 40)), before)  # the parent still works
     print(os.waitstatus_to_exitcode(status))
-"""
+"""  # noqa: E501
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
-@pytest.mark.parametrize(("backends", "codes"), [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])])
+@pytest.mark.parametrize(
+    ("backends", "codes"), [(["auto", "embree"], ["0", "0"]), (["pyrender"], ["3"])]
+)
 def test_renderers_after_a_fork(backends: list[str], codes: list[str]) -> None:
     """embree and OpenCV work in the child; OpenGL cannot, and the error says what to do."""
     require(*backends)
-    command, environment = [sys.executable, "-c", SCRIPT, *backends], {**os.environ, "OMP_NUM_THREADS": "2"}
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment, check=False)
+    command = [sys.executable, "-c", SCRIPT, *backends]
+    environment = {**os.environ, "OMP_NUM_THREADS": "2"}
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, env=environment, check=False
+    )
     assert (done.returncode, done.stderr, done.stdout.split()) == (0, "", codes)

@@ -20,7 +20,9 @@ def test_shade_is_exact_for_planes(normal):
     torch.testing.assert_close(grey, AMBIENT + (LIT - AMBIENT) * cosine, atol=2e-4, rtol=0)
     depth = (7.0 + 0.3 * RAYS[0] - 0.6 * RAYS[1])[None, None]
     expected = AMBIENT + (LIT - AMBIENT) / math.sqrt(1 + 0.3**2 + 0.6**2)
-    torch.testing.assert_close(shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0)
+    torch.testing.assert_close(
+        shade(depth, K, orthographic=True), torch.full_like(depth, expected), atol=2e-4, rtol=0
+    )
 
 
 def test_shade_is_sharp_at_contours_and_steps():

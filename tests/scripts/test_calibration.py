@@ -21,8 +21,13 @@ def options(**changes: object) -> Namespace:
 def test_logistic_fit_recovers_weights_and_respects_signs():
     rng = np.random.default_rng(0)
     X = rng.normal(size=(4000, 3))
-    right = rng.random(4000) < 1.0 / (1.0 + np.exp(-(2.0 * X[:, 0] - 1.0 * X[:, 1] + 0.5 * X[:, 2] + 0.7)))
-    rows = [{"features": dict(zip("abc", x, strict=True)), "right": y} for x, y in zip(X, right, strict=True)]
+    right = rng.random(4000) < 1.0 / (
+        1.0 + np.exp(-(2.0 * X[:, 0] - 1.0 * X[:, 1] + 0.5 * X[:, 2] + 0.7))
+    )
+    rows = [
+        {"features": dict(zip("abc", x, strict=True)), "right": y}
+        for x, y in zip(X, right, strict=True)
+    ]
     free = calibrate.fit_logistic(rows, np.ones(4000), {})
     assert list(free["weights"].values()) == pytest.approx([2.0, -1.0, 0.5], abs=0.15)
     assert free["bias"] == pytest.approx(0.7, abs=0.15)
@@ -39,7 +44,13 @@ def test_shares_fit_recovers_slope_and_resolution():
         behind = rng.uniform(0.0, 3.0)
         logit = -2.0 * max(0.0, behind - 0.5)
         second = rng.random() < np.exp(logit) / (1.0 + np.exp(logit))
-        rows.append({"scores": [0.0, -behind], "errors": [90.0, 1.0] if second else [1.0, 90.0], "right": True})
+        rows.append(
+            {
+                "scores": [0.0, -behind],
+                "errors": [90.0, 1.0] if second else [1.0, 90.0],
+                "right": True,
+            }
+        )
     fitted = calibrate.fit_shares(rows, np.ones(len(rows)), ties=True)
     assert fitted["slope"] == pytest.approx(2.0, abs=0.5)
     assert fitted["resolution"] == pytest.approx(0.5, abs=0.21)
@@ -54,7 +65,8 @@ def test_sets_of_furniture_are_left_out_where_there_is_none(tmp_path):
 
 def test_twins_have_the_same_shape_and_another_print():
     twins = Twins(options(cad="print"))
-    one, other = twins.mesh(1), twins.mesh(1 + TWIN)
+    one = twins.mesh(1)
+    other = twins.mesh(1 + TWIN)
     assert np.array_equal(one.triangles, other.triangles)
     assert not np.array_equal(one.paints[0].picture, other.paints[0].picture)
     assert twins.written == [k + TWIN for k in twins.ids]
@@ -62,7 +74,8 @@ def test_twins_have_the_same_shape_and_another_print():
 
 def test_mirrored_shapes_are_no_rotation_of_the_shape():
     tied = Tied(options(cad="mirrored"))
-    one, other = tied.mesh(2), tied.mesh(2 + TWIN)
+    one = tied.mesh(2)
+    other = tied.mesh(2 + TWIN)
     np.testing.assert_allclose(other.triangles[:, ::-1] * (-1.0, 1.0, 1.0), one.triangles)
 
 
@@ -71,7 +84,9 @@ def test_symmetries_of_shapes_keep_their_materials():
     for obj_id in (1, 2):
         S = shapes.symmetries(obj_id)
         np.testing.assert_allclose(S[0], np.eye(3))
-        np.testing.assert_allclose(S @ S.transpose(0, 2, 1), np.broadcast_to(np.eye(3), S.shape), atol=1e-9)
+        np.testing.assert_allclose(
+            S @ S.transpose(0, 2, 1), np.broadcast_to(np.eye(3), S.shape), atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.35, 0.6])

@@ -9,7 +9,8 @@ from torch.autograd import gradcheck
 
 from scripts.kornia.hog import HistogramOfOrientedGradients, histogram_of_oriented_gradients
 
-CELL, BLOCK = (6, 5), (2, 3)
+CELL = (6, 5)
+BLOCK = (2, 3)
 
 
 def images(kind: str) -> Tensor:
@@ -58,9 +59,17 @@ class TestHistogramOfOrientedGradients:
         image = images(kind)[:, :channels]
         out = histogram_of_oriented_gradients(image, 8, CELL, BLOCK)
         for mine, picture in zip(out, image, strict=True):
-            options = {"orientations": 8, "pixels_per_cell": CELL, "cells_per_block": BLOCK, "feature_vector": False}
-            theirs = hog(np.moveaxis(picture.numpy(), 0, -1), channel_axis=-1, block_norm="L2-Hys", **options)
-            np.testing.assert_allclose(mine.numpy(), theirs, atol=1e-6)  # scikit-image counts in float32
+            options = {
+                "orientations": 8,
+                "pixels_per_cell": CELL,
+                "cells_per_block": BLOCK,
+                "feature_vector": False,
+            }
+            theirs = hog(
+                np.moveaxis(picture.numpy(), 0, -1), channel_axis=-1, block_norm="L2-Hys", **options
+            )
+            # scikit-image counts in float32
+            np.testing.assert_allclose(mine.numpy(), theirs, atol=1e-6)
 
     @pytest.mark.parametrize("kind", ["constant", "checkerboard"])
     def test_gradients_are_finite(self, kind: str) -> None:
@@ -71,12 +80,16 @@ class TestHistogramOfOrientedGradients:
 
     def test_gradcheck(self) -> None:
         image = images("random")[:1, :, :12, :12].contiguous().requires_grad_()
-        assert gradcheck(lambda x: histogram_of_oriented_gradients(x, 9, (4, 4), (2, 2)), image, fast_mode=True)
+        assert gradcheck(
+            lambda x: histogram_of_oriented_gradients(x, 9, (4, 4), (2, 2)), image, fast_mode=True
+        )
 
     def test_module(self) -> None:
         image = images("random")
         module = HistogramOfOrientedGradients(6, CELL, BLOCK, 0.3, 1e-4)
-        assert torch.equal(module(image), histogram_of_oriented_gradients(image, 6, CELL, BLOCK, 0.3, 1e-4))
+        assert torch.equal(
+            module(image), histogram_of_oriented_gradients(image, 6, CELL, BLOCK, 0.3, 1e-4)
+        )
         assert "num_orientations=6" in repr(module)
 
     def test_dynamo(self) -> None:

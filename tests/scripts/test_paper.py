@@ -14,7 +14,12 @@ import pytest
 import torch
 
 from curvireg_torch.data import BOPDataset
-from curvireg_torch.geometry import camera_matrix, projected_boxes, rotation_from_viewpoint, transform
+from curvireg_torch.geometry import (
+    camera_matrix,
+    projected_boxes,
+    rotation_from_viewpoint,
+    transform,
+)
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
@@ -44,8 +49,11 @@ def root(tmp_path_factory):
         T[:3, :3] = rotation_from_viewpoint(float(azimuth), float(elevation)).double()
         T[:3, 3] = -T[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
         T[2, 3] += 5.0 * 0.5 * float(torch.tensor(mesh.extents).norm())
-        generator, background = torch.Generator().manual_seed(i), torch.full((3, 120, 160), 0.9)
-        image, box = synthesize_photograph(mesh, T, K, (120, 160), generator, background=background, texture=0.0)
+        generator = torch.Generator().manual_seed(i)
+        background = torch.full((3, 120, 160), 0.9)
+        image, box = synthesize_photograph(
+            mesh, T, K, (120, 160), generator, background=background, texture=0.0
+        )
         write_photo(folder / f"{i}.png", image)
         lines.append(f"{i}.png,{','.join(f'{v:g}' for v in box.tolist())},{azimuth},{elevation},0,")
     folder.joinpath("views.csv").write_text("\n".join(lines) + "\n")
@@ -77,7 +85,9 @@ def test_points_of_the_true_view_are_repeated_most(root):
 
 
 def test_tables_rank_by_the_terms_of_the_paper_alone():
-    for pipeline, whitening in zip(measure.variants("upright").values(), ("paper", "none"), strict=True):
+    for pipeline, whitening in zip(
+        measure.variants("upright").values(), ("paper", "none"), strict=True
+    ):
         assert [term.name for term in pipeline.terms] == ["hog", "repeatability"]
         assert pipeline.terms[0].whitening == whitening
         assert (pipeline.box_jitter, pipeline.search, pipeline.contours) == (0.0, True, False)
@@ -106,7 +116,9 @@ def test_closest_is_that_of_the_retrieved_views(views):
             assert len(found["est"]) == len(found["clo"]) == 4
             least = min(found["top"][:3])
             apart = [np.radians(x) for x in found["clo"][:3]]
-            assert max(np.degrees(apart)) >= least / 3.0 - 1e-3, "not closer than the closest of the three"
+            assert max(np.degrees(apart)) >= least / 3.0 - 1e-3, (
+                "not closer than the closest of the three"
+            )
 
 
 def test_a_mesh_is_rendered_once():
@@ -136,7 +148,8 @@ def test_bootstrap_resamples_cads():
 
 
 def test_points_within_a_radius():
-    photo, view = torch.zeros(9, 9, dtype=torch.bool), torch.zeros(9, 9, dtype=torch.bool)
+    photo = torch.zeros(9, 9, dtype=torch.bool)
+    view = torch.zeros(9, 9, dtype=torch.bool)
     photo[4, 4] = photo[4, 8] = view[4, 1] = True
     assert points_within(photo, view, (2.0, 3.0, 7.0)) == [0.0, 0.5, 1.0]
     assert points_within(photo, torch.zeros_like(view), (9.0,)) == [0.0]
@@ -158,7 +171,18 @@ def run(monkeypatch, *words):
 def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     page = tmp_path / "paper.md"
     page.write_text("# Page\n\n<!-- paper:begin -->\n<!-- paper:end -->\n")
-    words = ["repeatability", "web", root, "--out", tmp_path, "--image-size", "64", "--quiet", "--page", page]
+    words = [
+        "repeatability",
+        "web",
+        root,
+        "--out",
+        tmp_path,
+        "--image-size",
+        "64",
+        "--quiet",
+        "--page",
+        page,
+    ]
     assert run(monkeypatch, *words) == 0
     text = (tmp_path / "repeatability.md").read_text()
     assert "N = 2 (1 CADs)" in text
@@ -168,7 +192,9 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
     (record,) = (tmp_path / "records").iterdir()
     assert len(json.loads(record.read_text())) == 2
     assert run(monkeypatch, "precision", *words[1:], "--partial") == 2  # no records of views
-    monkeypatch.setattr(reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again")))
+    monkeypatch.setattr(
+        reproduce_paper, "measure", Mock(side_effect=AssertionError("measured again"))
+    )
     assert run(monkeypatch, *words, "--partial") == 0
     assert run(monkeypatch, "curve", *words[1:]) == 0
     assert (tmp_path / "curve.png").stat().st_size > 1000
@@ -179,19 +205,26 @@ def test_a_run_writes_its_tables_and_is_resumed(root, tmp_path, monkeypatch):
         run(monkeypatch, "precision", *words[1:])
 
 
-@pytest.mark.parametrize(("module", "package"), [("skimage", "scikit-image"), ("matplotlib", "matplotlib")])
+@pytest.mark.parametrize(
+    ("module", "package"), [("skimage", "scikit-image"), ("matplotlib", "matplotlib")]
+)
 def test_a_missing_package_is_named(root, tmp_path, monkeypatch, capsys, module, package):
     find_spec = util.find_spec
     monkeypatch.setattr(util, "find_spec", lambda name: None if name == module else find_spec(name))
     assert run(monkeypatch, "curve", "web", root, "--out", tmp_path) == 2
-    assert f"{package} is not installed; pip install 'curvireg_torch[paper]'" in capsys.readouterr().err
+    assert (
+        f"{package} is not installed; pip install 'curvireg_torch[paper]'"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["reproduce_paper", "staircase", "generated"])
 def test_scripts_run_beside_an_installed_package(name, tmp_path):
     script = Path(reproduce_paper.__file__).with_name(f"{name}.py")
-    done = subprocess.run([sys.executable, "-I", str(script), "--help"], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-I", str(script), "--help"], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert "--out DIR" in done.stdout
 
@@ -200,7 +233,16 @@ def test_generated_photographs_are_a_bop_set(tmp_path, monkeypatch):
     meshes = [tmp_path / f"{name}.ply" for name in ("one", "two")]
     for mesh in meshes:
         example_mesh().export(mesh)
-    words = ["generated.py", *map(str, meshes), "--count", "3", "--up", "z", "--out", str(tmp_path / "set")]
+    words = [
+        "generated.py",
+        *map(str, meshes),
+        "--count",
+        "3",
+        "--up",
+        "z",
+        "--out",
+        str(tmp_path / "set"),
+    ]
     monkeypatch.setattr(sys, "argv", words)
     generated.main()
     dataset = BOPDataset(tmp_path / "set")

@@ -52,7 +52,10 @@ def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Pa
     assert (stored["name"], stored["summary"]["n"]) == ("cups", 8)
     assert {"date", "commit"} <= stored.keys()
     table = results_table.table(results)
-    assert "| cups | 8 | 50.0 % | 75.0 % | 3.2° | 25.0 % | 40.0 % | 60.0 % | 4 | 100.0 % | 0.2 |" in table
+    assert (
+        "| cups | 8 | 50.0 % | 75.0 % | 3.2° | 25.0 % | 40.0 % | 60.0 % | 4 | 100.0 % | 0.2 |"
+        in table
+    )
     assert "1 failed, 2 skipped" in table
 
 
@@ -77,9 +80,14 @@ def test_comparison_of_a_set_that_was_never_stored(tmp_path: Path, results: Path
 
 def test_page_is_replaced_between_its_markers_only(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text("before\n<!-- rows:begin -->\nold\n<!-- rows:end -->\nafter\n", encoding="utf-8")
+    page.write_text(
+        "before\n<!-- rows:begin -->\nold\n<!-- rows:end -->\nafter\n", encoding="utf-8"
+    )
     _shared.update_page(page, "rows", "new\n")
-    assert page.read_text(encoding="utf-8") == "before\n<!-- rows:begin -->\nnew\n<!-- rows:end -->\nafter\n"
+    assert (
+        page.read_text(encoding="utf-8")
+        == "before\n<!-- rows:begin -->\nnew\n<!-- rows:end -->\nafter\n"
+    )
 
 
 def test_page_without_markers_is_an_error(tmp_path: Path) -> None:

@@ -17,13 +17,19 @@ def test_an_epoch_lowers_the_loss_and_leaves_the_layers_as_they_were(
     write_pascal3d(tmp_path / "pascal")
     heads: list[script.ViewpointHead] = []
     make = script.ViewpointHead
-    monkeypatch.setattr(script, "ViewpointHead", lambda *args: heads.append(make(*args)) or heads[0])
+    monkeypatch.setattr(
+        script, "ViewpointHead", lambda *args: heads.append(make(*args)) or heads[0]
+    )
     out = tmp_path / "runs" / "head.json"
-    results = script.main([str(tmp_path / "pascal"), "--batch", "1", "--size", "64", "--out", str(out)])
+    results = script.main(
+        [str(tmp_path / "pascal"), "--batch", "1", "--size", "64", "--out", str(out)]
+    )
     assert json.loads(out.read_text()) == results
     assert results["before"]["n"] + results["held out before"]["n"] == 5
     assert results["after"]["loss"] < 0.9 * results["before"]["loss"]
-    assert {"loss", "accuracy_azimuth_bin", "acc_pi_6", "med_err_deg", "n"} == set(results["held out after"])
+    assert {"loss", "accuracy_azimuth_bin", "acc_pi_6", "med_err_deg", "n"} == set(
+        results["held out after"]
+    )
     (head,) = heads
     fresh = cr.LearnedCurvilinearSaliency()
     for trained, fixed in zip(head.layers[0].parameters(), fresh.parameters(), strict=True):
@@ -33,7 +39,10 @@ def test_an_epoch_lowers_the_loss_and_leaves_the_layers_as_they_were(
 def test_no_photograph_is_in_both_halves(tmp_path: Path) -> None:
     write_pascal3d(tmp_path)
     crops = cr.data.crops(cr.Pascal3DPlus(tmp_path), 32)
-    parts = [{crops.annotation(index)["image_path"] for index in half.indices} for half in script.halves(crops)]
+    parts = [
+        {crops.annotation(index)["image_path"] for index in half.indices}
+        for half in script.halves(crops)
+    ]
     assert not parts[0] & parts[1]
     assert all(parts)
 

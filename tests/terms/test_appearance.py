@@ -43,13 +43,17 @@ def test_small_bank_stores_features_of_all_views(small_bank, matcher, tmp_path):
     raw = similarity(describe(query.crops, Backbone()), expected)
     torch.testing.assert_close(ranking.terms["appearance"], raw, atol=2e-3, rtol=0)
     small_bank.save(tmp_path / "bank.safetensors")
-    loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(*photograph(0))
+    loaded = ViewMatcher(ViewBank.load(tmp_path / "bank.safetensors"), pipeline=PIPELINE)(
+        *photograph(0)
+    )
     torch.testing.assert_close(loaded.scores, ranking.scores, atol=1e-3, rtol=1e-2)
 
 
 def test_large_bank_compares_the_cells_of_the_best_views(small_bank, truck, matcher):
     large_bank = ViewBank.build(truck, VIEWS, pipeline=large(), progress=False)
-    before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(*photograph(2))
+    before = ViewMatcher(small_bank, pipeline=replace(PIPELINE, terms=PIPELINE.terms[:3]))(
+        *photograph(2)
+    )
     assert large_bank.appearance is None
     reranking = ViewMatcher(large_bank, pipeline=large(top=5, min_angle=40.0))
     ranking = reranking(*photograph(2))
@@ -86,12 +90,18 @@ def painted_bank() -> ViewBank:
 
 @pytest.mark.parametrize("exhaustive_limit", [1000, 0])
 def test_colours_distinguish_front_and_back(painted_bank, tmp_path, exhaustive_limit):
-    pipeline = replace(PIPELINE.with_term("appearance", exhaustive_limit=exhaustive_limit), hypotheses=2)
+    pipeline = replace(
+        PIPELINE.with_term("appearance", exhaustive_limit=exhaustive_limit), hypotheses=2
+    )
     painted_bank.save(tmp_path / "bank.safetensors")
     bank = ViewBank.load(tmp_path / "bank.safetensors")  # with the mesh's colours
     if exhaustive_limit == 0:
         bank.appearance = None
-    views = [v for v in range(len(VIEWS)) if float(VIEWS.elevation[v]) == 30 and float(VIEWS.azimuth[v]) in (0, 180)]
+    views = [
+        v
+        for v in range(len(VIEWS))
+        if float(VIEWS.elevation[v]) == 30 and float(VIEWS.azimuth[v]) in (0, 180)
+    ]
     describer = ViewMatcher(bank, pipeline=pipeline).describer
     pictures = describer.shaded(bank.rotations[views], bank.distances[views])
     assert pictures.shape == (2, 4, 64, 64)

@@ -17,13 +17,16 @@ from tests._support.scenes import scene
 
 
 def test_correlation_is_the_cosine_of_the_better_crop_scored_by_standard_deviations():
-    queries, views = torch.tensor([[3.0, 4.0], [1.0, 0.0]]), torch.tensor([[4.0, 3.0], [0.0, 2.0], [5.0, 12.0]])
+    queries = torch.tensor([[3.0, 4.0], [1.0, 0.0]])
+    views = torch.tensor([[4.0, 3.0], [0.0, 2.0], [5.0, 12.0]])
     expected = torch.tensor([[24 / 25, 4 / 5, 63 / 65], [4 / 5, 0.0, 5 / 13]])
     module = terms.Correlation().build(SimpleNamespace(descriptors=views))
     torch.testing.assert_close(module(SimpleNamespace(descriptors=queries[:, None])), expected)
     together = module(SimpleNamespace(descriptors=queries[None]))
     torch.testing.assert_close(together, expected.amax(dim=0, keepdim=True))
-    score = terms.Correlation().log_score(torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4]))
+    score = terms.Correlation().log_score(
+        torch.tensor([[0.0, 0.0, 0.0, 1.0], [3.0, 3.0, 3.0, 5.0], [2.0] * 4])
+    )
     low = -4.0 / math.sqrt(3.0)  # the standard deviation of 0, 0, 0, 1 is sqrt(3) / 4
     torch.testing.assert_close(score, torch.tensor([[low, low, low, 0.0]] * 2 + [[0.0] * 4]))
 
@@ -45,7 +48,8 @@ def test_ledoit_wolf_equals_scikit_learn(count):
 
 @pytest.mark.parametrize("count", [5, 30, 2000])
 def test_precision_solves_with_the_shrunk_covariance(count):
-    x, y = sample(count, 24), sample(7, 24)
+    x = sample(count, 24)
+    y = sample(7, 24)
     mean, covariance = terms.ledoit_wolf(x)
     precision = terms.Precision(x)
     torch.testing.assert_close(precision.mean, mean)
@@ -56,7 +60,8 @@ def test_precision_solves_with_the_shrunk_covariance(count):
 
 
 def test_matcher_ranks_by_whitened_correlation(bank):
-    images, boxes = [scene(0)[0]], scene(0)[1][None]
+    images = [scene(0)[0]]
+    boxes = scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="bank"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes).descriptors[:, 0]
@@ -68,7 +73,8 @@ def test_matcher_ranks_by_whitened_correlation(bank):
 
 
 def test_matcher_ranks_by_the_product_that_the_paper_prints(bank):
-    images, boxes = [scene(0)[0]], scene(0)[1][None]
+    images = [scene(0)[0]]
+    boxes = scene(0)[1][None]
     pipeline = replace(bank.pipeline.with_term("hog", whitening="paper"), box_jitter=0.0)
     matcher = ViewMatcher(bank, pipeline=pipeline)
     query = matcher.query(images, boxes)
@@ -101,10 +107,13 @@ def test_dilate_points_uses_a_euclidean_disc(eps):
 
 def test_repeatability_score_has_the_closed_form():
     rep = torch.tensor([[0.2, 0.5, 0.8]])
-    assert int(terms.Repeatability(mode="paper").log_score(rep).argmax()) == 1  # favours average views
+    # favours average views
+    assert int(terms.Repeatability(mode="paper").log_score(rep).argmax()) == 1
     for sigma in (0.1, 0.2):
         expected = [-(d**2) / (2 * sigma**2) for d in (0.6, 0.3, 0.0)]
-        torch.testing.assert_close(terms.Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected))
+        torch.testing.assert_close(
+            terms.Repeatability(sigma=sigma).log_score(rep)[0], torch.tensor(expected)
+        )
     with pytest.raises(InvalidInputError, match="mode"):
         terms.Repeatability(mode="other")
 
@@ -112,25 +121,36 @@ def test_repeatability_score_has_the_closed_form():
 def test_repeatability_is_the_fraction_of_points_with_one_of_the_view_near_them():
     """In cells of 2 px, the last ones of which are cut."""
     S = 131
-    views, queries = torch.zeros(3, S, S, dtype=torch.bool), torch.zeros(1, 2, S, S, dtype=torch.bool)
+    views = torch.zeros(3, S, S, dtype=torch.bool)
+    queries = torch.zeros(1, 2, S, S, dtype=torch.bool)
     queries[0, 0, [20, 60, 130], [20, 60, 130]] = True  # the second crop has no points
     views[0, [20, 60, 130], [20, 60, 130]] = True
     views[1, [20, 60], [20, 90]] = True
-    facts = {"settings": SimpleNamespace(image_size=S), "descriptors": views, "points_at": lambda _, i: views[i]}
+    facts = {
+        "settings": SimpleNamespace(image_size=S),
+        "descriptors": views,
+        "points_at": lambda _, i: views[i],
+    }
     known = type("Views", (), {"__len__": lambda _: len(views), **facts})()
     compare = terms.Repeatability(eps=2.0 / S).build(known)
-    torch.testing.assert_close(compare(SimpleNamespace(points=queries)), torch.tensor([[1.0, 1 / 3, 0.0]]))
+    torch.testing.assert_close(
+        compare(SimpleNamespace(points=queries)), torch.tensor([[1.0, 1 / 3, 0.0]])
+    )
     assert compare(SimpleNamespace(points=queries[:0])).shape == (0, 3)
 
 
 def box_score(shapes, boxes, **options):
-    return terms.BoxShape(**options).build(SimpleNamespace(boxes=boxes))(SimpleNamespace(shapes=shapes))
+    return terms.BoxShape(**options).build(SimpleNamespace(boxes=boxes))(
+        SimpleNamespace(shapes=shapes)
+    )
 
 
 def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_border():
     boxes = torch.tensor([[0.0, 0, 20, 10], [0, 0, 10, 10], [0, 0, 10, 20]]) + 3.0
     expected = [math.exp(-((k * math.log(2)) ** 2) / (2 * 0.5**2)) for k in (0, 1, 2)]
-    assert box_score(terms.box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(expected, rel=1e-5)
+    assert box_score(terms.box_shapes(boxes[:1]), boxes, sigma=0.5)[0].tolist() == pytest.approx(
+        expected, rel=1e-5
+    )
     assert box_score(torch.tensor([-9.0]), boxes)[0, 2] == 1.0
     for box, whole in (
         ([10, 10, 60, 40], True),
@@ -145,7 +165,10 @@ def test_box_shape_score_is_a_gaussian_of_the_log_aspect_ratio_away_from_the_bor
     ):
         shape = terms.whole_box_shapes(torch.tensor([box], dtype=torch.float32), [(80, 100)])
         assert bool(shape.isfinite()) == whole
-        assert bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all()) != whole
+        assert (
+            bool((box_score(shape, torch.tensor([[0.0, 0, 1, 1], [0, 0, 1, 9]])) == 1).all())
+            != whole
+        )
 
 
 def test_whitening_refuses_covariances_that_cannot_be_inverted():
@@ -170,13 +193,16 @@ def test_jittered_boxes_are_shifted_and_scaled():
 
 
 def test_box_jitter_recovers_a_shifted_view(bank):
-    S, margin = bank.settings.image_size, bank.settings.margin
+    S = bank.settings.image_size
+    margin = bank.settings.margin
     picture = bank.silhouettes_at(slice(30, 31))[:, None].float().expand(-1, 3, -1, -1)
     side = S / (1 + 2 * margin)
     box = torch.tensor([[(S - side) / 2, (S - side) / 2, (S + side) / 2, (S + side) / 2]]) - 0.5
     shifted = box + 0.075 * side * torch.tensor([1.0, 0, 1, 0])
     pipelines = (replace(bank.pipeline, box_jitter=jitter) for jitter in (0.0, 0.1))
-    exact, jitter = (ViewMatcher(bank, field=ImageGradient(), pipeline=pipeline) for pipeline in pipelines)
+    exact, jitter = (
+        ViewMatcher(bank, field=ImageGradient(), pipeline=pipeline) for pipeline in pipelines
+    )
     cases = ((exact, box), (exact, shifted), (jitter, shifted))
     reference, lost, recovered = (matcher(picture, b).hog[0, 30].item() for matcher, b in cases)
     assert lost < reference - 0.05
@@ -189,6 +215,8 @@ def test_a_field_that_changes_the_learned_one_is_used():
             return 2.0 * super().forward(image)
 
     crops = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(0))
-    (once, mask), (twice, same) = (terms.photograph_field(f(), crops) for f in (LearnedCurvilinearSaliency, Doubled))
+    (once, mask), (twice, same) = (
+        terms.photograph_field(f(), crops) for f in (LearnedCurvilinearSaliency, Doubled)
+    )
     assert torch.equal(twice, 2.0 * once)
     assert torch.equal(mask, same)

@@ -11,8 +11,12 @@ from curvireg_torch import errors, geometry
 from curvireg_torch.errors import ImageError, InvalidInputError
 from curvireg_torch.utils import checks
 
-CAMERA = torch.tensor([[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
-POSE = geometry.transform(cr.rotation_from_viewpoint(30.0, 20.0).double(), torch.tensor([0.1, 0.2, 6.0]).double())
+CAMERA = torch.tensor(
+    [[220.1, 0.0, 63.5], [0.0, 220.1, 47.5], [0.0, 0.0, 1.0]], dtype=torch.float64
+)
+POSE = geometry.transform(
+    cr.rotation_from_viewpoint(30.0, 20.0).double(), torch.tensor([0.1, 0.2, 6.0]).double()
+)
 
 
 def changed(matrix: Tensor, *changes: tuple[int, int, float]) -> Tensor:
@@ -37,7 +41,10 @@ BAD_CAMERAS = {
 @pytest.mark.parametrize("bad", BAD_CAMERAS)
 def test_check_camera_matrix_refuses_what_is_no_camera(bad: str) -> None:
     checks.check_camera_matrix(CAMERA)
-    for call in (checks.check_camera_matrix, lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K)):
+    for call in (
+        checks.check_camera_matrix,
+        lambda K: cr.project_points(torch.zeros(1, 3).double(), POSE, K),
+    ):
         with pytest.raises(InvalidInputError, match="camera matrix: expected"):
             call(BAD_CAMERAS[bad])
 
@@ -60,7 +67,10 @@ def test_check_rotation_and_check_pose_refuse_what_is_not_rigid(bad: str) -> Non
             call(BAD_ROTATIONS[bad])
     T = geometry.transform(BAD_ROTATIONS[bad], POSE[:3, 3])
     point = torch.zeros(1, 3).double()
-    for call in (lambda T: checks.check_pose(T, "T"), lambda T: cr.project_points(point, T, CAMERA)):
+    for call in (
+        lambda T: checks.check_pose(T, "T"),
+        lambda T: cr.project_points(point, T, CAMERA),
+    ):
         with pytest.raises(InvalidInputError, match="expected rigid"):
             call(T)
 
@@ -75,8 +85,12 @@ def test_check_pose_refuses_other_rows_and_missing_values() -> None:
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
 def test_check_pose_accepts_rounded_poses(dtype: torch.dtype) -> None:
     generator = torch.Generator().manual_seed(0)
-    R = geometry.rotation_from_axis_angle(2.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64))
-    T = geometry.transform(R, torch.randn(500, 3, generator=generator, dtype=torch.float64)).to(dtype)
+    R = geometry.rotation_from_axis_angle(
+        2.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    )
+    T = geometry.transform(R, torch.randn(500, 3, generator=generator, dtype=torch.float64)).to(
+        dtype
+    )
     checks.check_pose(T, "T")
     checks.check_rotation(T[:, :3, :3], "R")
     checks.check_pose(torch.linalg.inv(T.double()), "T")
@@ -87,11 +101,25 @@ def test_check_pose_accepts_rounded_poses(dtype: torch.dtype) -> None:
 def test_check_photograph_and_check_pixels_refuse_other_images() -> None:
     image = torch.rand(3, 8, 9)
     checks.check_photograph(image)
-    for bad in (image[0], image[:2], image.long(), image > 0.5, image[None], image[:, :0], "missing.png", None):
+    for bad in (
+        image[0],
+        image[:2],
+        image.long(),
+        image > 0.5,
+        image[None],
+        image[:, :0],
+        "missing.png",
+        None,
+    ):
         with pytest.raises(InvalidInputError, match="images: expected"):
             checks.check_photograph(bad)
     checks.check_pixels(1.0005 * torch.ones(3, 2, 2), "of the box")
-    for value, match in ((math.nan, "NaN or inf"), (-math.inf, "NaN or inf"), (1.01, "255"), (-0.01, "255")):
+    for value, match in (
+        (math.nan, "NaN or inf"),
+        (-math.inf, "NaN or inf"),
+        (1.01, "255"),
+        (-0.01, "255"),
+    ):
         with pytest.raises(ImageError, match=match):
             checks.check_pixels(torch.full((3, 2, 2), value), "of the box")
 
@@ -100,13 +128,32 @@ def test_as_boxes_and_as_camera_matrices_accept_tensors_arrays_and_lists_only() 
     boxes = torch.tensor([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 8.0]])
     for given in (boxes.double(), [*boxes], boxes.tolist(), [*boxes.numpy()], boxes.int().numpy()):
         assert torch.equal(checks.as_boxes(given, 2).float(), boxes)
-    others = [["a", "b", "c", "d"]], [[1.0, 2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0, 5.0]], [None], {"x": 1}
+    others = (
+        [["a", "b", "c", "d"]],
+        [[1.0, 2.0, 3.0]],
+        [[1.0, 2.0], [3.0, 4.0, 5.0]],
+        [None],
+        {"x": 1},
+    )
     for bad in (*others, np.array([[1, 2, 3, None]]), torch.ones(1, 4, dtype=torch.bool)):
         with pytest.raises(InvalidInputError, match="boxes: expected"):
             checks.as_boxes(bad, 1)
-    for K in (CAMERA, [CAMERA, CAMERA], [CAMERA.tolist()] * 2, [*CAMERA.expand(2, 3, 3).numpy()], CAMERA.numpy()):
+    for K in (
+        CAMERA,
+        [CAMERA, CAMERA],
+        [CAMERA.tolist()] * 2,
+        [*CAMERA.expand(2, 3, 3).numpy()],
+        CAMERA.numpy(),
+    ):
         assert torch.equal(checks.as_camera_matrices(K, 2), CAMERA.expand(2, 3, 3))
-    for bad in ([None], "camera", [CAMERA, None], [[1.0, 2.0, 3.0]], [CAMERA, CAMERA[:2]], [CAMERA] * 3):
+    for bad in (
+        [None],
+        "camera",
+        [CAMERA, None],
+        [[1.0, 2.0, 3.0]],
+        [CAMERA, CAMERA[:2]],
+        [CAMERA] * 3,
+    ):
         with pytest.raises(InvalidInputError, match="camera_matrices: expected"):
             checks.as_camera_matrices(bad, 2)
 
@@ -122,10 +169,16 @@ def test_numbers_and_integers_of_the_wrong_type_are_refused() -> None:
     assert checks.check_integer(np.int64(3), "scales") == 3
 
 
-@pytest.mark.parametrize("name", [n for n in vars(errors) if n.endswith(("Error", "Warning")) and n[0] != "_"])
+@pytest.mark.parametrize(
+    "name", [n for n in vars(errors) if n.endswith(("Error", "Warning")) and n[0] != "_"]
+)
 def test_errors_keep_message_and_subject(name: str) -> None:
     error = getattr(errors, name)("unusable; use another", subject="a.png")
-    for copy in (error, pickle.loads(pickle.dumps(error)), type(error)("unusable; use another").with_subject("a.png")):
+    for copy in (
+        error,
+        pickle.loads(pickle.dumps(error)),
+        type(error)("unusable; use another").with_subject("a.png"),
+    ):
         assert str(copy) == "a.png: unusable; use another"
         assert (copy.message, copy.subject) == ("unusable; use another", "a.png")
     assert str(error.with_subject("image 3")) == "image 3: unusable; use another"
@@ -137,4 +190,6 @@ def test_check_square_pixels_accepts_ten_per_cent() -> None:
         checks.check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))
     for ratio in (1.0 / 1.101, 1.101):
         with pytest.raises(InvalidInputError, match="square"):
-            checks.check_square_pixels(torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))]))
+            checks.check_square_pixels(
+                torch.stack([CAMERA, changed(CAMERA, (0, 0, 220.1 * ratio))])
+            )

@@ -15,7 +15,8 @@ from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
 from curvireg_torch.utils.files import file_name, only_in
 
-OLD, NEW = b"a" * 1000, b"b" * 5_000_000
+OLD = b"a" * 1000
+NEW = b"b" * 5_000_000
 
 
 @pytest.fixture
@@ -42,7 +43,9 @@ def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(OutputError, match=r"file: cannot be written \(File too large\); choose another place"):
+        with pytest.raises(
+            OutputError, match=r"file: cannot be written \(File too large\); choose another place"
+        ):
             files.write_file(path, NEW)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -66,18 +69,23 @@ def test_check_writable_leaves_nothing_and_names_the_option(tmp_path: Path) -> N
     files.check_writable(tmp_path / "a" / "b", "--out")
     assert not list((tmp_path / "a" / "b").iterdir())
     (tmp_path / "file").write_bytes(OLD)
-    with pytest.raises(OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"):
+    with pytest.raises(
+        OutputError, match=r"^--out .*file: cannot be written to \(.*\); choose another --out$"
+    ):
         files.check_writable(tmp_path / "file", "--out")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
 def test_write_file_keeps_the_old_content_if_interrupted(
     number: signal.Signals, code: int, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: files.write_file(path, NEW))
     before = [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]
-    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for jobs in the background
+    # a shell ignores it for jobs in the background
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(SystemExit, match=str(code)):
             sys.exit(main(["cache"]))
@@ -108,7 +116,9 @@ def test_write_csv_leaves_nothing_to_a_spreadsheet_to_compute(tmp_path: Path) ->
 def test_read_json_refuses_malicious_missing_and_large_files(tmp_path: Path) -> None:
     for content in (b"[" * 2_000_000, b'{"0": ' + b"1" * 100_000 + b"}", b"\xff", b"[1]"):
         (tmp_path / "a.json").write_bytes(content)
-        with pytest.raises(InvalidInputError, match=r"a\.json: .*README shows the layout") as caught:
+        with pytest.raises(
+            InvalidInputError, match=r"a\.json: .*README shows the layout"
+        ) as caught:
             files.read_json(tmp_path / "a.json", dict, "README")
         assert len(str(caught.value).splitlines()) == 1
         assert len(str(caught.value)) < 1000
@@ -122,13 +132,29 @@ def test_read_json_refuses_malicious_missing_and_large_files(tmp_path: Path) -> 
 
 def test_finite_numbers_accepts_finite_numbers_only() -> None:
     assert files.finite_numbers([1, 2.5], 2) == (1.0, 2.5)
-    for values in ([1], [1, True], [1, "2"], [1, float("nan")], [1, 10**400], "12", {"a": 1, "b": 2}, None):
+    for values in (
+        [1],
+        [1, True],
+        [1, "2"],
+        [1, float("nan")],
+        [1, 10**400],
+        "12",
+        {"a": 1, "b": 2},
+        None,
+    ):
         assert files.finite_numbers(values, 2) is None
 
 
 def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
     x = torch.arange(4.0)
-    others = [{"b": x}, {"a": x.double()}, {"a": x.view(2, 2)}, {"a": x + 1e-6}, {"a": x, "b": x}, {"a": x.bfloat16()}]
+    others = [
+        {"b": x},
+        {"a": x.double()},
+        {"a": x.view(2, 2)},
+        {"a": x + 1e-6},
+        {"a": x, "b": x},
+        {"a": x.bfloat16()},
+    ]
     found = {files.tensor_digest(tensors) for tensors in ({"a": x}, *others)}
     assert len(found) == 1 + len(others)
     strided = torch.stack([x, x], dim=1)[:, 0].requires_grad_()
@@ -136,7 +162,9 @@ def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
     assert len(files.tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
 
 
-def test_code_digest_changes_with_any_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_digest_changes_with_any_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for decide in (cache._SOURCES, POSE_SOURCES):  # banks and results
         assert {"features", "filters", "geometry", "mesh", "rendering", "terms.py"} <= set(decide)
         assert len(files.code_digest(*decide)) == 16
@@ -165,7 +193,15 @@ def test_file_name_has_no_folders():
 
 def test_only_in_finds_files_of_one_folder(tmp_path):
     find = only_in(tmp_path)
-    for name in ("a.png", "/etc/a.png", "../a.png", "C:\\a.png", "b/../a.png", "\0a.png", " a.png "):
+    for name in (
+        "a.png",
+        "/etc/a.png",
+        "../a.png",
+        "C:\\a.png",
+        "b/../a.png",
+        "\0a.png",
+        " a.png ",
+    ):
         assert find(name) == tmp_path / "a.png"
     for name in ("", "..", "../..", "/", "x/.", "..\\.."):
         assert find(name) == tmp_path / "file"

@@ -10,19 +10,44 @@ from curvireg_torch import cli
 from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import CurviregError
 
-HEAVY = {"torch", "numpy", "scipy", "kornia", "trimesh", "cv2", "sklearn", "matplotlib", "safetensors", "tqdm"}
-UNUSED = {"sklearn", "matplotlib", "skimage", "pyrender", "OpenGL", "timm", "torchvision", "pandas", "IPython"}
+HEAVY = {
+    "torch",
+    "numpy",
+    "scipy",
+    "kornia",
+    "trimesh",
+    "cv2",
+    "sklearn",
+    "matplotlib",
+    "safetensors",
+    "tqdm",
+}
+UNUSED = {
+    "sklearn",
+    "matplotlib",
+    "skimage",
+    "pyrender",
+    "OpenGL",
+    "timm",
+    "torchvision",
+    "pandas",
+    "IPython",
+}
 
 
 def imported_by(code: str) -> set[str]:
     """Top-level modules after ``code`` has run in a new process."""
     ending = "except SystemExit:\n    pass\nprint('\\n'.join(sys.modules), file=sys.stderr)"
     script = f"import sys\ntry:\n    {code}\n{ending}"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=120
+    )
     return {name.split(".")[0] for name in done.stderr.split()}
 
 
-@pytest.mark.parametrize("words", ["--help", "--version", "register -h", "evaluate bop --help", "register --unit mile"])
+@pytest.mark.parametrize(
+    "words", ["--help", "--version", "register -h", "evaluate bop --help", "register --unit mile"]
+)
 def test_help_imports_nothing_heavy(words):
     assert not imported_by(f"from curvireg_torch.cli import main; main({words.split()!r})") & HEAVY
 
@@ -36,10 +61,12 @@ def test_imports_are_only_those_of_what_is_used():
     assert not loaded & UNUSED
     # kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation.
     loaded = imported_by(
-        "import numpy, trimesh, curvireg_torch as cr; from curvireg_torch.geometry import sample_views; "
+        "import numpy, trimesh, curvireg_torch as cr; from curvireg_torch.geometry import "
+        "sample_views; "
         "views = sample_views(azimuth_step=90, elevations=[20]); "
         "bank = cr.ViewBank.build(trimesh.creation.box((1, 2, 3)), views, progress=False); "
-        "picture = numpy.random.default_rng(0).random((48, 64, 3)); K = cr.camera_matrix(60, 60, 32, 24); "
+        "picture = numpy.random.default_rng(0).random((48, 64, 3)); K = cr.camera_matrix(60, 60, "
+        "32, 24); "
         "assert cr.Registrar(bank)([picture], [[4, 4, 40, 30]], K)[0].ok"
     )
     assert {"torch", "trimesh"} <= loaded
@@ -49,12 +76,21 @@ def test_imports_are_only_those_of_what_is_used():
 def test_options_accept_numbers_with_commas():
     box = ["--box", "10,", "20,", "30.5,", "40"]
     arguments = parse(["register", "a,1.jpg", *box, "--camera=1e3,1000,-.5,2", "5,6", "--out", "o"])
-    assert arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == (10.0, 20.0, 30.5, 40.0)
-    assert (arguments.camera, arguments.paths) == ((1000.0, 1000.0, -0.5, 2.0), [Path("a,1.jpg"), Path("5,6")])
+    assert (
+        arguments.box == parse(["view", "--box=10, 20, 30.5, 40"]).box == (10.0, 20.0, 30.5, 40.0)
+    )
+    assert (arguments.camera, arguments.paths) == (
+        (1000.0, 1000.0, -0.5, 2.0),
+        [Path("a,1.jpg"), Path("5,6")],
+    )
 
 
 def test_main_reports_errors_in_one_line_with_a_code(monkeypatch, capsys):
-    denied = PermissionError(13, "denied", "x.ply"), 2, "error: [Errno 13] denied: 'x.ply'; check that it exists"
+    denied = (
+        PermissionError(13, "denied", "x.ply"),
+        2,
+        "error: [Errno 13] denied: 'x.ply'; check that it exists",
+    )
     refused = CurviregError("no good"), 2, "error: no good\n"
     for raised, code, message in ((KeyboardInterrupt(), 130, "interrupted\n"), denied, refused):
         command = Namespace(run=Mock(side_effect=raised), debug=False)

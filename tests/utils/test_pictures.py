@@ -11,12 +11,23 @@ from PIL import EpsImagePlugin, Image
 
 from curvireg_torch.errors import MAX_IMAGE_PIXELS, ImageError
 from curvireg_torch.utils import pictures
-from curvireg_torch.utils.pictures import PICTURE_NAMES, PICTURE_STARTS, check_pixels, open_picture, picture_format
+from curvireg_torch.utils.pictures import (
+    PICTURE_NAMES,
+    PICTURE_STARTS,
+    check_pixels,
+    open_picture,
+    picture_format,
+)
 from tests._support.doubling import check_linear
 
 SECURITY = Path(__file__).parents[2] / "SECURITY.md"
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n%%EOF\n"
-DOS_POSTSCRIPT = b"\xc5\xd0\xd3\xc6" + (32).to_bytes(4, "little") + len(POSTSCRIPT).to_bytes(4, "little") + bytes(20)
+DOS_POSTSCRIPT = (
+    b"\xc5\xd0\xd3\xc6"
+    + (32).to_bytes(4, "little")
+    + len(POSTSCRIPT).to_bytes(4, "little")
+    + bytes(20)
+)
 
 
 def _saved(name: str, mode: str = "RGB", **options: object) -> bytes:
@@ -57,7 +68,16 @@ def test_open_picture_tells_formats_by_each_of_their_starts():
             for other in (b" " + start, start[:-1]):
                 with pytest.raises(ImageError, match="not an image that is read"):
                     picture_format(other)
-    for other in (b"", b"P0CMYK 1 1 255\n", b"P7\n", b"Pf\n", b"PyP\n", b"RIFFAVI WAVE", b"GIF89a", b"<svg/>"):
+    for other in (
+        b"",
+        b"P0CMYK 1 1 255\n",
+        b"P7\n",
+        b"Pf\n",
+        b"PyP\n",
+        b"RIFFAVI WAVE",
+        b"GIF89a",
+        b"<svg/>",
+    ):
         with pytest.raises(ImageError, match=re.escape(PICTURE_NAMES)):
             picture_format(other)
 
@@ -129,7 +149,9 @@ def test_comments_of_ppm_are_left_out(content):
 
 def test_bytes_of_binary_ppm_are_no_comments():
     assert open_picture(b"P5 3 1 255\n#\n#").tobytes() == b"#\n#"
-    assert open_picture(b"P4 8 1\n#").tobytes() == open_picture(b"P1 8 1\n0 0 1 0 0 0 1 1").tobytes()
+    assert (
+        open_picture(b"P4 8 1\n#").tobytes() == open_picture(b"P1 8 1\n0 0 1 0 0 0 1 1").tobytes()
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,7 +178,12 @@ def test_ppm_is_read_in_linear_time(make):
 def test_a_long_header_of_ppm_is_refused():
     room = pictures.MAX_PPM_HEADER - len(b"P6 1 1 255\n")
     assert open_picture(b"P6 " + b" " * room + b"1 1 255\nabc").tobytes() == b"abc"
-    for header in (b"P6 " + b" " * (room + 1) + b"1 1 255\n", b"P5 1 1", b"P5 1 1 x ", b"P5 1 12345678901 255 "):
+    for header in (
+        b"P6 " + b" " * (room + 1) + b"1 1 255\n",
+        b"P5 1 1",
+        b"P5 1 1 x ",
+        b"P5 1 12345678901 255 ",
+    ):
         with pytest.raises(ImageError, match="long header; convert it to JPEG or PNG"):
             open_picture(header + b"abc")
 

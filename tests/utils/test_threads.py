@@ -55,7 +55,8 @@ def test_map_on_threads_keeps_the_order_on_single_threads() -> None:
 
 
 def test_threads_that_start_during_jobs_keep_the_number_of_the_process() -> None:
-    """A thread takes torch's number for the process over with its first call of torch, and keeps it."""
+    """A thread takes torch's number for the process over with its first call of torch, and keeps
+    it."""
     found: list[int] = []
 
     def on_a_new_thread() -> None:
@@ -87,7 +88,8 @@ def test_the_caller_keeps_a_number_of_its_own() -> None:
 
 
 def test_a_pool_whose_threads_cannot_start_fails_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    start, calls = threading.Thread.start, []
+    start = threading.Thread.start
+    calls = []
 
     def refuse_the_third(thread: threading.Thread) -> None:
         calls.append(thread)
@@ -138,13 +140,17 @@ def test_submitted_jobs_are_cancelled_after_an_error_of_the_caller() -> None:
 @pytest.mark.parametrize("gradients", [True, False])
 def test_jobs_record_gradients_as_their_caller_does(gradients: bool) -> None:
     with torch.set_grad_enabled(gradients):
-        assert threads.map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [gradients] * 3
+        assert (
+            threads.map_on_threads(lambda _: torch.is_grad_enabled(), range(3)) == [gradients] * 3
+        )
 
 
 def test_jobs_share_few_threads_on_many_cores() -> None:
     torch.set_num_threads(16)  # the fixture undoes it
     assert threads.available_threads() == threads.MAX_THREADS
-    names = threads.map_on_threads(lambda _: (time.sleep(0.01), threading.get_ident())[1], range(16))
+    names = threads.map_on_threads(
+        lambda _: (time.sleep(0.01), threading.get_ident())[1], range(16)
+    )
     assert len(set(names)) <= threads.MAX_THREADS
 
 
@@ -160,7 +166,9 @@ def test_one_torch_thread_gives_the_threads_of_torch_to_jobs() -> None:
         assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)
         threads.for_each(2, lambda _: both.wait())
         assert threads.map_on_threads(threads_in_job, [0, 1]) == [(1, 1)] * 2
-        assert threads.map_on_threads(lambda _: (torch.get_num_threads(), threads.available_threads()), [0]) == [(1, 2)]
+        assert threads.map_on_threads(
+            lambda _: (torch.get_num_threads(), threads.available_threads()), [0]
+        ) == [(1, 2)]
         with threads.single_threaded_pool() as pool:
             assert list(pool.map(threads_in_job, [0, 1])) == [(1, 1)] * 2
         assert (torch.get_num_threads(), threads.available_threads()) == (1, 2)

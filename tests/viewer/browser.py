@@ -8,12 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-PROGRAMS = [next(filter(None, map(shutil.which, names)), None)
-            for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))]  # fmt: skip
+PROGRAMS = [
+    next(filter(None, map(shutil.which, names)), None)
+    for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))
+]
 MISSING = [name for name in ("nicegui", "selenium") if importlib.util.find_spec(name) is None]
-MISSING += [name for name, path in zip(("chromium", "chromedriver"), PROGRAMS, strict=True) if path is None]
+MISSING += [
+    name for name, path in zip(("chromium", "chromedriver"), PROGRAMS, strict=True) if path is None
+]
 OPTIONS = (
-    "headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
+    "headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",  # noqa: E501
     "disable-component-update", "disable-sync", "window-size=1500,1400", "use-angle=swiftshader",
     "enable-unsafe-swiftshader",
 )  # fmt: skip
@@ -39,8 +43,12 @@ class Browser:
         options.binary_location = PROGRAMS[0]
         for option in (*OPTIONS, f"user-data-dir={folder / 'profile'}"):
             options.add_argument(f"--{option}")
-        options.add_experimental_option("prefs", {"download.default_directory": str(folder / "downloads")})
-        self.driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(PROGRAMS[1]))
+        options.add_experimental_option(
+            "prefs", {"download.default_directory": str(folder / "downloads")}
+        )
+        self.driver = webdriver.Chrome(
+            options=options, service=webdriver.ChromeService(PROGRAMS[1])
+        )
         self.folder = folder
         self.driver.get(address)
         self.wait(lambda: self.part("register"), "the page")
@@ -56,7 +64,8 @@ class Browser:
         return [part.text for part in parts if part.text]
 
     def wait(self, condition, what, seconds=90):
-        deadline, error = time.monotonic() + seconds, None
+        deadline = time.monotonic() + seconds
+        error = None
         while True:
             try:
                 if value := condition():
@@ -89,37 +98,54 @@ class Browser:
               transfer.items.add(new File([Uint8Array.from(atob(data), c => c.charCodeAt(0))], name));
             for (const type of ["dragover", "drop"])
               document.querySelector("footer, main").dispatchEvent(
-                new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}))"""
+                new DragEvent(type, {dataTransfer: transfer, bubbles: true, cancelable: true}))"""  # noqa: E501
         self.driver.execute_script(script, files)
 
     def emulate(self, width, height, *, dark=False):
         """Show the page as a screen of that size does, until it is called with a width of 0."""
         command = self.driver.execute_cdp_cmd
         if width:
-            metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+            metrics = {
+                "width": width,
+                "height": height,
+                "deviceScaleFactor": 1,
+                "mobile": width < 600,
+            }
             command("Emulation.setDeviceMetricsOverride", metrics)
         else:
             command("Emulation.clearDeviceMetricsOverride", {})
         value = "dark" if dark else "light"
-        command("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": value}]})
+        command(
+            "Emulation.setEmulatedMedia",
+            {"features": [{"name": "prefers-color-scheme", "value": value}]},
+        )
 
     def picture(self, name, part=None):
-        """Write pictures for the documentation, in light and in dark colours and on a phone, where ``part`` is in view,
-        into the folder that CURVIREG_PICTURES names, if it does."""
+        """Write pictures for the documentation, in light and in dark colours and on a phone, where
+        ``part`` is in view, into the folder that CURVIREG_PICTURES names, if it does."""
         if folder := os.environ.get("CURVIREG_PICTURES"):
             for end, size in (("", (1440, 900)), ("-dark", (1440, 900)), ("-phone", (390, 844))):
                 self.emulate(*size, dark=end == "-dark")
-                self.driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": "mouseMoved", "x": 1, "y": 1})
+                self.driver.execute_cdp_cmd(
+                    "Input.dispatchMouseEvent", {"type": "mouseMoved", "x": 1, "y": 1}
+                )
                 self.driver.execute_script("document.activeElement.blur(); scrollTo(0, 0)")
                 if part and end == "-phone":
-                    self.driver.execute_script("arguments[0].scrollIntoView({block: 'end'})", self.part(part))
+                    self.driver.execute_script(
+                        "arguments[0].scrollIntoView({block: 'end'})", self.part(part)
+                    )
                 time.sleep(1)
-                pixels = cv2.imdecode(np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR)
-                cv2.imwrite(str(Path(folder) / f"{name}{end}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 60])
+                pixels = cv2.imdecode(
+                    np.frombuffer(self.driver.get_screenshot_as_png(), np.uint8), cv2.IMREAD_COLOR
+                )
+                cv2.imwrite(
+                    str(Path(folder) / f"{name}{end}.webp"), pixels, [cv2.IMWRITE_WEBP_QUALITY, 60]
+                )
             self.emulate(1440, 900)
 
     def drag(self, start, end, size, held=None):
-        """Drag the mouse between pixels of the photograph, whose width is ``size`` px; call ``held`` before the end."""
+        """Drag the mouse between pixels of the photograph, whose width is ``size`` px; call
+        ``held`` before the end."""
         from selenium.webdriver import ActionChains
 
         image = self.part("photograph")
@@ -127,9 +153,14 @@ class Browser:
         zoom = image.size["width"] / size
         middle = image.size["width"] / 2, image.size["height"] / 2
         (x0, y0), (x1, y1) = (
-            tuple(round((v + 0.5) * zoom - m) for v, m in zip(point, middle, strict=True)) for point in (start, end)
+            tuple(round((v + 0.5) * zoom - m) for v, m in zip(point, middle, strict=True))
+            for point in (start, end)
         )
-        chain = ActionChains(self.driver, duration=50).move_to_element_with_offset(image, x0, y0).click_and_hold()
+        chain = (
+            ActionChains(self.driver, duration=50)
+            .move_to_element_with_offset(image, x0, y0)
+            .click_and_hold()
+        )
         chain.move_by_offset((x1 - x0) // 2, (y1 - y0) // 2)
         chain.move_to_element_with_offset(image, x1, y1).perform()
         if held is not None:
@@ -148,7 +179,7 @@ class Browser:
             const least = values => values.reduce((a, b) => Math.min(a, b), 1e9);
             const y = drawn.map(k => Math.floor(k / canvas.width));
             const box = [least(x), least(y), -least(x.map(v => -v)), -least(y.map(v => -v))];
-            return box.map(v => v * arguments[0] / canvas.width)"""
+            return box.map(v => v * arguments[0] / canvas.width)"""  # noqa: E501
         return self.driver.execute_script(script, width)
 
     def box(self):
@@ -157,7 +188,10 @@ class Browser:
 
     def downloaded(self, name):
         path = self.folder / "downloads" / name
-        self.wait(lambda: path.is_file() and not list(path.parent.glob("*.crdownload")), f"download of {name}")
+        self.wait(
+            lambda: path.is_file() and not list(path.parent.glob("*.crdownload")),
+            f"download of {name}",
+        )
         content = path.read_bytes()
         path.unlink()
         return content

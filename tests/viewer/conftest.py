@@ -29,7 +29,9 @@ def folder(tmp_path_factory):
 def address(folder):
     """Address of a viewer that was started without a photograph."""
     command = [sys.executable, "-m", "curvireg_torch", "view", "--no-browser"]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
+    }
     environment |= {"CURVIREG_CACHE": str(folder / "cache"), "PYTHONPATH": str(Path.cwd())}
     (folder / "temporary").mkdir()
     environment["TMPDIR"] = str(folder / "temporary")
@@ -50,7 +52,8 @@ def address(folder):
             server.kill()
             server.wait()
         server.stdout.close()
-    log = (folder / "log").read_text().replace("WARNING:  Invalid HTTP request received.\n", "")  # one test sends it
+    # one test sends it
+    log = (folder / "log").read_text().replace("WARNING:  Invalid HTTP request received.\n", "")
     assert (server.returncode, log) == (0, "")
     assert not list((folder / "temporary").glob("curvireg-view-*")), "the server removes its folder"
 
@@ -82,13 +85,18 @@ def registered(tmp_path_factory):
 
 @pytest.fixture
 def session(registered):
-    """The session at its first hypothesis; its options, photographs and result are restored afterwards."""
+    """The session at its first hypothesis; its options, photographs and result are restored
+    afterwards."""
     session = registered[0]
-    shot, kept, options = session.shot, dict(vars(session.shot)), session.options
+    shot = session.shot
+    kept = dict(vars(session.shot))
+    options = session.options
     shot.choose(0)
     yield session
     vars(shot).update(kept)
-    session.options, session.shots, session.shot = options, [shot], shot
+    session.options = options
+    session.shots = [shot]
+    session.shot = shot
 
 
 @pytest.fixture

@@ -1,4 +1,5 @@
-"""The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of screens."""
+"""The page as people use it: dropped files, mistakes, a reload, keys, small screens, and readers of
+screens."""
 
 import json
 import re
@@ -12,7 +13,10 @@ from curvireg_torch.synthetic import demo_scene, example_mesh
 from curvireg_torch.visualization.encoding import png, to_uint8
 from tests.viewer.browser import MISSING
 
-pytestmark = [pytest.mark.browser, pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}")]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(bool(MISSING), reason=f"not installed: {', '.join(MISSING)}"),
+]
 
 
 def saved(browser):
@@ -31,12 +35,18 @@ def _own_screen(browser):
 
 def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browser):
     assert browser.driver.find_element("css selector", "html").get_attribute("lang") == "en-US"
-    assert [browser.text(name) for name in ("sample", "register")] == ["Try the sample", "Find the pose"]
+    assert [browser.text(name) for name in ("sample", "register")] == [
+        "Try the sample",
+        "Find the pose",
+    ]
     assert browser.part("register").get_attribute("disabled")
     browser.emulate(1440, 900)
     browser.picture("viewer-empty")
     browser.click("sample")
-    browser.wait(lambda: browser.text("photograph-facts").startswith("coffee.jpg: 600 x 400 px"), "photograph")
+    browser.wait(
+        lambda: browser.text("photograph-facts").startswith("coffee.jpg: 600 x 400 px"),
+        "photograph",
+    )
     assert "CC0" in browser.text("photograph-facts")
     browser.wait(lambda: "done" in browser.part("step-box").get_attribute("class"), "box")
     browser.wait(lambda: not browser.part("register").get_attribute("disabled"), "ready")
@@ -55,22 +65,33 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
 
     browser.emulate(1440, 900)
     browser.unfold("command-line")
-    canvas = browser.wait(lambda: browser.part("preview").find_element("css selector", "canvas"), "the model")
+    canvas = browser.wait(
+        lambda: browser.part("preview").find_element("css selector", "canvas"), "the model"
+    )
     labels = """
         const all = [...document.querySelectorAll('.nicegui-scene div')];
         return all.filter(e => !e.children.length && e.textContent).map(e => e.textContent)"""
     browser.wait(lambda: {"up", "front"} <= set(browser.driver.execute_script(labels)), "axes")
     before = hinted_azimuth(browser)
     assert f"--near {before:g} " in browser.text("command")
-    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(45, 0).release().perform()
+    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(
+        45, 0
+    ).release().perform()
     browser.wait(lambda: 20 < (before - hinted_azimuth(browser)) % 360 < 120, "turned")
-    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(-45, 20).release().perform()
-    browser.wait(lambda: abs(before - hinted_azimuth(browser)) < 20, "turned back, and seen from higher up")
+    ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(
+        -45, 20
+    ).release().perform()
+    browser.wait(
+        lambda: abs(before - hinted_azimuth(browser)) < 20, "turned back, and seen from higher up"
+    )
     browser.picture("viewer-model", "fold-model")
     browser.click("no-hint")
     browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
     browser.click("mark-front")
-    browser.wait(lambda: browser.text("hint-facts") == "Click on the side that is front.", "asked for the front")
+    browser.wait(
+        lambda: browser.text("hint-facts") == "Click on the side that is front.",
+        "asked for the front",
+    )
     ActionChains(browser.driver).move_to_element_with_offset(canvas, -22, 0).click().perform()
     browser.wait(lambda: "Click" not in browser.text("hint-facts"), "clicked")
 
@@ -94,8 +115,13 @@ def test_a_reload_keeps_photograph_mesh_box_and_answer(browser):
     browser.driver.refresh()
     browser.wait(lambda: [browser.text(name) for name in names] == before, "everything again")
     images = browser.part("photograph").find_elements("css selector", "img")
-    browser.wait(lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [600] * 3, "layers")
-    browser.wait(lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards")
+    browser.wait(
+        lambda: [int(image.get_attribute("naturalWidth")) for image in images] == [600] * 3,
+        "layers",
+    )
+    browser.wait(
+        lambda: len(browser.part("panel-answer").find_elements("css selector", "img")) > 1, "cards"
+    )
     assert browser.text("progress") == "done"
     browser.picture("viewer", "answer-1")
 
@@ -113,17 +139,23 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
         browser.click(f"download-{name.replace('overlay.png', 'picture')}")
         assert browser.downloaded(name).startswith(start)
     browser.click("answer-1")
-    browser.wait(lambda: browser.part("answer-1").get_attribute("aria-pressed") == "true", "the first again")
+    browser.wait(
+        lambda: browser.part("answer-1").get_attribute("aria-pressed") == "true", "the first again"
+    )
 
 
 def test_the_pose_is_corrected_on_the_photograph(browser):
     browser.emulate(1440, 900)
-    before, at_rest = saved(browser), browser.extent(600)
+    before = saved(browser)
+    at_rest = browser.extent(600)
     x0, y0, x1, y1 = at_rest
-    middle, right = ((x0 + x1) / 2, (y0 + y1) / 2), [x0 + 36, y0, x1 + 36, y1]
+    middle = ((x0 + x1) / 2, (y0 + y1) / 2)
+    right = [x0 + 36, y0, x1 + 36, y1]
 
     def follows():
-        browser.wait(lambda: browser.extent(600) == pytest.approx(right, abs=4), "the mesh follows", 20)
+        browser.wait(
+            lambda: browser.extent(600) == pytest.approx(right, abs=4), "the mesh follows", 20
+        )
 
     browser.drag(middle, (middle[0] + 36, middle[1]), 600, held=follows)
     browser.wait(lambda: "moved: rotated 0.0 degrees" in browser.text("facts"), "moved")
@@ -154,7 +186,9 @@ def scroll(browser, element, amount):
     from selenium.webdriver import ActionChains
     from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
-    ActionChains(browser.driver).scroll_from_origin(ScrollOrigin.from_element(element), 0, amount).perform()
+    ActionChains(browser.driver).scroll_from_origin(
+        ScrollOrigin.from_element(element), 0, amount
+    ).perform()
 
 
 def test_the_program_is_copied(browser):
@@ -165,17 +199,22 @@ def test_the_program_is_copied(browser):
     copied = browser.driver.execute_async_script(script)
     assert copied.startswith("import curvireg_torch as cr\n")
     files = re.findall(r"'([^']+coffee\.jpg|[^']+cup\.ply)'", copied)
-    assert [Path(file).is_file() for file in files] == [True, True], "it runs as long as the page is open"
+    assert [Path(file).is_file() for file in files] == [True, True], (
+        "it runs as long as the page is open"
+    )
 
 
 def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(browser):
     from selenium.webdriver import ActionChains
 
     browser.emulate(1440, 900)
-    before, canvas = browser.text("certainty"), browser.part("preview").find_element("css selector", "canvas")
+    before = browser.text("certainty")
+    canvas = browser.part("preview").find_element("css selector", "canvas")
     start = hinted_azimuth(browser)
     browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", canvas)
-    drag = ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
+    drag = (
+        ActionChains(browser.driver).move_to_element(canvas).click_and_hold().move_by_offset(120, 0)
+    )
     drag.release().perform()  # half the height is half a turn
     browser.wait(lambda: 140 < (start - hinted_azimuth(browser)) % 360 < 220, "seen from behind")
     browser.click("register")
@@ -197,10 +236,12 @@ def test_the_photograph_fits_the_window_and_stays_in_view(browser, size):
     viewport = browser.driver.find_element("css selector", ".viewport")
     inside = """
         const frame = arguments[0].getBoundingClientRect();
-        return frame.top >= 0 && frame.left >= 0 && frame.bottom <= innerHeight && frame.right <= innerWidth"""
+        return frame.top >= 0 && frame.left >= 0 && frame.bottom <= innerHeight && frame.right <= innerWidth"""  # noqa: E501
     for end in (0, 300, 100000):
         browser.driver.execute_script("scrollTo(0, arguments[0])", end)
-        browser.wait(lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5)
+        browser.wait(
+            lambda: browser.driver.execute_script(inside, viewport), f"in view at {end}", 5
+        )
     assert browser.driver.execute_script("return scrollY") > 300
     assert viewport.rect["width"] > 0.5 * size[0]
 
@@ -210,9 +251,15 @@ def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(bro
     wide = """
         const all = [...document.querySelectorAll('*:not(.preview *)')];
         return all.filter(e => e.getBoundingClientRect().right > 391)"""
-    browser.wait(lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390, "narrow")
+    browser.wait(
+        lambda: browser.driver.execute_script("return document.documentElement.scrollWidth") == 390,
+        "narrow",
+    )
     assert browser.driver.execute_script(wide) == []
-    parts = [browser.part(name).rect for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")]
+    parts = [
+        browser.part(name).rect
+        for name in ("photograph", "step-photograph", "step-mesh", "register", "verdict")
+    ]
     assert [part["y"] for part in parts] == sorted(part["y"] for part in parts)
     assert browser.part("photograph").rect["width"] > 300
     small = """
@@ -221,13 +268,15 @@ def test_a_small_screen_stacks_everything_and_dark_colours_follow_the_system(bro
         return seen.filter(e => {
             const {width, height} = e.getBoundingClientRect();
             return width < 44 || height < 44;
-        }).map(e => e.outerHTML.slice(0, 200))"""
+        }).map(e => e.outerHTML.slice(0, 200))"""  # noqa: E501
     for fold in ("options", "camera", "command-line", "model"):
         browser.unfold(fold)
     assert browser.driver.execute_script(small) == [], "fingers need 44 px"
     browser.emulate(1440, 900, dark=True)
     body = browser.driver.find_element("css selector", "body")
-    browser.wait(lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark")
+    browser.wait(
+        lambda: body.value_of_css_property("background-color") == "rgba(20, 23, 26, 1)", "dark"
+    )
 
 
 def test_keys_undo_and_zoom_change_the_box(browser):
@@ -282,12 +331,16 @@ def test_keys_undo_and_zoom_change_the_box(browser):
 
 def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(browser, folder):
     browser.drop(folder / "truck.ply", folder / "photo.png")
-    browser.wait(lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph")
+    browser.wait(
+        lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph"
+    )
     browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
     (folder / "other.png").write_bytes((folder / "photo.png").read_bytes())
     for name in ("other.png", "photo.png"):  # photo.png for the second time
         browser.upload("photograph", folder / name)
-        browser.wait(lambda name=name: browser.text("photograph-facts").startswith(f"{name}: "), name)
+        browser.wait(
+            lambda name=name: browser.text("photograph-facts").startswith(f"{name}: "), name
+        )
     assert browser.messages() == []
     browser.unfold("camera")
     browser.click("exif")
@@ -298,7 +351,11 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     (folder / "notes.txt").write_text("nothing to see")
     browser.drop(folder / "broken.png", folder / "hostile.obj", folder / "notes.txt")
     browser.wait(lambda: len(browser.messages()) == 3, "three messages")
-    for part, name in (("photograph", "broken.png"), ("mesh", "hostile.obj"), ("file", "notes.txt")):
+    for part, name in (
+        ("photograph", "broken.png"),
+        ("mesh", "hostile.obj"),
+        ("file", "notes.txt"),
+    ):
         assert browser.text(f"message-{part}").startswith(f"{name}: ")
         assert str(folder) not in browser.text(f"message-{part}")
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
@@ -330,14 +387,19 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
     assert [image.get_attribute("alt") for image in thumbnails][-2:] == list(scenes)
     for number, is_there in ((len(thumbnails) - 1, False), (len(thumbnails), True)):
         browser.click(f"photograph-{number}")
-        browser.wait(lambda is_there=is_there: (browser.box() is not None) == is_there, f"box of {number}")
+        browser.wait(
+            lambda is_there=is_there: (browser.box() is not None) == is_there, f"box of {number}"
+        )
 
     def count():
         return len(browser.part("strip").find_elements("css selector", "img"))
 
     for left in range(len(thumbnails) - 1, 1, -1):  # those of the tests before
         browser.click("photograph-1")
-        browser.wait(lambda: browser.part("photograph-1").get_attribute("aria-pressed") == "true", "the first")
+        browser.wait(
+            lambda: browser.part("photograph-1").get_attribute("aria-pressed") == "true",
+            "the first",
+        )
         browser.click("no-photo")
         browser.wait(lambda n=left: count() == n, f"{left} left")
     browser.click("photograph-2")
@@ -353,12 +415,18 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     scenes = [demo_scene(seed) for seed in (4, 5)]  # the world is the mesh's own frame
     lines = ["photo,x0,y0,x1,y1,fx,fy,cx,cy,r11,r12,r13,r21,r22,r23,r31,r32,r33,tx,ty,tz"]
     for seed, scene in zip((4, 5), scenes, strict=True):
-        R, t = scene.truth[:3, :3].flatten().tolist(), (1000.0 * scene.truth[:3, 3]).tolist()  # in mm
+        # in mm
+        R = scene.truth[:3, :3].flatten().tolist()
+        t = (1000.0 * scene.truth[:3, 3]).tolist()
         box = scene.box.tolist() if seed == 4 else [""] * 4
-        lines.append(",".join(map(str, [f"table-{seed}.png", *box, 1040, 1040, 479.5, 359.5, *R, *t])))
+        lines.append(
+            ",".join(map(str, [f"table-{seed}.png", *box, 1040, 1040, 479.5, 359.5, *R, *t]))
+        )
     (folder / "rig.csv").write_text("\n".join(lines))
     browser.drop(*map(folder.joinpath, ["table-4.png", "table-5.png", "table.ply", "rig.csv"]))
-    browser.wait(lambda: browser.text("rig-facts") == "rig.csv: one pose in 2 photographs", "the rig")
+    browser.wait(
+        lambda: browser.text("rig-facts") == "rig.csv: one pose in 2 photographs", "the rig"
+    )
     browser.wait(lambda: browser.text("mesh-facts").startswith("table.ply: "), "the mesh")
     assert browser.text("register") == "Find the pose in 2 photographs"
     browser.click("register")
@@ -375,4 +443,6 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
     browser.picture("viewer-rig")
     browser.click("no-rig")
-    browser.wait(lambda: browser.text("register") == "Find the object and its pose", "as without a rig")
+    browser.wait(
+        lambda: browser.text("register") == "Find the object and its pose", "as without a rig"
+    )

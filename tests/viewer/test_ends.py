@@ -1,4 +1,5 @@
-"""How the page begins and ends: its address is no argument of the browser, and no signal leaves the uploads behind."""
+"""How the page begins and ends: its address is no argument of the browser, and no signal leaves the
+uploads behind."""
 
 import os
 import re
@@ -30,7 +31,9 @@ def wait(condition, seconds=60):
 
 
 def post(address, name, content):
-    request = urllib.request.Request(f"{address}upload", content, {"x-file-name": name}, method="POST")
+    request = urllib.request.Request(
+        f"{address}upload", content, {"x-file-name": name}, method="POST"
+    )
     with urllib.request.urlopen(request) as answer:
         return answer.status
 
@@ -45,12 +48,16 @@ def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_pat
     browser.write_text(BROWSER)
     browser.chmod(0o700)
     seen = tmp_path / "seen"
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
+    }
     environment |= {"BROWSER": f"{browser} %s", "SEEN": str(seen), "TMPDIR": str(tmp_path)}
     environment |= {"PYTHONPATH": str(Path.cwd()), "CURVIREG_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "curvireg_torch", "view", "--host", host]
     with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True)
+        process = subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True
+        )
     try:
         address = re.search(r"http://\S+", process.stdout.readline())[0]
         wait(seen.is_file)

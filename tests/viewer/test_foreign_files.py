@@ -1,4 +1,5 @@
-"""What strangers upload names uploaded files only: the page neither reads other files nor tells which exist."""
+"""What strangers upload names uploaded files only: the page neither reads other files nor tells
+which exist."""
 
 import json
 import os
@@ -14,7 +15,8 @@ CALIBRATION = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1]}
 
 @pytest.fixture
 def outside(tmp_path):
-    """A folder of the server: ``secret`` is no calibration, ``cam.json`` is one, ``0.png`` a photograph."""
+    """A folder of the server: ``secret`` is no calibration, ``cam.json`` is one, ``0.png`` a
+    photograph."""
     folder = tmp_path / "server"
     folder.mkdir()
     (folder / "secret").write_text("TOKEN-hunter2\nuser:root\n")
@@ -67,7 +69,9 @@ def test_photographs_of_a_rig_are_uploads_too(workspace, outside, tmp_path):
     write_colmap(tmp_path, rows)
     write_bop_scene(tmp_path, rows, [[5]] * 3, [[5, 6, 20, 30]])
     scene = json.loads((tmp_path / "scene_camera.json").read_text())
-    (tmp_path / "scene_camera.json").write_text(json.dumps({f"../{up}/{k}": camera for k, camera in scene.items()}))
+    (tmp_path / "scene_camera.json").write_text(
+        json.dumps({f"../{up}/{k}": camera for k, camera in scene.items()})
+    )
     written(tmp_path / "rig.csv", HEADER, *rows)
     for names in (("images.txt", "cameras.txt"), ("scene_camera.json",), ("rig.csv",)):
         session = send(workspace, tmp_path, *names)

@@ -36,7 +36,9 @@ def camera(frames, taken):
             time.sleep(0.01)
         return (True, frames[number]) if number < len(frames) else (False, None)
 
-    return SimpleNamespace(isOpened=lambda: True, get=lambda _: 0.0, release=lambda: None, read=read)
+    return SimpleNamespace(
+        isOpened=lambda: True, get=lambda _: 0.0, release=lambda: None, read=read
+    )
 
 
 def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
@@ -58,15 +60,23 @@ def test_a_frame_is_drawn_once_the_one_before_is_with_a_browser():
 def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     scenes = sequence(4)
     learned_registrar().bank.save(tmp_path / "truck.safetensors")
-    pictures = [(image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy() for image, _, _ in scenes]
-    seen, pages, threads = [], [], []
+    pictures = [
+        (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy() for image, _, _ in scenes
+    ]
+    seen = []
+    pages = []
+    threads = []
     call = Follower.__call__
 
     def watch(address):
         with urllib.request.urlopen(address) as answer:
-            pages.append((address, answer.read().decode(), answer.headers["content-security-policy"]))
+            pages.append(
+                (address, answer.read().decode(), answer.headers["content-security-policy"])
+            )
         with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(urllib.request.Request(address, headers={"Origin": "http://evil.example"}))
+            urllib.request.urlopen(
+                urllib.request.Request(address, headers={"Origin": "http://evil.example"})
+            )
         while len(seen) < 3:
             picture = urllib.request.urlopen(f"{address}frame").read()
             if picture and picture not in seen:
@@ -86,18 +96,30 @@ def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Follower, "__call__", interrupted)
     monkeypatch.setattr(cv2, "VideoCapture", lambda _: camera(pictures, seen))
     box = map(str, scenes[0][1].tolist())
-    words = ["follow", "0", str(tmp_path / "truck.safetensors"), "--camera", *map(str, CAMERA), "--box", *box]
+    words = [
+        "follow",
+        "0",
+        str(tmp_path / "truck.safetensors"),
+        "--camera",
+        *map(str, CAMERA),
+        "--box",
+        *box,
+    ]
     assert main([*words, "--show", "--json"]) == 0
     threads[0].join(10)
     printed = capsys.readouterr()
-    assert [json.loads(line)["frame"] for line in printed.out.splitlines()] == [f"frame-00000{k}" for k in range(3)]
+    assert [json.loads(line)["frame"] for line in printed.out.splitlines()] == [
+        f"frame-00000{k}" for k in range(3)
+    ]
     assert "3 frames: 3 of 3 believed" in printed.err
     ((address, page, policy),) = pages
     assert address in printed.err
     assert "live" in page
     assert policy.startswith("default-src 'none'")
     for picture in seen:
-        pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+        pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(
+            int
+        )
         assert pixels.shape == (180, 240, 3)
         assert (np.abs(pixels - OUTLINE).sum(axis=2) < 120).sum() > 50, "the outline"
     with pytest.raises(urllib.error.URLError):  # it has ended

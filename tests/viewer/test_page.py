@@ -34,7 +34,11 @@ def build(workspace):
 
 
 def send(stage, kind, x=0.0, y=0.0, **values):
-    asyncio.run(stage._handle(SimpleNamespace(args={"type": kind, "x": x, "y": y, "reach": 4 / 240, **values})))
+    asyncio.run(
+        stage._handle(
+            SimpleNamespace(args={"type": kind, "x": x, "y": y, "reach": 4 / 240, **values})
+        )
+    )
 
 
 def drag(stage, start, end):
@@ -43,7 +47,8 @@ def drag(stage, start, end):
 
 
 def test_gestures_come_as_fractions_and_become_a_box_in_px(workspace, build):
-    shot, stage = workspace.session.shot, build(Stage)
+    shot = workspace.session.shot
+    stage = build(Stage)
     asyncio.run(stage.refresh())
     drag(stage, (20, 30), (120, 90))
     assert shot.box == pytest.approx((20, 30, 120, 90))
@@ -72,7 +77,8 @@ def test_messages_are_text_and_not_html(workspace, build):
 
 
 def test_typed_numbers_go_into_the_session(workspace, build):
-    inputs, session = build(Inputs), workspace.session
+    inputs = build(Inputs)
+    session = workspace.session
 
     def typed(words):
         inputs.camera.set_value(words)
@@ -91,7 +97,9 @@ def test_typed_numbers_go_into_the_session(workspace, build):
     session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2), guess=None)
     inputs.refresh()
     assert inputs.camera.value == "300 300 119.5 0.30000000000000004"
-    asyncio.run(inputs._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0))))
+    asyncio.run(
+        inputs._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
+    )
     inputs.refresh()
     assert inputs.camera_facts.content == "from a calibration file, without its distortion"
     assert isinstance(typed(inputs.camera.value)[0], Camera), "what is shown is not typed"
@@ -99,7 +107,8 @@ def test_typed_numbers_go_into_the_session(workspace, build):
 
 
 def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(workspace, build):
-    session, previews = workspace.session, [build(Preview), build(Preview)]
+    session = workspace.session
+    previews = [build(Preview), build(Preview)]
     asyncio.run(workspace.open_mesh(workspace.folder / "truck.ply"))
 
     def click(mark, *point):
@@ -113,7 +122,9 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
     session.hint_direction((3.0, 0.0, 0.0))
     for preview in previews:
         asyncio.run(preview.refresh())
-        assert preview.facts.content == "Hint: seen from azimuth 90, elevation 0, within 45 degrees."
+        assert (
+            preview.facts.content == "Hint: seen from azimuth 90, elevation 0, within 45 degrees."
+        )
     assert "--near 90 0 0 --within 45" in session.command()
     session.remove_limits()
     assert "--near" not in session.command()
@@ -134,12 +145,21 @@ def shown(session, tmp_path):
 
 
 def test_each_remark_has_its_repair(shown, monkeypatch):
-    session, started = shown.session, []
-    shot, answers = session.shot, Answers(shown)
-    monkeypatch.setattr(shown, "start_search", lambda: started.append((shot.box, session.options.guess)))
-    plain, before = {**session.document(), "corrected_box": None}, shot.box
+    session = shown.session
+    started = []
+    shot = session.shot
+    answers = Answers(shown)
+    monkeypatch.setattr(
+        shown, "start_search", lambda: started.append((shot.box, session.options.guess))
+    )
+    plain = {**session.document(), "corrected_box": None}
+    before = shot.box
     assert answers._repairs(plain) == {}
-    hint = {**plain, "prior": {"contradiction": "better outside"}, "corrected_box": [1.04, 2, 30, 40]}
+    hint = {
+        **plain,
+        "prior": {"contradiction": "better outside"},
+        "corrected_box": [1.04, 2, 30, 40],
+    }
     session.set_limits(elevation=(0.0, 10.0))
     repairs = answers._repairs(hint)
     assert list(repairs) == ["Search without the hint", "Search with that box"]
@@ -150,7 +170,8 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
 
 
 def test_the_pose_is_dragged_on_the_photograph(shown):
-    shot, posed = shown.session.shot, Stage(shown)
+    shot = shown.session.shot
+    posed = Stage(shown)
     asyncio.run(posed.refresh())
     assert posed.mode == "pose"
     assert "disabled" in posed.undo.props
@@ -172,7 +193,10 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
     assert (centre(), len(shot.answer.edits)) == (pytest.approx([x + 20, y + 10], abs=1e-6), 2)
     send(posed, "undo")
     assert len(shot.answer.edits) == 1
-    for kind, values in (("scale", {"factor": 1.1, "roll": 5.0}), ("nudge", {"dx": 1, "dy": 0, "shift": True})):
+    for kind, values in (
+        ("scale", {"factor": 1.1, "roll": 5.0}),
+        ("nudge", {"dx": 1, "dy": 0, "shift": True}),
+    ):
         send(posed, kind, **values)
     assert len(shot.answer.edits) == 1, "one change, when it rests"
     posed._last_gesture -= 10
@@ -186,10 +210,12 @@ def test_the_pose_is_dragged_on_the_photograph(shown):
 
 
 def test_photographs_are_chosen_from_a_strip(shown, registered):
-    session, stage = shown.session, Stage(shown)
+    session = shown.session
+    stage = Stage(shown)
     asyncio.run(stage.refresh())
     assert stage.strip.default_slot.children == []
-    first, second = session.shot, session.open_photo(registered[1] / "photo.png")
+    first = session.shot
+    second = session.open_photo(registered[1] / "photo.png")
     asyncio.run(stage.refresh())
     assert (stage.mode, stage.layers.visible) == ("box", False)
     one, other = stage.strip.default_slot.children

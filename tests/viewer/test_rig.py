@@ -26,7 +26,8 @@ HEADER = ",".join(["photo", *BOX, *CAMERA, *ROTATION, *TRANSLATION])
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
-    """Photographs, truck.safetensors, and rig.csv without a box of the second; returns the folder and the rows."""
+    """Photographs, truck.safetensors, and rig.csv without a box of the second; returns the folder
+    and the rows."""
     folder = tmp_path_factory.mktemp("rig")
     rows = write_rig_photos(folder)
     rows[1][1:5] = [""] * 4
@@ -60,7 +61,13 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     assert (first.box, second.box, third.box) == (tuple(rows[0][1:5]), None, tuple(rows[2][1:5]))
     assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
     search(workspace)
-    words = ["register", "--views", str(folder / "rig.csv"), str(folder / "truck.safetensors"), "--quiet"]
+    words = [
+        "register",
+        "--views",
+        str(folder / "rig.csv"),
+        str(folder / "truck.safetensors"),
+        "--quiet",
+    ]
     assert main([*words, "--out", str(tmp_path / "result")]) == 0
     written = json.loads((tmp_path / "result" / "result.json").read_text())
     document = json.loads(to_json(session.document()))
@@ -72,7 +79,10 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
         assert document[key] == written[key], key
     assert (document["mesh"], document["inputs"]["rig"]) == ("truck.safetensors", "rig.csv")
     for shot, view in zip((first, second, third), document["views"], strict=True):
-        assert (shot.projection[0][:3, :3].tolist(), shot.found_box.tolist()) == (view["rotation"], view["box"])
+        assert (shot.projection[0][:3, :3].tolist(), shot.found_box.tolist()) == (
+            view["rotation"],
+            view["box"],
+        )
         assert shot.answer is first.answer
     assert first.glb() == (tmp_path / "result" / "pose.glb").read_bytes()
     assert second.overlay() == (tmp_path / "result" / "overlay.png").read_bytes()
@@ -86,7 +96,8 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
 @pytest.fixture(scope="module")
 def found(rig, tmp_path_factory):
     """A workspace with the answer in two photographs of the rig, and a third photograph."""
-    folder, workspace = rig[0], Workspace(RegisterOptions(), tmp_path_factory.mktemp("uploads"))
+    folder = rig[0]
+    workspace = Workspace(RegisterOptions(), tmp_path_factory.mktemp("uploads"))
     (folder / "other.png").write_bytes((folder / "1.png").read_bytes())
     session = send(workspace, folder, "rig.csv", "other.png", "0.png", "2.png", "truck.safetensors")
     search(workspace)
@@ -113,8 +124,12 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
         world = torch.tensor(document["rotation"]).double()
         assert document["rotation"] == first.answer.pose.rotation.tolist()
         for shot, row in zip((first, last), document["views"], strict=True):
-            torch.testing.assert_close(shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world)
-            torch.testing.assert_close(shot.projection[0][:3, :3], torch.tensor(row["rotation"]).double())
+            torch.testing.assert_close(
+                shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world
+            )
+            torch.testing.assert_close(
+                shot.projection[0][:3, :3], torch.tensor(row["rotation"]).double()
+            )
             assert (row["edge_support"], row["name"], row["failure"]) == (None, row["name"], None)
         assert document["T_cam_from_model"] is None
         return document
@@ -135,7 +150,8 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
 def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
     workspace, session = found
     _, first, last = session.shots
-    before, session.shot = first.box, first
+    before = first.box
+    session.shot = first
     drawn = [before[0] - 3.0, before[1] - 2.0, before[2] + 3.0, before[3] + 2.0]
     first.set_box(tuple(drawn))
     last.set_box(None)
@@ -179,11 +195,16 @@ def test_a_bad_rig_is_named_with_its_row(workspace, rig, tmp_path, column, value
     assert (workspace.messages, session.shot.view is session.rig[0]) == ({}, True)
 
 
-def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photographs(workspace, rig, tmp_path):
+def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photographs(
+    workspace, rig, tmp_path
+):
     folder, rows = rig
     header = HEADER.replace(",".join(CAMERA), "camera")
     written(tmp_path / "rig.csv", header, *([*row[:5], "cam.json", *row[9:]] for row in rows))
-    calibration = {"camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1], "dist": [-0.2, 0, 0, 0, 0]}
+    calibration = {
+        "camera_matrix": [260.0, 0, 119.5, 0, 260, 89.5, 0, 0, 1],
+        "dist": [-0.2, 0, 0, 0, 0],
+    }
     (tmp_path / "cam.json").write_text(json.dumps(calibration))
     session = send(workspace, folder, "0.png")
     send(workspace, tmp_path, "rig.csv")
@@ -216,12 +237,20 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     assert (workspace.messages, len(session.together())) == ({}, 2)
     assert session.rig_gaps() == "not open: 2.png; drop what is missing here, or go on without"
     example_mesh().apply_scale(1000.0).export(tmp_path / "obj_000005.ply")
-    names = "scene_camera.json", "000000.png", "scene_gt.json", "scene_gt_info.json", "obj_000005.ply"
+    names = (
+        "scene_camera.json",
+        "000000.png",
+        "scene_gt.json",
+        "scene_gt_info.json",
+        "obj_000005.ply",
+    )
     send(workspace, tmp_path, *names)
     assert (workspace.messages, session.options.unit) == ({}, "mm")
     assert [shot.path.name for shot in session.together()] == ["000000.png"]
     assert session.shot.box == (5.0, 6.0, 25.0, 36.0)
     send(workspace, tmp_path, "000001.png", "000002.png")
-    assert session.command() == "curvireg register --views SCENE obj_000005.ply --unit mm --out result"
+    assert (
+        session.command() == "curvireg register --views SCENE obj_000005.ply --unit mm --out result"
+    )
     session.shot.set_box((6.0, 6.0, 25.0, 36.0))
     assert session.command() == ""

@@ -16,13 +16,22 @@ async def page(scope, _, send):
     if scope["type"] == "websocket":
         await send({"type": "websocket.accept"})
     else:
-        await send({"type": "http.response.start", "status": 200, "headers": [(b"x-frame-options", b"ALLOWALL")]})
+        await send(
+            {
+                "type": "http.response.start",
+                "status": 200,
+                "headers": [(b"x-frame-options", b"ALLOWALL")],
+            }
+        )
         await send({"type": "http.response.body", "body": b"page"})
 
 
 def answer(site, kind="http", also=None, **headers):
     """The first message that answers a request to a site for one host."""
-    pairs = [(name.encode(), value.encode()) for name, value in {"host": "127.0.0.1:8080", **headers}.items()]
+    pairs = [
+        (name.encode(), value.encode())
+        for name, value in {"host": "127.0.0.1:8080", **headers}.items()
+    ]
     scope = {"type": kind, "path": "/", "method": "GET", "headers": pairs}
     scope["extensions"] = {"websocket.http.response": {}}
     sent = []
@@ -47,10 +56,18 @@ def status(site, host="127.0.0.1:8080", **headers):
 
 def test_a_page_answers_to_its_own_names_and_origins_only():
     for host in ("127.0.0.1:8080", "localhost:9000", "[::1]:8080", "LOCALHOST"):
-        assert status("127.0.0.1", host) == status("127.0.0.1", host, origin=f"http://{host}") == 200, host
+        assert (
+            status("127.0.0.1", host) == status("127.0.0.1", host, origin=f"http://{host}") == 200
+        ), host
     for host in ("evil.example", "127.0.0.1.evil.example:8080", "192.168.1.7", "[::1", ""):
         assert status("127.0.0.1", host) == 400, host
-    for origin in ("http://evil.example", "null", "http://127.0.0.1:9000", "http://localhost:8080", ""):
+    for origin in (
+        "http://evil.example",
+        "null",
+        "http://127.0.0.1:9000",
+        "http://localhost:8080",
+        "",
+    ):
         assert status("127.0.0.1", origin=origin) == status("0.0.0.0", origin=origin) == 403, origin
     for host in ("192.168.1.7:80", "[fe80::1]:80", "bench"):
         assert status("0.0.0.0", host) == 200
@@ -69,7 +86,14 @@ def test_ipv6_addresses_are_hosts_in_any_spelling():
 
 
 def test_a_host_header_is_a_name_and_a_port_alone():
-    for header in ("evil@127.0.0.1", "127.0.0.1/x", "127.0.0.1:80:80", "127.0.0.1?", "127.0.0.1#", "127.0.0.1:x"):
+    for header in (
+        "evil@127.0.0.1",
+        "127.0.0.1/x",
+        "127.0.0.1:80:80",
+        "127.0.0.1?",
+        "127.0.0.1#",
+        "127.0.0.1:x",
+    ):
         assert status("127.0.0.1", header) == 400, header
 
 
@@ -102,9 +126,17 @@ def test_the_printed_address_names_the_host(capsys, host, shown, is_warned):
 
 def test_every_answer_has_the_security_headers():
     for headers in ({}, {"host": "evil.example"}, {"origin": "http://evil.example"}):
-        pairs = [(name.decode(), value.decode()) for name, value in answer("127.0.0.1", **headers)["headers"]]
-        assert sorted(pair for pair in pairs if pair[0] in SECURITY_HEADERS) == sorted(SECURITY_HEADERS.items())
-    policy = dict(part.strip().split(" ", 1) for part in SECURITY_HEADERS["content-security-policy"].split(";"))
+        pairs = [
+            (name.decode(), value.decode())
+            for name, value in answer("127.0.0.1", **headers)["headers"]
+        ]
+        assert sorted(pair for pair in pairs if pair[0] in SECURITY_HEADERS) == sorted(
+            SECURITY_HEADERS.items()
+        )
+    policy = dict(
+        part.strip().split(" ", 1)
+        for part in SECURITY_HEADERS["content-security-policy"].split(";")
+    )
     assert policy["default-src"] == policy["frame-ancestors"] == policy["base-uri"] == "'none'"
     allowed = {"'self'", "'none'", "'unsafe-inline'", "'unsafe-eval'", "data:", "blob:"}
     assert {source for sources in policy.values() for source in sources.split()} <= allowed
@@ -138,7 +170,13 @@ def test_the_server_answers_plain_requests(address):
     status, body = request(parts.path)
     assert status == 200
     assert b'<html lang="en-US">' in body
-    for path in ("/", "/docs", parts.path[:-2] + "/", parts.path + "page", f"{parts.path}file/photograph.jpg"):
+    for path in (
+        "/",
+        "/docs",
+        parts.path[:-2] + "/",
+        parts.path + "page",
+        f"{parts.path}file/photograph.jpg",
+    ):
         status, body = request(path)
         assert status == 404, path
         assert len(body) < 100
@@ -146,7 +184,9 @@ def test_the_server_answers_plain_requests(address):
     assert request(parts.path, host="evil.example")[0] == 400
     for method in ("GET", "POST"):
         assert request(parts.path + "upload", method, origin="http://evil.example")[0] == 403
-    assert request(parts.path + "upload", "POST", None, **{"content-length": str(1 << 40)})[0] == 413
+    assert (
+        request(parts.path + "upload", "POST", None, **{"content-length": str(1 << 40)})[0] == 413
+    )
     assert request(parts.path + "upload", "POST", iter([b"of no length"]))[0] == 413
     with socket.create_connection((parts.hostname, parts.port), timeout=60) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n")

@@ -1,4 +1,5 @@
-"""The viewer's session: the result of the command line, moved by hand and fitted again. No page is needed."""
+"""The viewer's session: the result of the command line, moved by hand and fitted again. No page is
+needed."""
 
 import io
 import json
@@ -34,7 +35,9 @@ def write_scene(folder: Path, seed: int = 0) -> tuple[list[float], torch.Tensor]
     image, box, T = scene(seed)
     write_photo(folder / "photo.png", image)
     example_mesh().export(folder / "truck.ply")
-    small = replace(PRESETS["classical"], views=VIEWS, bank=BankSettings(image_size=96), hypotheses=2)
+    small = replace(
+        PRESETS["classical"], views=VIEWS, bank=BankSettings(image_size=96), hypotheses=2
+    )
     (folder / "small.json").write_text(small.to_json())
     return [float(v) for v in box], T
 
@@ -50,7 +53,11 @@ def run_command(folder: Path, command: str) -> dict:
 
 def new_session(*words):
     arguments = parse(["view", *words])
-    return Session(register_options(arguments, *([path] if path else [] for path in (arguments.photo, arguments.mesh))))
+    return Session(
+        register_options(
+            arguments, *([path] if path else [] for path in (arguments.photo, arguments.mesh))
+        )
+    )
 
 
 @pytest.fixture
@@ -64,7 +71,9 @@ def folder(tmp_path, monkeypatch):
 
 def test_command_gives_the_same_result_bit_by_bit(session, registered):
     _, folder, truth = registered
-    assert session.command().startswith(f"curvireg register '{folder}/my photo.png' {folder / 'truck.ply'} ")
+    assert session.command().startswith(
+        f"curvireg register '{folder}/my photo.png' {folder / 'truck.ply'} "
+    )
     written = run_command(folder, session.command())
     document = json.loads(to_json(session.document()))
     for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
@@ -87,19 +96,25 @@ def test_without_a_box_the_answer_is_a_detection(session, registered):
 
 
 def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registered):
-    found, first = session.shot.result.registration, session.document()
+    found = session.shot.result.registration
+    first = session.document()
     session.shot.choose(1)
     document = json.loads(to_json(session.document()))
     assert document["rotation"] == first["top"][1]["rotation"]
     assert document["translation"] == first["top"][1]["translation"]
     assert document["score"] == first["top"][1]["score"]
-    assert [top["rotation"] for top in document["top"]] == [first["top"][k]["rotation"] for k in (1, 0)]
+    assert [top["rotation"] for top in document["top"]] == [
+        first["top"][k]["rotation"] for k in (1, 0)
+    ]
     assert document["viewer"]["hypothesis"] == 1
     # A pipeline that was calibrated has probabilities; each answer has its own.
     calibrated = replace(found, probabilities=(0.95, 0.03))
     session.shot.result = replace(session.shot.result, registration=calibrated)
     assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
-    assert (session.document()["probabilities"], session.document()["none"]) == ([0.03, 0.95], pytest.approx(0.02))
+    assert (session.document()["probabilities"], session.document()["none"]) == (
+        [0.03, 0.95],
+        pytest.approx(0.02),
+    )
     assert session.document()["covariance"] is None
     session.shot.choose(0)
     assert session.shot.result.chosen is calibrated
@@ -113,34 +128,47 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     assert start.confidence is None
     scene = trimesh.load(io.BytesIO(session.shot.glb()), file_type="glb")
     flip = np.diag([1.0, -1.0, -1.0, 1.0])
-    assert np.allclose(flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5)
+    assert np.allclose(
+        flip @ scene.graph["object"][0], session.shot.answer.pose.transform, atol=1e-5
+    )
     overlays = [session.shot.overlay()]
     session.shot.choose(0)
     assert session.shot.overlay() != overlays[0]
 
 
 def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
-    before, describer = session.shot.answer.pose, session.shot.result.registrar.describer
+    before = session.shot.answer.pose
+    describer = session.shot.result.registrar.describer
     centre = before.rotation @ describer.centre + before.translation
     assert session.shot.result.answer_before is None
-    moved = session.shot.result.moved(before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0))
+    moved = session.shot.result.moved(
+        before.projection[0], rotation=(0, 6, 0), translation=(0.05, 0, 0)
+    )
     session.shot.place(moved)
     pose = session.shot.answer.pose
     assert float(rotation_error(pose.rotation, before.rotation)) == pytest.approx(6, abs=1e-4)
     shift = pose.rotation @ describer.centre + pose.translation - centre
-    torch.testing.assert_close(shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64))
+    torch.testing.assert_close(
+        shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64)
+    )
     document = json.loads(to_json(session.document()))
     assert document["rotation"] == pose.rotation.tolist() == document["top"][0]["rotation"]
     assert len(document["top"]) == 2
     for name in ("confidence", "none", "score", "edge_support", "covariance", "ambiguous"):
         assert document[name] is None, name
-    assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (False, [], {})
+    assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (
+        False,
+        [],
+        {},
+    )
     assert document["viewer"]["by_hand"] == ["moved: rotated 6.0 degrees, shifted 0.05 radii"]
     session.shot.fit()
     fitted = session.shot.answer
     assert fitted.edits[1].startswith("contours fitted, edge support ")
     assert float(rotation_error(fitted.pose.rotation, before.rotation)) < 1.5
-    assert float((fitted.pose.translation - before.translation).norm()) < 0.03 * float(centre.norm())
+    assert float((fitted.pose.translation - before.translation).norm()) < 0.03 * float(
+        centre.norm()
+    )
     for answer in (pose, fitted.pose):  # one step back, and again
         session.shot.undo()
         assert session.shot.answer.pose is answer
@@ -157,10 +185,15 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
         names: dict = {}
         exec(session.python(), names)
-    found = {name: torch.tensor(names["pose"][name], dtype=torch.float64) for name in ("rotation", "translation")}
+    found = {
+        name: torch.tensor(names["pose"][name], dtype=torch.float64)
+        for name in ("rotation", "translation")
+    }
     assert float(rotation_error(found["rotation"], session.shot.answer.pose.rotation)) < 0.1
     assert torch.allclose(found["translation"], session.shot.answer.pose.translation, rtol=1e-3)
-    session.shot.place(session.shot.result.moved(session.shot.answer.pose.projection[0], rotation=(0, 6, 0)))
+    session.shot.place(
+        session.shot.result.moved(session.shot.answer.pose.projection[0], rotation=(0, 6, 0))
+    )
     assert f"'rotation': {session.shot.answer.pose.rotation.tolist()}" in session.python()
 
 
@@ -170,7 +203,8 @@ def test_move_without_a_camera_keeps_the_allocentric_rotation(session, monkeypat
     session.set_camera()
     session.register()
     assert session.shot.result.registrar is registrar, "the views are not rendered again"
-    before, T = session.shot.answer.pose, session.shot.answer.pose.projection[0]
+    before = session.shot.answer.pose
+    T = session.shot.answer.pose.projection[0]
     session.shot.place(session.shot.result.moved(T, rotation=(0, 0, 5)))
     pose = session.shot.answer.pose
     assert pose.translation is None
@@ -217,13 +251,22 @@ def test_each_photograph_keeps_its_box_and_its_result(registered, monkeypatch):
 
 
 def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monkeypatch):
-    monkeypatch.setattr(module, "open_registrar", lambda options, meshes, **_: (options.pose, meshes))
+    monkeypatch.setattr(
+        module, "open_registrar", lambda options, meshes, **_: (options.pose, meshes)
+    )
     request = replace(RegisterOptions(), meshes=(folder / "truck.ply",), pose="any")
     session = new_session()
     first = session._open_registrar(request)
     assert first == ("any", request.meshes)
-    box, camera = (1.0, 2.0, 30.0, 40.0), (260.0, 260.0, 119.5, 89.5)
-    other = replace(request, photos=(folder / "photo.png",), box=box, camera=camera, limits={"theta": (0.0, 9.0)})
+    box = (1.0, 2.0, 30.0, 40.0)
+    camera = (260.0, 260.0, 119.5, 89.5)
+    other = replace(
+        request,
+        photos=(folder / "photo.png",),
+        box=box,
+        camera=camera,
+        limits={"theta": (0.0, 9.0)},
+    )
     assert session._open_registrar(other) is first
     assert session._open_registrar(replace(other, camera=None, guess=60.0)) is first
     for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
@@ -240,13 +283,18 @@ def test_distortion_is_removed_from_all_photographs(folder):
     assert (session.request().camera, plain.notes) == (pytest.approx((250, 250, 119.5, 89.5)), ())
     assert "--camera 250 250 119.5 89.5" in session.command()
     session.shot.set_box((10.0, 20.0, 90.0, 80.0))
-    camera, box = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480)), ["--box", "10", "20", "90", "80"]
-    (folder / "cam.json").write_text(json.dumps({"K": K.tolist(), "D": camera.distortion, "image_size": [480, 360]}))
+    camera = Camera(K, (-0.3, 0.1, 0, 0, 0), size=(360, 480))
+    box = ["--box", "10", "20", "90", "80"]
+    (folder / "cam.json").write_text(
+        json.dumps({"K": K.tolist(), "D": camera.distortion, "image_size": [480, 360]})
+    )
     given = new_session("photo.png", "truck.ply", "--camera", "cam.json", *box)
     given.load()
     seen = undistorted(plain.image, camera, torch.tensor([10.0, 20, 90, 80]))
     assert torch.equal(given.shot.photo.image, seen.image)
-    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), "px of the photograph as it was taken"
+    assert given.shot.box == pytest.approx(seen.box.tolist(), abs=0.06), (
+        "px of the photograph as it was taken"
+    )
     with pytest.raises(InvalidInputError, match="--box: needs a photograph"):
         new_session(*box).load()
     session.set_camera(camera)
@@ -261,7 +309,10 @@ def test_distortion_is_removed_from_all_photographs(folder):
     session.shot.set_box(tuple(scene(0)[1].tolist()))
     session.register()
     document = session.document()
-    assert (document["inputs"]["camera_source"], document["camera"]) == ("file", camera.at((180, 240)).describe())
+    assert (document["inputs"]["camera_source"], document["camera"]) == (
+        "file",
+        camera.at((180, 240)).describe(),
+    )
     assert "cr.register(cr.geometry.undistorted(cr.data.read_photo(" in session.python()
     session.set_camera((250.0, 250.0, 119.5, 89.5))
     assert [torch.equal(shot.photo.image, plain.image) for shot in session.shots] == [True, True]
@@ -287,7 +338,19 @@ def test_command_contains_inputs_options_and_the_limits_on_the_pose(folder):
     session.open_mesh(folder / "truck.ply")
     with pytest.raises(InvalidInputError, match="180"):
         session.register()
-    words = ["--near", "10", "-20.5", "--within", "30", "--front=-x", "--distance", "0.5", "2", "--fov", "65"]
+    words = [
+        "--near",
+        "10",
+        "-20.5",
+        "--within",
+        "30",
+        "--front=-x",
+        "--distance",
+        "0.5",
+        "2",
+        "--fov",
+        "65",
+    ]
     session = new_session(*words)
     session.set_limits(azimuth=(315.0, 45.0), elevation=(-10.0, 40.0))
     again = register_options(parse(shlex.split(session.command())[1:]))
@@ -345,7 +408,10 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     shift = seen(moved, K, describer.centre) - seen(T, K, describer.centre)
     torch.testing.assert_close(shift, torch.tensor([12.0, -5.0], dtype=torch.float64))
     assert torch.equal(moved[:3, :3], T[:3, :3])
-    near = T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64) + describer.centre
+    near = (
+        T[:3, :3].T @ torch.tensor([0, 0, -describer.radius], dtype=torch.float64)
+        + describer.centre
+    )
     turned = result.dragged(T, K, (0.0, 0.0), (4.0, 3.0), turns=True)
     shift = seen(turned, K, near) - seen(T, K, near)
     assert 4 < shift[0] < 8, "right and down, a little more than the mouse, as it is nearer"
@@ -356,7 +422,9 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
     torch.testing.assert_close(centres[1], centres[0] / 1.25)
     assert float(rotation_error(moved[:3, :3], T[:3, :3])) == pytest.approx(30, abs=1e-4)
     # Clockwise on the screen: what is right of the centre goes down.
-    right = T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
+    right = (
+        T[:3, :3].T @ torch.tensor([describer.radius, 0, 0], dtype=torch.float64) + describer.centre
+    )
     assert seen(moved, K, right)[1] > seen(T, K, right)[1]
     with pytest.raises(InvalidInputError, match="touch the camera"):
         result.scaled(T, 1000.0)
@@ -366,7 +434,9 @@ def test_the_mesh_follows_the_mouse_its_wheel_and_two_fingers(pose):
 @pytest.mark.parametrize("elevation", [-30.0, 0.0, 60.0])
 def test_a_hint_is_the_side_from_which_the_model_is_seen(azimuth, elevation):
     """The camera of that viewpoint stands where the hint was taken, in the frame of limits."""
-    R = rotation_from_viewpoint(*(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation, 0.0)))
+    R = rotation_from_viewpoint(
+        *(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation, 0.0))
+    )
     position = R.mT @ torch.tensor([0.0, 0.0, -3.0], dtype=torch.float64)
     session = Session(RegisterOptions(limits={"front": "x"}))
     session.hint_direction(position.tolist())

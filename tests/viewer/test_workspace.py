@@ -64,7 +64,10 @@ def test_uploads_find_their_place(workspace, scene):
     session.shot = session.shots[0]
     asyncio.run(workspace.remove_photo())
     assert (names(workspace), sorted(stored(workspace))) == (["b.png"], ["b.png", "part.PLY"])
-    calibration = {"camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1], "dist": [0.1, 0, 0, 0, 0]}
+    calibration = {
+        "camera_matrix": [300.0, 0, 119.5, 0, 300, 89.5, 0, 0, 1],
+        "dist": [0.1, 0, 0, 0, 0],
+    }
     asyncio.run(upload(workspace, scene, "cam.json", json.dumps(calibration).encode()))
     assert session.shot.photo.notes == ("undistorted",)
     asyncio.run(workspace.remove_photo())
@@ -73,9 +76,16 @@ def test_uploads_find_their_place(workspace, scene):
 
 def test_messages_are_about_one_file_and_go_when_their_cause_is_gone(workspace, scene):
     asyncio.run(upload(workspace, scene / "photo.png", "good.png"))
-    asyncio.run(upload(workspace, scene / "photo.png", "half.png", (scene / "photo.png").read_bytes()[:2000]))
+    asyncio.run(
+        upload(
+            workspace, scene / "photo.png", "half.png", (scene / "photo.png").read_bytes()[:2000]
+        )
+    )
     asyncio.run(upload(workspace, scene / "truck.ply", "bad.ply", b"ply\nnonsense"))
-    for name, words in (("notes.pdf", "neither a photograph .* nor a mesh .*zip"), ("cam.yaml", "no camera matrix")):
+    for name, words in (
+        ("notes.pdf", "neither a photograph .* nor a mesh .*zip"),
+        ("cam.yaml", "no camera matrix"),
+    ):
         asyncio.run(upload(workspace, scene, name, b"x: 1"))
         with pytest.raises(AssertionError, match=rf"^{name}: {words}"):
             raise AssertionError(workspace.messages["file"])
@@ -109,7 +119,9 @@ def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
     mesh = b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\n"
     mesh += b"f 1/1 2/2 3/3\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\nf 2/1 3/2 4/3\n"
     material = b"newmtl m\nKd 0.8 0.1 0.1\nmap_Kd a.png\n"
-    facts = "rendered in grey: materials or textures are missing; send it with them in a zip archive"
+    facts = (
+        "rendered in grey: materials or textures are missing; send it with them in a zip archive"
+    )
     pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material})
     for path, content in (("a.obj", mesh), ("a.zip", None)):
         with warnings.catch_warnings():
@@ -125,7 +137,10 @@ def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
     asyncio.run(upload(workspace, tmp_path / "a.zip"))
     assert workspace.session.mesh_facts.endswith("rendered in its colours")
     assert workspace.messages == {}
-    pack(tmp_path / "a.zip", {"a.obj": mesh, "a.mtl": material, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"})
+    pack(
+        tmp_path / "a.zip",
+        {"a.obj": mesh, "a.mtl": material, "a.png": b"%!PS-Adobe-3.0 EPSF-3.0\n"},
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = show_warning
@@ -134,14 +149,22 @@ def test_a_mesh_without_its_texture_is_not_called_coloured(workspace, tmp_path):
 
 
 def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
-    limits, camera = {"theta": (-10.0, 10.0)}, (9.0, 9.0, 5.0, 5.0)
-    own = replace(RegisterOptions(), unit="ft", pose="any", limits=limits, camera=camera, mesh_is="similar")
+    limits = {"theta": (-10.0, 10.0)}
+    camera = (9.0, 9.0, 5.0, 5.0)
+    own = replace(
+        RegisterOptions(), unit="ft", pose="any", limits=limits, camera=camera, mesh_is="similar"
+    )
     session = workspace.session
     session.options = own
     for _ in range(2):
         asyncio.run(workspace.load_sample())
         options = session.options
-        assert (options.unit, options.pose, options.limits, options.mesh_is) == ("mm", "upright", None, None)
+        assert (options.unit, options.pose, options.limits, options.mesh_is) == (
+            "mm",
+            "upright",
+            None,
+            None,
+        )
         assert (options.camera, options.guess, names(workspace)) == (None, 30.0, ["coffee.jpg"])
     assert session.shot.photo.image.shape == (3, 400, 600)
     assert "CC0" in session.shot.photo.notes[0]
@@ -160,7 +183,8 @@ def test_the_sample_fills_the_page_and_its_options_go_with_it(workspace, scene):
 def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     """Outline of the cup and its handle, marked by eye in the photograph, in px."""
     sides = [(173, 116), (177, 163), (183, 193), (200, 220), (409, 117), (400, 166), (380, 214)]
-    foot, handle = [(280, 286), (302, 283)], [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
+    foot = [(280, 286), (302, 283)]
+    handle = [(208, 254), (199, 274), (197, 288), (202, 300), (215, 308)]
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
@@ -194,7 +218,10 @@ class Search:
     """Stands for ``Session.register``; it runs until it is released or cancelled."""
 
     def __init__(self, session):
-        self.session, self.begun, self.released, self.shots = session, threading.Event(), threading.Event(), []
+        self.session = session
+        self.begun = threading.Event()
+        self.released = threading.Event()
+        self.shots = []
 
     def __call__(self):
         self.shots.append(self.session.shot)
@@ -222,7 +249,9 @@ async def begin(workspace, search):
     return running
 
 
-def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end_it(workspace, scene, search):
+def test_photographs_are_added_while_a_search_runs_but_stop_and_another_mesh_end_it(
+    workspace, scene, search
+):
     async def work():
         await begin(workspace, search)
         await asyncio.wait_for(upload(workspace, scene / "photo.png"), 10)
@@ -285,8 +314,11 @@ def test_closing_the_sample_or_the_photograph_ends_the_search_in_it(workspace, s
     assert workspace.messages == {}
 
 
-def test_find_while_a_photograph_opens_searches_in_the_new_one(workspace, scene, search, monkeypatch):
-    begun, released = threading.Event(), threading.Event()
+def test_find_while_a_photograph_opens_searches_in_the_new_one(
+    workspace, scene, search, monkeypatch
+):
+    begun = threading.Event()
+    released = threading.Event()
     open_photo = workspace.session.open_photo
 
     def slow(*arguments):
@@ -321,12 +353,20 @@ def pack(path, members):
 def test_unpack_finds_the_mesh_among_its_parts_and_keeps_everything_inside(tmp_path):
     files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(trimesh.creation.box()))
     parts = {f"part/{name}": content for name, content in files.items()}
-    outside = {"../../a.png": b"x", "/etc/b.png": b"x", "..\\c.png": b"x", "__MACOSX/part/._model.gltf": b"x"}
-    archive, folder = pack(tmp_path / "a.zip", {**parts, **outside}), tmp_path / "upload" / "parts"
+    outside = {
+        "../../a.png": b"x",
+        "/etc/b.png": b"x",
+        "..\\c.png": b"x",
+        "__MACOSX/part/._model.gltf": b"x",
+    }
+    archive = pack(tmp_path / "a.zip", {**parts, **outside})
+    folder = tmp_path / "upload" / "parts"
     mesh = unpack(archive, folder)
     assert mesh == folder / "part" / "model.gltf"
     assert np.allclose(trimesh.load(mesh).extents, 1)
-    assert all(folder in path.parents for path in tmp_path.rglob("*") if path.is_file() and path != archive)
+    assert all(
+        folder in path.parents for path in tmp_path.rglob("*") if path.is_file() and path != archive
+    )
     assert len([path for path in folder.rglob("*") if path.is_file()]) == len(parts) + 4
 
 
@@ -342,7 +382,8 @@ def test_unpack_refuses_what_is_too_large_damaged_or_not_one_mesh(tmp_path, monk
     refused({"a.ply": b"", "b.stl": b""}, r"several meshes: .*b\.stl")
     for damaged in (content[:40], b""):
         refused(damaged, "cannot be unpacked")
-    refused(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)), "cannot be unpacked")  # a header that lies
+    # a header that lies
+    refused(content.replace(struct.pack("<I", 5000), struct.pack("<I", 10)), "cannot be unpacked")
     monkeypatch.setattr(module, "MAX_MESH_BYTES", 4999)
     refused(content, "or 4,999 bytes when unpacked")
     monkeypatch.setattr(module, "MAX_ARCHIVE_FILES", 2)
@@ -371,7 +412,11 @@ def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
         with pytest.raises(OutputError, match=message):
             asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
     with monkeypatch.context() as patch:
-        patch.setattr(module.tempfile, "mkdtemp", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+        patch.setattr(
+            module.tempfile,
+            "mkdtemp",
+            Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")),
+        )
         with pytest.raises(OutputError, match=message):
             asyncio.run(upload(workspace, scene / "photo.png", "a.png", b"1"))
     assert (list(workspace.folder.iterdir()), workspace.receiving) == ([], {})
@@ -379,7 +424,9 @@ def test_a_full_disk_is_said_and_leaves_nothing(workspace, scene, monkeypatch):
     monkeypatch.setattr(zipfile.ZipFile, "extractall", full)
     pack(scene / "a.zip", {"a.ply": b""})
     asyncio.run(upload(workspace, scene / "a.zip"))
-    assert workspace.messages["mesh"].startswith("a.zip: cannot be stored (No space left on device); make room")
+    assert workspace.messages["mesh"].startswith(
+        "a.zip: cannot be stored (No space left on device); make room"
+    )
     assert stored(workspace) == []
 
 
@@ -397,8 +444,12 @@ def test_messages_have_no_temporary_folders(workspace):
         assert workspace.messages["mesh"] == shown
         asyncio.run(workspace.run("mesh", Mock(side_effect=KeyError(text))))
         assert str(workspace.folder) + "/" not in workspace.messages["mesh"]
-    asyncio.run(workspace.run("mesh", Mock(side_effect=OSError(36, "File name too long", f"{inside}/x"))))
-    assert workspace.messages["mesh"] == "File name too long; check the machine on which the page runs"
+    asyncio.run(
+        workspace.run("mesh", Mock(side_effect=OSError(36, "File name too long", f"{inside}/x")))
+    )
+    assert (
+        workspace.messages["mesh"] == "File name too long; check the machine on which the page runs"
+    )
 
 
 def test_closing_ends_the_search_and_removes_the_uploads(workspace, scene, search):
@@ -416,7 +467,8 @@ def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatc
     monkeypatch.setattr(module, "MAX_VIEWER_BYTES", 100)
 
     async def work():
-        begun, released = asyncio.Event(), asyncio.Event()
+        begun = asyncio.Event()
+        released = asyncio.Event()
 
         async def slow():
             begun.set()
@@ -436,7 +488,8 @@ def test_files_on_their_way_count_with_what_they_announced(workspace, monkeypatc
 
 
 def test_unpack_reads_no_directory_that_is_larger_than_it_says(tmp_path, monkeypatch):
-    """Two records at the end of an archive tell the size of its directory, and a third one may lie in the last."""
+    """Two records at the end of an archive tell the size of its directory, and a third one may lie
+    in the last."""
     monkeypatch.setattr(zipfile.ZipFile, "infolist", None)  # it would be read by then
     content = pack(tmp_path / "a.zip", {f"{k:0200}.txt": b"" for k in range(6000)}).read_bytes()
     end = content.rindex(b"PK\5\6")
@@ -445,7 +498,9 @@ def test_unpack_reads_no_directory_that_is_larger_than_it_says(tmp_path, monkeyp
     record = struct.pack("<IQHHIIQQQQ", 0x06064B50, 44, 45, 45, 0, 0, 6000, 6000, size, start)
     record += struct.pack("<IIQI", 0x07064B50, 0, end, 1)
     small = struct.pack("<IHHHHIIH", 0x06054B50, 0, 0, 6000, 6000, 100, start, 0)
-    inner = struct.pack("<4sHHHHIIH", b"PK\5\6", *struct.unpack("<HH", b"PK\5\6"), 6000, 6000, size, 100, 0)
+    inner = struct.pack(
+        "<4sHHHHIIH", b"PK\5\6", *struct.unpack("<HH", b"PK\5\6"), 6000, 6000, size, 100, 0
+    )
     for ends in (content[end:], record + small, inner):
         (tmp_path / "a.zip").write_bytes(content[:end] + ends)
         with pytest.raises(InvalidInputError, match=r"^a\.zip: more than 1,000 files"):
@@ -456,6 +511,8 @@ def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
     mesh = trimesh.creation.box().export(file_type="ply")
     deep = "a/" * module.MAX_ARCHIVE_DEPTH
     assert unpack(pack(tmp_path / "a.zip", {f"{deep}a.ply": mesh}), tmp_path / "parts").is_file()
-    with pytest.raises(InvalidInputError, match=r"^a\.zip: folders in more than 32 folders; pack only"):
+    with pytest.raises(
+        InvalidInputError, match=r"^a\.zip: folders in more than 32 folders; pack only"
+    ):
         unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
     assert not (tmp_path / "more").exists()

@@ -9,9 +9,13 @@ from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.visualization.contours import contour_layer, contour_pixels
 
-FOCAL, SIZE = 200.0, 120
-CAMERA = torch.tensor([[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
-GREEN, ORANGE = (0, 255, 80), (255, 170, 0)
+FOCAL = 200.0
+SIZE = 120
+CAMERA = torch.tensor(
+    [[FOCAL, 0.0, 59.5], [0.0, FOCAL, 59.5], [0.0, 0.0, 1.0]], dtype=torch.float64
+)
+GREEN = (0, 255, 80)
+ORANGE = (255, 170, 0)
 
 
 def placed(z: float) -> torch.Tensor:
@@ -20,7 +24,9 @@ def placed(z: float) -> torch.Tensor:
     return T
 
 
-def drawn(mesh: trimesh.Trimesh, T: torch.Tensor, size: tuple[int, int] = (SIZE, SIZE)) -> np.ndarray:
+def drawn(
+    mesh: trimesh.Trimesh, T: torch.Tensor, size: tuple[int, int] = (SIZE, SIZE)
+) -> np.ndarray:
     return contour_layer(ViewDescriber(mesh, BankSettings(image_size=64)), T, CAMERA, size)
 
 
@@ -29,7 +35,8 @@ def colour(layer: np.ndarray, value: tuple[int, int, int]) -> np.ndarray:
 
 
 def roof(degrees: float) -> trimesh.Trimesh:
-    """Two planes that meet at the vertical ridge x = 0 in an angle of 180 - degrees, seen along z."""
+    """Two planes that meet at the vertical ridge x = 0 in an angle of 180 - degrees, seen along
+    z."""
     fall = float(np.tan(np.deg2rad(degrees / 2)))
     vertices = [[-1, -1, fall], [0, -1, 0], [1, -1, fall], [-1, 1, fall], [0, 1, 0], [1, 1, fall]]
     faces = [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]]
@@ -95,5 +102,7 @@ def test_the_outline_is_drawn_over_the_creases_that_end_at_it():
     columns = slice(58, 62)  # of the crease
     assert colour(layer, ORANGE)[40:80, columns].any(axis=1).all()
     for rows in (slice(18, 22), slice(98, 102)):
-        assert colour(layer, GREEN)[rows, columns].any(axis=0).all(), "without a gap where the crease ends"
+        assert colour(layer, GREEN)[rows, columns].any(axis=0).all(), (
+            "without a gap where the crease ends"
+        )
         assert not colour(layer, ORANGE)[rows, columns][:2].all()

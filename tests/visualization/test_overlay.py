@@ -33,7 +33,8 @@ def test_contour_overlay_draws_the_object_although_the_box_is_wrong(camera, shif
     assert fraction_near(picture, mask[::-1], 2) < 0.5
     truth = replace(result.hypotheses[0], projection=(T, CAMERA))
     at_the_truth = contour_overlay(registrar, truth, image, box)
-    # The drawn contour is rounded to pixels, and so is the mask, by another renderer: a pixel or two differ at corners.
+    # The drawn contour is rounded to pixels, and so is the mask, by another renderer: a pixel or
+    # two differ at corners.
     assert fraction_near(at_the_truth, mask, 1.5) > 0.98
     assert fraction_near(at_the_truth, mask, 2) == 1.0
     if camera is None:  # the assumed camera, not a view that fills the box

@@ -14,11 +14,16 @@ def test_viewpoints_draws_the_best_score_of_each_direction_last_and_the_hypothes
     result = Registrar(bank, pipeline=unrefined(bank, hypotheses=3))([image], box[None], CAMERA)[0]
     axes = viewpoints(bank, result).axes[0]
     (drawn,) = axes.collections
-    shown = {tuple(at): score for at, score in zip(drawn.get_offsets().tolist(), drawn.get_array(), strict=True)}
+    shown = {
+        tuple(at): score
+        for at, score in zip(drawn.get_offsets().tolist(), drawn.get_array(), strict=True)
+    }
     assert len(shown) == 8
     for (azimuth, elevation), score in shown.items():
         same = (bank.views.azimuth == azimuth) & (bank.views.elevation == elevation)
         assert score == pytest.approx(float(result.ranking.scores[0][same].max()))
     marks = [(line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines]
-    np.testing.assert_allclose(marks, [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses])
+    np.testing.assert_allclose(
+        marks, [(h.viewpoint[0] % 360, h.viewpoint[1]) for h in result.hypotheses]
+    )
     assert [text.get_text() for text in axes.texts] == ["1", "2", "3"]

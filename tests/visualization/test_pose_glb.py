@@ -22,11 +22,14 @@ def tree_of(data: bytes) -> dict:
 
 
 def project(points: np.ndarray, tree: dict) -> np.ndarray:
-    """Pixels of points in metres in the file's camera, which is at the origin and looks along -z."""
-    W, H = SIZE[1], SIZE[0]
+    """Pixels of points in metres in the file's camera, which is at the origin and looks along
+    -z."""
+    W = SIZE[1]
+    H = SIZE[0]
     lens = tree["cameras"][0]["perspective"]
     up = 1 / np.tan(lens["yfov"] / 2)
-    x, y = points[:, 0] / -points[:, 2] * up / lens["aspectRatio"], points[:, 1] / -points[:, 2] * up
+    x = points[:, 0] / -points[:, 2] * up / lens["aspectRatio"]
+    y = points[:, 1] / -points[:, 2] * up
     return np.stack([(x + 1) / 2 * W - 0.5, (1 - y) / 2 * H - 0.5], axis=1)
 
 
@@ -36,11 +39,14 @@ def test_pose_glb_camera_projects_mesh_and_photograph(unit, metres):
     mesh = trimesh.creation.box((0.1, 0.2, 0.05))
     mesh.units = unit
     data = pose_glb(mesh, T, CAMERA, image)
-    tree, back = tree_of(data), trimesh.load(BytesIO(data), file_type="glb")
+    tree = tree_of(data)
+    back = trimesh.load(BytesIO(data), file_type="glb")
     parts = {back.graph[name][1]: back.graph[name][0] for name in back.graph.nodes_geometry}
     boxes = [n for n in parts if len(back.geometry[n].faces) == 12]
     points = trimesh.transform_points(back.geometry[boxes[0]].vertices, parts[boxes[0]])
-    expected = project_points(torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA).numpy()
+    expected = project_points(
+        torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3))), T, CAMERA
+    ).numpy()
     np.testing.assert_allclose(project(points, tree), expected, atol=1e-2)
     extras = next(node for node in tree["nodes"] if "camera" in node)["extras"]
     assert (extras["T_cam_from_model"], extras["camera_matrix"]) == (T.tolist(), CAMERA.tolist())
@@ -71,7 +77,9 @@ def test_pose_glb_keeps_vertex_colours():
     accessor = tree["accessors"][part["attributes"]["COLOR_0"]]
     view = tree["bufferViews"][accessor["bufferView"]]
     start = data.index(b"BIN\0") + 4 + view["byteOffset"]
-    colours = np.frombuffer(data[start : start + view["byteLength"]], np.uint8).reshape(accessor["count"], -1)
+    colours = np.frombuffer(data[start : start + view["byteLength"]], np.uint8).reshape(
+        accessor["count"], -1
+    )
     assert {tuple(c[:3]) for c in colours.tolist()} == {(147, 2, 2), (2, 2, 147)}, "linear"
     # Metal would be black without surroundings to reflect.
     assert tree["materials"][part["material"]]["pbrMetallicRoughness"]["metallicFactor"] == 0
@@ -95,18 +103,30 @@ def test_scene_glb_places_each_camera_where_its_photograph_was_taken():
     poses = []
     for degrees, shift in ((0.0, (0.1, 0.0, 0.0)), (25.0, (-0.2, 0.3, 0.1))):
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = rotation_from_axis_angle(torch.deg2rad(torch.tensor([0.1, 1.0, 0.3])) * degrees).double()
+        pose[:3, :3] = rotation_from_axis_angle(
+            torch.deg2rad(torch.tensor([0.1, 1.0, 0.3])) * degrees
+        ).double()
         pose[:3, 3] = torch.tensor(shift)
         poses.append(pose)
     data = scene_glb(mesh, T, [(pose, K, image) for pose in poses])
-    tree, back = tree_of(data), trimesh.load(BytesIO(data), file_type="glb")
-    name = next(n for n in back.graph.nodes_geometry if len(back.geometry[back.graph[n][1]].faces) == 12)
-    world = trimesh.transform_points(back.geometry[back.graph[name][1]].vertices, back.graph[name][0])
+    tree = tree_of(data)
+    back = trimesh.load(BytesIO(data), file_type="glb")
+    name = next(
+        n for n in back.graph.nodes_geometry if len(back.geometry[back.graph[n][1]].faces) == 12
+    )
+    world = trimesh.transform_points(
+        back.geometry[back.graph[name][1]].vertices, back.graph[name][0]
+    )
     nodes = [node for node in tree["nodes"] if "camera" in node]
-    assert [(node["name"], node["camera"]) for node in nodes] == [("photograph 0", 0), ("photograph 1", 1)]
+    assert [(node["name"], node["camera"]) for node in nodes] == [
+        ("photograph 0", 0),
+        ("photograph 1", 1),
+    ]
     corners = torch.from_numpy(np.array(mesh.triangles.reshape(-1, 3)))
     for node, pose in zip(nodes, poses, strict=True):
         world_from_camera = np.array(node["matrix"]).reshape(4, 4).T  # glTF writes columns
         seen = trimesh.transform_points(world, np.linalg.inv(world_from_camera))
-        np.testing.assert_allclose(project(seen, tree), project_points(corners, pose @ T, K).numpy(), atol=1e-2)
+        np.testing.assert_allclose(
+            project(seen, tree), project_points(corners, pose @ T, K).numpy(), atol=1e-2
+        )
         assert node["extras"]["T_cam_from_model"] == (pose @ T).tolist()

@@ -28,8 +28,11 @@ def registered():
 def small_picture(sheet, number):
     """One of the eight pictures below the photograph and its caption, from 0."""
     rows = np.nonzero((sheet[720:, 20] != 255).any(axis=1))[0]  # of the first column
-    starts = [r for r in rows if r - 1 not in rows and (rows < r + 100).sum() - (rows < r).sum() == 100]
-    top, left = 720 + starts[number // 4], 10 + number % 4 * (SIDE + 10)
+    starts = [
+        r for r in rows if r - 1 not in rows and (rows < r + 100).sum() - (rows < r).sum() == 100
+    ]
+    top = 720 + starts[number // 4]
+    left = 10 + number % 4 * (SIDE + 10)
     return sheet[top : top + SIDE, left : left + SIDE]
 
 
@@ -37,9 +40,14 @@ def test_registration_sheet_shows_the_whole_photograph_with_the_contours(registe
     registrar, result, image, box = registered
     photograph = registration_sheet(registrar, result, image, box)[:720]
     assert photograph.shape == (720, 960, 3)
-    enlarged = torch.nn.functional.interpolate(image[None], (720, 960), mode="bicubic")[0].permute(1, 2, 0)
+    enlarged = torch.nn.functional.interpolate(image[None], (720, 960), mode="bicubic")[0].permute(
+        1, 2, 0
+    )
     assert np.median(np.abs(photograph - 255 * enlarged.clamp(0, 1).numpy())) < 2
-    K = torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]], dtype=torch.float64) @ CAMERA
+    K = (
+        torch.tensor([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]], dtype=torch.float64)
+        @ CAMERA
+    )
     mask = (render_depth(example_mesh(), result.projection[0], K, (720, 960))[0, 0] > 0).numpy()
     rows, columns = np.nonzero((photograph == GREEN).all(axis=2))
     for drawn, seen in ((rows, np.nonzero(mask)[0]), (columns, np.nonzero(mask)[1])):
@@ -54,7 +62,9 @@ def test_registration_sheet_draws_rivals_at_their_poses(registered):
     assert len(others) == 3
     close_up = small_picture(sheet, 0)
     same = replace(second, projection=first.projection)
-    other = registration_sheet(registrar, replace(result, hypotheses=(first, same, *others)), image, box)
+    other = registration_sheet(
+        registrar, replace(result, hypotheses=(first, same, *others)), image, box
+    )
     assert np.array_equal(small_picture(other, 4), close_up)
     assert not np.array_equal(small_picture(sheet, 4), close_up)
     rows, columns = np.nonzero((sheet != other).any(axis=2))

@@ -29,10 +29,14 @@ def test_thumbnail_draws_contours_on_the_object(scale):
     assert len(x) > 50
     # Project the vertices into the thumbnail.
     T, K = result.projection
-    uv = project_points(torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K)[0]
+    uv = project_points(
+        torch.as_tensor(registrar.bank.mesh.vertices, dtype=torch.float64), T[None], K
+    )[0]
     left, top, right, _ = close_up(photograph.shape[-2:], edges)
     shrink = pixels.shape[1] / (right - left)
-    expected = [(v + 0.5 - start) * shrink - 0.5 for v, start in zip(uv.T, (left, top), strict=True)]
+    expected = [
+        (v + 0.5 - start) * shrink - 0.5 for v, start in zip(uv.T, (left, top), strict=True)
+    ]
     for drawn, projected in zip((x, y), expected, strict=True):
         # The box is drawn over the outermost pixels.
         assert abs(drawn.min() - float(projected.min())) <= 3
@@ -40,7 +44,9 @@ def test_thumbnail_draws_contours_on_the_object(scale):
 
 
 def test_write_sheet_shows_the_best_and_the_worst(tmp_path):
-    entry = sheet.SheetEntry(number=0, name="a.png", caption="", kind="doubtful", picture=tmp_path / "none.jpg")
+    entry = sheet.SheetEntry(
+        number=0, name="a.png", caption="", kind="doubtful", picture=tmp_path / "none.jpg"
+    )
     rows = [replace(entry, number=k) for k in range(7, 0, -1)]
     sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv", each=2)
     page = (tmp_path / "index.html").read_text()

@@ -1,4 +1,5 @@
-"""The overlay video: contours at the pose, captions, and what is written where OpenCV cannot encode."""
+"""The overlay video: contours at the pose, captions, and what is written where OpenCV cannot
+encode."""
 
 from dataclasses import replace
 
@@ -45,7 +46,10 @@ def test_caption_says_how_sure_the_pose_is(registered):
     for confidence, expected in ((0.95, "likely"), (0.6, "unsure"), (0.4, "no match")):
         result = replace(registered[1], probabilities=(confidence,))
         assert caption(result)[0] == f"{expected}, confidence {confidence:.2f}"
-    assert (caption(LOST)[0], caption(FailedRegistration(InvalidInputError("no")))[0]) == ("lost", "failed")
+    assert (caption(LOST)[0], caption(FailedRegistration(InvalidInputError("no")))[0]) == (
+        "lost",
+        "failed",
+    )
 
 
 def test_overlay_video_warns_without_an_encoder(registered, tmp_path, monkeypatch):

@@ -27,18 +27,20 @@ _PAIR = {"l": "left", "r": "right"}
 def load_camera(path: str | os.PathLike[str]) -> Camera:
     """Read a calibration file; of one with several cameras, ``FILE:NAME`` names one.
 
-    Read are YAML, XML and JSON of OpenCV, also stereo (``M1``, ``D1``: ``FILE:1``), and ``.npz`` with ``mtx`` and
-    ``dist``; ``camera_info`` of ROS with ``roi`` and ``binning`` (``FILE:P`` is the camera of the rectified picture);
-    camchains of Kalibr and ``sensor.yaml`` of EuRoC; camodocal's files; ``cameras.txt`` of COLMAP; ``camera.json`` and
-    ``scene_camera.json`` (``FILE:IMAGE_ID``) of BOP; ``cam_K.txt`` of 3 x 3 numbers; ``camera_data.json`` of MegaPose;
-    ``transforms.json`` of nerfstudio; XML of Metashape; ppx, ppy of RealSense; matrices that Open3D and ARKit write
-    column by column; ``result.json``. Principal points that count from the corner of the picture (COLMAP, nerfstudio)
-    are converted. Four coefficients without a model's name are read as k1, k2, p1, p2, with a warning.
+    Read are YAML, XML and JSON of OpenCV, also stereo (``M1``, ``D1``: ``FILE:1``), and ``.npz``
+    with ``mtx`` and ``dist``; ``camera_info`` of ROS with ``roi`` and ``binning`` (``FILE:P`` is
+    the camera of the rectified picture); camchains of Kalibr and ``sensor.yaml`` of EuRoC;
+    camodocal's files; ``cameras.txt`` of COLMAP; ``camera.json`` and ``scene_camera.json``
+    (``FILE:IMAGE_ID``) of BOP; ``cam_K.txt`` of 3 x 3 numbers; ``camera_data.json`` of MegaPose;
+    ``transforms.json`` of nerfstudio; XML of Metashape; ppx, ppy of RealSense; matrices that Open3D
+    and ARKit write column by column; ``result.json``. Principal points that count from the corner
+    of the picture (COLMAP, nerfstudio) are converted. Four coefficients without a model's name are
+    read as k1, k2, p1, p2, with a warning.
 
     Raises:
         MissingFileError: the file does not exist.
-        InvalidInputError: it is none of these, lacks a value, describes a camera that is not supported, or has a key
-            that looks like distortion and is not read.
+        InvalidInputError: it is none of these, lacks a value, describes a camera that is not
+            supported, or has a key that looks like distortion and is not read.
 
     Example:
         >>> import tempfile
@@ -46,7 +48,8 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
         >>> _ = file.write_text("1 SIMPLE_RADIAL 640 480 500 320 240 -0.1")
         >>> camera = load_camera(f"{file}:1")
         >>> camera.matrix.tolist(), camera.distortion, camera.size
-        ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480, 640))
+        ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480,
+        640))
     """
     return Calibrations().load(path)
 
@@ -61,7 +64,8 @@ class Calibrations:
         """:func:`load_camera`."""
         file = Path(path)
         name = ""
-        if not os.path.isfile(file) and ":" in str(path):  # unlike Path.is_file, whatever the name is
+        # unlike Path.is_file, whatever the name is
+        if not os.path.isfile(file) and ":" in str(path):
             front, _, name = str(path).rpartition(":")
             file = Path(front)
         if not os.path.isfile(file):
@@ -80,13 +84,16 @@ class Calibrations:
 
 def _document(file: Path) -> Any:
     if file.stat().st_size > MAX_CAMERA_BYTES:
-        raise InvalidInputError(f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out")
+        raise InvalidInputError(
+            f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out"
+        )
     return _with_stereo_pair(read_document(file))
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A dict of a document that describes a camera: where it is, the dicts around it, and its format."""
+    """A dict of a document that describes a camera: where it is, the dicts around it, and its
+    format."""
 
     path: tuple[str, ...]
     values: Mapping[str, Any]
@@ -119,7 +126,8 @@ class _Cameras:
         self.inside = Counter(id(values) for camera in self.found for values in camera.around)
 
     def camera(self, name: str) -> Camera:
-        """The camera with a name; without one, the only camera. Its distortion is all read, or the file refused."""
+        """The camera with a name; without one, the only camera. Its distortion is all read, or the
+        file refused."""
         chosen, parse = self._chosen(name)
         around = [values for values in chosen.around if self.inside[id(values)] == 1]
         used: Used = set()
@@ -129,7 +137,8 @@ class _Cameras:
         if unread:
             keys = ", ".join(repr(key) for key in list(dict.fromkeys(unread))[:4])
             raise InvalidInputError(
-                f"{keys}: looks like distortion, but is not read; write the coefficients as distortion_coefficients: "
+                f"{keys}: looks like distortion, but is not read; write the coefficients as "
+                f"distortion_coefficients: "
                 "[k1, k2, p1, p2, k3], or remove the key"
             )
         return camera
@@ -145,15 +154,21 @@ class _Cameras:
         unique = len(set(last)) == len(last)
         names = last if unique else ["/".join(camera.path) for camera in self.found]
         listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-        advice = f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
+        advice = (
+            f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
+        )
         raise InvalidInputError((f"no camera {name!r}; " if name else "several cameras; ") + advice)
 
 
-def _found(value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], ...]) -> Iterator[_Found]:
+def _found(
+    value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], ...]
+) -> Iterator[_Found]:
     """The cameras in a document, each before those inside it."""
     if isinstance(value, list):
         for index, item in enumerate(value):
-            names = [item[key] for key in _ITEM_NAMES if key in item] if isinstance(item, dict) else []
+            names = (
+                [item[key] for key in _ITEM_NAMES if key in item] if isinstance(item, dict) else []
+            )
             yield from _found(item, (*path, str([*names, index][0])), around)
     if not isinstance(value, dict):
         return
@@ -166,7 +181,8 @@ def _found(value: Any, path: tuple[str, ...], around: tuple[Mapping[str, Any], .
 
 
 def _with_stereo_pair(document: Any) -> Any:
-    """M1, D1, M2, D2 of a stereo calibration as two cameras "1" and "2"; other documents as they are."""
+    """M1, D1, M2, D2 of a stereo calibration as two cameras "1" and "2"; other documents as they
+    are."""
     inside = document
     while isinstance(inside, dict) and len(inside) == 1:  # the root of XML
         (inside,) = inside.values()

@@ -16,11 +16,13 @@ import yaml
 from ...errors import InvalidInputError
 
 EXPECTED = (
-    "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, camera.json of BOP, "
+    "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, "
+    "camera.json of BOP, "
     "cam_K.txt of 3 x 3 numbers"
 )
 MAX_DEPTH = 50  # of nested lists and keys
-MAX_ARRAY_BYTES = 1 << 16  # of an array in an .npz file; larger ones are points of the calibration, and left out
+# of an array in an .npz file; larger ones are points of the calibration, and left out
+MAX_ARRAY_BYTES = 1 << 16
 MAX_ARRAYS = 1000  # of an .npz file
 _COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]", re.MULTILINE)
 _YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -28,12 +30,14 @@ _COUNTS = (4, 9, 12, 16)  # numbers of fx, fy, cx, cy; of a matrix of 3 x 3, 3 x
 
 
 def read_document(file: Path, expected: str = EXPECTED) -> Any:
-    """The values in a file; numbers alone are ``{"K": numbers}``, a line of COLMAP is ``{"colmap": words}``.
+    """The values in a file; numbers alone are ``{"K": numbers}``, a line of COLMAP is
+    ``{"colmap": words}``.
 
     ``expected`` is what messages say about the kinds of files.
 
     Raises:
-        InvalidInputError: it is damaged, or of no such kind. The message quotes nothing of its content.
+        InvalidInputError: it is damaged, or of no such kind. The message quotes nothing of its
+            content.
     """
     data = file.read_bytes()
     if data.startswith((b"PK\3\4", b"\x93NUMPY")):
@@ -56,17 +60,27 @@ def _text(data: bytes, expected: str) -> str:
     try:
         return data.decode(encoding)
     except UnicodeDecodeError as error:
-        message = "not a text file, and pickle is not read; save it as JSON: json.dump({'camera_matrix': K.tolist(), "
-        raise InvalidInputError(f"{message}'dist_coeffs': D.tolist()}}, file); expected {expected}") from error
+        message = (
+            "not a text file, and pickle is not read; save it as JSON: "
+            "json.dump({'camera_matrix': K.tolist(), "
+        )
+        raise InvalidInputError(
+            f"{message}'dist_coeffs': D.tolist()}}, file); expected {expected}"
+        ) from error
 
 
 def _numbers_alone(text: str) -> list[float]:
-    """The numbers of a text that holds nothing else, as ``numpy.savetxt`` writes them; [] of another text."""
+    """The numbers of a text that holds nothing else, as ``numpy.savetxt`` writes them; [] of
+    another text."""
     words = re.sub(r"#.*|[\[\](),;]", " ", text[:5000]).split()
     if len(text) > 5000 or len(words) not in _COUNTS:
         return []
     numbers = [number(word) for word in words]
-    return [value for value in numbers if isinstance(value, float)] if not any(map(_is_text, numbers)) else []
+    return (
+        [value for value in numbers if isinstance(value, float)]
+        if not any(map(_is_text, numbers))
+        else []
+    )
 
 
 def _is_text(value: Any) -> bool:
@@ -90,20 +104,37 @@ def _arrays(data: bytes) -> dict[str, Any]:
             members = archive.infolist()[:MAX_ARRAYS]
             small = [member for member in members if member.file_size <= MAX_ARRAY_BYTES]
             arrays = [member for member in small if member.filename.endswith(".npy")]
-            return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in arrays}
+            return {
+                member.filename.removesuffix(".npy"): _array(archive.read(member))
+                for member in arrays
+            }
     except InvalidInputError:
         raise
-    except (ValueError, OSError, EOFError, MemoryError, KeyError, struct.error, zlib.error) as error:
+    except (
+        ValueError,
+        OSError,
+        EOFError,
+        MemoryError,
+        KeyError,
+        struct.error,
+        zlib.error,
+    ) as error:
         raise InvalidInputError("a damaged .npz or .npy; save it again") from error
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:  # encrypted, or packed otherwise
+    # encrypted, or packed otherwise
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
         raise InvalidInputError("a damaged .npz; save it again with numpy.savez") from error
 
 
 def _array(data: bytes) -> Any:
-    """The values of a file of ``numpy.save``, whose header is checked before memory is taken; None of objects."""
+    """The values of a file of ``numpy.save``, whose header is checked before memory is taken; None
+    of objects."""
     stream = BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    reader = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    reader = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = reader(stream)
     if dtype.kind not in "fiu":
         return None
@@ -121,7 +152,9 @@ def _colmap(text: str) -> dict[str, Any]:
 def _xml(text: str) -> Any:
     """Elements by their tags; attributes count as elements."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise InvalidInputError("defines entities, which are not read; write it with cv2.FileStorage")
+        raise InvalidInputError(
+            "defines entities, which are not read; write it with cv2.FileStorage"
+        )
 
     def value(element: ElementTree.Element) -> Any:
         if not len(element) and (words := (element.text or "").split()):
@@ -131,7 +164,11 @@ def _xml(text: str) -> Any:
         for child in element:
             several = values.get(child.tag, [])
             inside = value(child)
-            values[child.tag] = [*(several if isinstance(several, list) else [several]), inside] if several else inside
+            values[child.tag] = (
+                [*(several if isinstance(several, list) else [several]), inside]
+                if several
+                else inside
+            )
         return values or []
 
     root = ElementTree.fromstring(text)
@@ -139,7 +176,8 @@ def _xml(text: str) -> Any:
 
 
 def _yaml(text: str, expected: str) -> Any:
-    """The first document with content. Tags say nothing here, and aliases, which can blow a file up, are refused."""
+    """The first document with content. Tags say nothing here, and aliases, which can blow a file
+    up, are refused."""
     text = re.sub(r"(?m)^%.*", "", text)  # OpenCV's "%YAML:1.0" is none of YAML's directives
     root: list[Any] = []
     open_values: list[Any] = [root]  # lists, and dicts in which a key waits for its value
@@ -147,7 +185,9 @@ def _yaml(text: str, expected: str) -> Any:
     try:
         for event in yaml.parse(text, Loader=_YAML_LOADER):
             if isinstance(event, yaml.AliasEvent):
-                raise InvalidInputError("has aliases (*name), which are not read; write it without them")
+                raise InvalidInputError(
+                    "has aliases (*name), which are not read; write it without them"
+                )
             if isinstance(event, yaml.CollectionEndEvent):
                 open_values.pop()
                 keys.pop()
@@ -163,7 +203,8 @@ def _yaml(text: str, expected: str) -> Any:
 
 
 def _put(open_values: list[Any], keys: list[str | None], event: Any) -> None:
-    """Add the value of an event of YAML where it belongs; it becomes the innermost open one if it holds others."""
+    """Add the value of an event of YAML where it belongs; it becomes the innermost open one if it
+    holds others."""
     if len(open_values) > MAX_DEPTH:
         raise InvalidInputError("nested too deeply; write it again")
     inside = open_values[-1]

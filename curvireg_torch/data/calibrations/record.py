@@ -33,8 +33,12 @@ class Record:
         around: enclosing dicts, the innermost first.
     """
 
-    def __init__(self, values: Mapping[str, Any], used: Used, around: Sequence[Mapping[str, Any]] = ()) -> None:
-        self.values, self.used, self.around = values, used, around
+    def __init__(
+        self, values: Mapping[str, Any], used: Used, around: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        self.values = values
+        self.used = used
+        self.around = around
 
     def has(self, *names: str) -> bool:
         """Whether the dict itself has one of the keys."""
@@ -52,7 +56,8 @@ class Record:
         return None
 
     def numbers(self, *names: str) -> list[float]:
-        """The finite numbers of the first of some keys, of a matrix row by row; none without such a key."""
+        """The finite numbers of the first of some keys, of a matrix row by row; none without such a
+        key."""
         flat = flattened(self.get(*names))
         found = finite_numbers(flat, len(flat))
         if found is None:
@@ -76,7 +81,8 @@ class Record:
 
 
 def flattened(value: Any) -> list[Any]:
-    """The scalars of nested lists, and of the ``data`` of a dict; texts that are numbers are these."""
+    """The scalars of nested lists, and of the ``data`` of a dict; texts that are numbers are
+    these."""
     while isinstance(value, dict):
         value = value.get("data")
     if isinstance(value, list):
@@ -88,7 +94,8 @@ def flattened(value: Any) -> list[Any]:
 
 
 def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, str]]:
-    """The keys that look like distortion and have a number that is not zero, each with the identity of its dict.
+    """The keys that look like distortion and have a number that is not zero, each with the identity
+    of its dict.
 
     Args:
         value: a document, or a part of it.
@@ -102,7 +109,9 @@ def distortion_keys(value: Any, others: Container[int]) -> Iterator[tuple[int, s
         yield from distortion_keys_inside(value, others)
 
 
-def distortion_keys_inside(values: Mapping[str, Any], others: Container[int]) -> Iterator[tuple[int, str]]:
+def distortion_keys_inside(
+    values: Mapping[str, Any], others: Container[int]
+) -> Iterator[tuple[int, str]]:
     """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
     for key, value in values.items():
         if _DISTORTION_KEY.match(plain(key)) and _has_number(value):

@@ -2,8 +2,9 @@
 A row for my table
 ==================
 
-You have a folder of photographs of one thing, and want a table: where it was seen from, and how sure that is. No camera
-is known, so there is no distance. The photographs are generated here; one of them is damaged, as in real folders.
+You have a folder of photographs of one thing, and want a table: where it was seen from, and how
+sure that is. No camera is known, so there is no distance. The photographs are generated here; one
+of them is damaged, as in real folders.
 """
 
 import csv
@@ -17,9 +18,11 @@ import curvireg_torch as cr
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 folder = Path(tempfile.mkdtemp())
-mesh, size = example_mesh(), (180, 240)
+mesh = example_mesh()
+size = (180, 240)
 K = cr.camera_matrix(260.0, 260.0, 119.5, 89.5, dtype=torch.float64)
-boxes, true_azimuths = [], []
+boxes = []
+true_azimuths = []
 for seed in range(6):
     generator = torch.Generator().manual_seed(seed)
     truth = random_pose(mesh, K, size, generator, elevations=(12.0, 45.0), fill=(0.75, 0.95))
@@ -34,7 +37,8 @@ photographs = sorted(folder.glob("*.png"))
 # One call
 # --------
 #
-# Photographs are registered in parallel. One that cannot be read does not stop the others: its result is not ``ok``.
+# Photographs are registered in parallel. One that cannot be read does not stop the others: its
+# result is not ``ok``.
 
 registrar = cr.Registrar(mesh, pipeline=cr.Pipeline().with_pose_prior("upright"), progress=False)
 results = registrar([str(path) for path in photographs], boxes)
@@ -77,5 +81,5 @@ for ax, k in zip(axes, usable, strict=True):
 plt.show()
 
 # %%
-# ``curvireg register --list`` writes such a table, with overlays, and continues after an interruption: see
-# :doc:`/results`.
+# ``curvireg register --list`` writes such a table, with overlays, and continues after an
+# interruption: see :doc:`/results`.

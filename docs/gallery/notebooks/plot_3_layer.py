@@ -2,9 +2,9 @@
 A layer in my model
 ===================
 
-You have a network of your own, and want to show it edges rather than brightness. Every filter of the library is an
-``nn.Module`` that passes gradients. Here a small classifier learns which of two shapes a picture shows; the light
-changes from picture to picture.
+You have a network of your own, and want to show it edges rather than brightness. Every filter of
+the library is an ``nn.Module`` that passes gradients. Here a small classifier learns which of two
+shapes a picture shows; the light changes from picture to picture.
 """
 
 import matplotlib.pyplot as plt
@@ -17,20 +17,23 @@ torch.manual_seed(0)
 
 
 def pictures(count):
-    """Pictures (count, 1, 32, 32) of a square or a disc, and their labels; light and contrast vary."""
+    """Pictures (count, 1, 32, 32) of a square or a disc, and their labels; light and contrast
+    vary."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, 32), torch.linspace(-1, 1, 32), indexing="ij")
     labels = torch.randint(2, (count,))
-    centre, radius = torch.rand(count, 2, 1, 1) * 0.6 - 0.3, torch.rand(count, 1, 1) * 0.2 + 0.4
-    dx, dy = x - centre[:, 0], y - centre[:, 1]
+    centre = torch.rand(count, 2, 1, 1) * 0.6 - 0.3
+    radius = torch.rand(count, 1, 1) * 0.2 + 0.4
+    dx = x - centre[:, 0]
+    dy = y - centre[:, 1]
     disc = (dx**2 + dy**2).sqrt() / radius
     square = torch.maximum(dx.abs(), dy.abs()) / (0.89 * radius)
     inside = torch.sigmoid(20 * (1 - torch.where(labels[:, None, None] == 1, disc, square)))
     contrast = (0.2 + 0.6 * torch.rand(count, 1, 1)) * (2 * torch.randint(2, (count, 1, 1)) - 1)
     light = torch.randn(count, 2, 1, 1) * 0.5
     noise = 0.03 * torch.randn(count, 32, 32)
-    return (0.5 + 0.5 * contrast * inside + 0.3 * (light[:, 0] * x + light[:, 1] * y) + noise)[:, None].clamp(
-        0, 1
-    ), labels
+    return (0.5 + 0.5 * contrast * inside + 0.3 * (light[:, 0] * x + light[:, 1] * y) + noise)[
+        :, None
+    ].clamp(0, 1), labels
 
 
 x_train, y_train = pictures(256)
@@ -55,11 +58,14 @@ plt.show()
 # Pixels or edges
 # ---------------
 #
-# ``HOG`` turns the field into a descriptor; ``learnable=True`` makes its options parameters of the network.
+# ``HOG`` turns the field into a descriptor; ``learnable=True`` makes its options parameters of the
+# network.
 
 models = {
     "pixels": nn.Sequential(nn.Flatten(), nn.Linear(32 * 32, 64), nn.ReLU(), nn.Linear(64, 2)),
-    "edges": nn.Sequential(cr.ImageGradient(learnable=True), cr.HOG(grid=4, learnable=True), nn.LazyLinear(2)),
+    "edges": nn.Sequential(
+        cr.ImageGradient(learnable=True), cr.HOG(grid=4, learnable=True), nn.LazyLinear(2)
+    ),
 }
 for name, model in models.items():
     model(x_train[:1])  # decides the size of the lazy layer
