@@ -107,7 +107,8 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
             assert expected is None or float(rotation_error(R, scene(expected)[2][:3, :3])) < 15
             assert [[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)] == R.tolist()
     check_pose(rows[0], scene(0)[2], 15.0, 0.1)
-    assert [rows[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
+    assert "" not in [rows[1][name] for name in ("tx", "ty", "tz")], "of an estimated camera"
+    assert (documents[0]["camera_source"], documents[1]["camera_source"]) == ("given", "estimated")
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
@@ -181,7 +182,8 @@ LIMITED = [
         {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]},
     ),
     ("", "", {"elevation": [-10.0, 80.0]}),
-    ("distance", "1 2", "distance: needs the camera"),
+    ("distance", "1 2", {"distance": [1.0, 2.0], "elevation": [-10.0, 80.0]}),
+    ("distance", "1", "distance: expected"),
     ("azimuth", "140", "azimuth: expected LOW HIGH"),
     ("azimuth", "from 140", "azimuth: expected LOW HIGH, finite numbers, got 'from 140'"),
     ("side", "top", "side"),

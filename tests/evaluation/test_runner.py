@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
+from curvireg_torch.data.pose_files import PoseFile
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.evaluation import runner
 from curvireg_torch.evaluation.photograph import Entry, View
@@ -132,11 +133,15 @@ VIEWS = (View("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
 OTHERS = {
     "name": "y.png",
     "instances": 2,
-    "start_confidence": 0.5,
     "as_stored": True,
     "views": VIEWS,
 }
-OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": ((1.0, 0.0, 0.0, 0.0),)}
+OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": PoseFile(torch.eye(4))}
+STARTS = (
+    PoseFile(2.0 * torch.eye(4)),
+    PoseFile(torch.eye(4), unit="mm"),
+    PoseFile(torch.eye(4), confidence=0.5),
+)
 BOXES = ((1.0, 2.0, 3.0, 4.25), None)
 CAMERAS = (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
 
@@ -151,6 +156,10 @@ def test_request_covers_every_option_and_other_views():
         changed = replace(ENTRY, **{name: value})
         assert changed.request() != ENTRY.request() == replace(ENTRY).request(), (name, value)
         assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key, (name, value)
+    started = replace(ENTRY, start=OTHERS["start"])
+    for start in STARTS:
+        changed = replace(ENTRY, start=start)
+        assert changed.request() != started.request() != ENTRY.request(), start
     values = {
         "box": (1.0, 2.0, 3.0, 4.0),
         "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1]))),
