@@ -23,7 +23,7 @@ from ..visualization.sheet import SheetEntry, write_sheet
 from .benchmarks import Benchmark, copy_shown, detection_recall
 from .outputs import output_folder
 from .runner import POSE_SOURCES, run_entries, thumbnail_of
-from .store import ResultStore, Row, to_json
+from .store import ResultStore, Row, has_pose, to_json
 
 __all__ = ["evaluate", "report"]
 
@@ -145,7 +145,7 @@ def report(
     summary = {
         **benchmark.summary(samples, rows, errors),
         **detection,
-        "failed": sum(row["status"] == "failed" for row in rows),
+        "failed": sum(not has_pose(row) for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],
         "limit": limit,
@@ -175,12 +175,12 @@ def _write_page(
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
         number = row.get("confidence")
         confidence = "not calibrated" if number is None else f"confidence {two_decimals(number)}"
-        if row["status"] == "failed":
-            kind = "failed"
+        if not has_pose(row):
+            kind = row["verdict"]
             caption = row["message"]
             rank = (2.0, 0.0)
         elif math.isnan(error):
-            kind = "reliable" if row["reliable"] else "doubtful"
+            kind = row["verdict"]
             caption = f"pose unknown, {confidence}"
             rank = 1.0, -(number or 0.0)
         else:
@@ -196,7 +196,7 @@ def _write_page(
         )
     known = [error for error in errors.tolist() if not math.isnan(error)]
     right = sum(error < RIGHT_DEG for error in known)
-    failed = sum(row["status"] == "failed" for row in rows)
+    failed = sum(not has_pose(row) for row in rows)
     title = (
         f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} "
         f"failed"

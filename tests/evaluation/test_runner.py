@@ -51,7 +51,7 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         assert str(registrar) == entry.meshes[0].name
         first = sum(label[1] == entry.label[1] for label in labels) == 1
         assert (bank_seconds > 0) == first, "the first pays for the bank"
-        return {"status": "ok"}
+        return {"verdict": "reliable"}
 
     def open_registrar(meshes):
         assert not any(reference() for reference in opened), (
