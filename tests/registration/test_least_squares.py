@@ -207,7 +207,9 @@ def test_directions_are_known_where_errors_of_points_and_normals_tell_less(radiu
     change in the derivatives."""
     points, T, centre, J = cloud(60)
     W = torch.full((1, 60, 1), 0.5, dtype=torch.float64)
-    _, known = ls.pose_covariance(ls.Measurements(J, W, W), points, T, K[None], centre, radius=radius)
+    _, known = ls.pose_covariance(
+        ls.Measurements(J, W, W), points, T, K[None], centre, radius=radius
+    )
     small = 1e-6
     n = points.normals
     turned = n + small * torch.stack([-n[..., 1], n[..., 0]], dim=-1)
