@@ -1,7 +1,6 @@
 """One photograph, or several of one pose: what is known about it, and its registration."""
 
 import base64
-import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -35,7 +34,7 @@ from ..registration.result import detection_document, result_document
 from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .opening import CAMERA_OPTIONS, check_bank, start_in_unit
+from .opening import check_bank, start_in_unit
 from .outputs import output_folder
 from .result_files import View, write_result
 
@@ -381,8 +380,7 @@ def register_views(
     try:
         return registrar.register_views(images, boxes, matrices, poses), seen
     except CurviregError as error:
-        named = re.sub(r"\bimage (\d+)\b", lambda number: views[int(number[1])].name, f"{error}")
-        raise InvalidInputError(named) from error
+        raise error.with_image_names([view.name for view in views]) from error
 
 
 def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
@@ -399,6 +397,8 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     if camera is not None:
         return camera, "exif"
     if given == "exif" or entry.start is not None:
-        what = "no focal length in its EXIF" if given == "exif" else "--start: needs the camera"
-        raise InvalidInputError(f"{what}; give {CAMERA_OPTIONS}", subject=entry.name)
+        is_insisted = given == "exif"
+        wanted = "no focal length in its EXIF" if is_insisted else "a start pose needs the camera"
+        message = f"{wanted}; give the camera"
+        raise InvalidInputError(message, subject=entry.name, kind="camera")
     return None, None
