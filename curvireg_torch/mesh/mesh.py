@@ -52,8 +52,7 @@ def load_mesh(
             .stp, .iges, .igs and .dae.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
             None: that which the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else
-                m. An object that would be smaller
-            than 5 mm or larger than 100 m gets a warning.
+            m. An object that would be smaller than 5 mm or larger than 100 m gets a warning.
         up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
             ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
             other formats.

@@ -484,6 +484,24 @@ def test_bop_scene_cameras_are_named_by_image(tmp_path):
     check(load_camera(file), (), size=None)  # all the same
 
 
+@pytest.mark.parametrize(
+    ("source", "deviation", "expected"),
+    [
+        ("given", 0.0, "given"),
+        ("given", 0.04, "given"),
+        ("estimated", 0.35, "estimated"),
+        ("exif", 0.05, "given"),
+    ],
+)
+def test_the_camera_of_a_result_is_as_uncertain_as_it_was(tmp_path, source, deviation, expected):
+    own = {**OWN, "focal_deviation": deviation, "source": source}
+    for content in (own, {"camera": own, "inputs": {"camera": None}}):
+        (tmp_path / "result.json").write_text(json.dumps(content))
+        camera = load_camera(tmp_path / "result.json")
+        assert (camera.focal_deviation, camera.source) == (deviation, expected)
+        assert camera.size == (480, 640)
+
+
 def test_metashape_counts_from_the_centre_and_swaps_the_tangential_coefficients(tmp_path):
     file = tmp_path / "calibration.xml"
     lens = "<k1>-0.31</k1><k2>0.12</k2><k3>0.03</k3><p1>-0.002</p1><p2>0.001</p2>"
