@@ -115,8 +115,8 @@ def synthesize_photograph(
     texture: float = 0.35,
 ) -> tuple[Tensor, Tensor]:
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box
-    (4,) in px. ``texture`` is the contrast of a random solid pattern; a mesh with colours shows
-    those instead. The background (3, H, W), default :func:`procedural_background`, is out of
+    (4,) in px. ``texture`` is the contrast of a random solid pattern; a mesh whose colours vary
+    shows those instead. The background (3, H, W), default :func:`procedural_background`, is out of
     focus."""
     H, W = size
     # Supersampling by two.

@@ -15,7 +15,8 @@ from tests._support.scenes import CAMERA, SIZE
 def test_photograph_shows_the_colours_of_the_mesh_at_its_pose_which_must_show_the_object():
     generator = torch.Generator().manual_seed(3)
     mesh = example_mesh()
-    mesh.visual.face_colors = np.tile(np.array([255, 0, 255, 255], np.uint8), (len(mesh.faces), 1))
+    paint = np.array([[255, 0, 255, 255], [180, 0, 180, 255]], np.uint8)
+    mesh.visual.face_colors = paint[np.arange(len(mesh.faces)) % 2]
     T = random_pose(mesh, CAMERA, SIZE, generator, elevations=(15.0, 45.0))
     grey = torch.full((3, *SIZE), 0.5)
     image, box = synthesize_photograph(mesh, T, CAMERA, SIZE, generator, background=grey)

@@ -14,7 +14,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
 
-from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError, MissingFileError
+from ..errors import CurviregError, ImageError, InvalidInputError, MissingFileError
 from ..jobs.options import CAMERA_OPTIONS
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
@@ -40,8 +40,6 @@ FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camer
 
 SCORES = ("confidence", "edge_support", "message")
 
-STATUSES = ("ok", "unsure", "lost", "failed")
-
 
 def add_follow(commands: Any) -> None:
     parser = add_command(
@@ -53,7 +51,7 @@ def add_follow(commands: Any) -> None:
         "curvireg follow 0 part.stl --unit mm --camera cam.yaml --json",
         help="follow an object through a video, or live",
         description="Registers the first frame and tracks the object from frame to frame. Writes\n"
-        "DIR/results.csv: photo, status (ok: confidence of 0.5 or more; unsure, lost, "
+        "DIR/results.csv: photo, verdict (reliable, unsure, no match, lost, "
         "failed),\nrotation row by row, "
         "translation in the mesh's unit, confidence, edge support, and why there is no pose;\n"
         "DIR/overlay.mp4: contours of the pose and confidence on each frame.\n"
@@ -125,7 +123,7 @@ def run(arguments: argparse.Namespace) -> None:
         video = out / "overlay.mp4"
         files = f"; see {out}/results.csv" + (f" and {video}" if video.is_file() else "")
     print(f"{tally}{files}", file=sys.stderr if arguments.json else sys.stdout)
-    if not tally.counts["ok"] and not tally.counts["unsure"]:
+    if not tally.posed:
         reason = f"; the first: {tally.first_message}" if tally.frames else ""
         message = (
             f"no frame could be registered{reason}; give frames that can be read, and "
@@ -162,16 +160,20 @@ class Tally:
             self.seconds_after_first += seconds
         else:
             self.first_message = pose.get("message", "")
-        self.counts[pose["status"]] += 1
+        self.counts[pose["verdict"]] += 1
+
+    @property
+    def posed(self) -> int:
+        """Number of frames with a pose."""
+        return self.frames - self.counts["lost"] - self.counts["failed"]
 
     def __str__(self) -> str:
-        others = ", ".join(f"{self.counts[status]} {status}" for status in STATUSES[1:])
+        from ..registration.result import verdict_counts
+
         rate = ""
         if self.frames > 1:
             rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
-        return (
-            f"{self.frames} frames: {self.counts['ok']} of {self.frames} believed, {others}{rate}"
-        )
+        return f"{self.frames} frames: {verdict_counts(self.counts)}{rate}"
 
 
 def _follow(
@@ -194,7 +196,7 @@ def _follow(
     fps = fps if 0 < fps < 1000 else FOLDER_FPS
     registrar = open_registrar(options, options.meshes)
     tally = Tally()
-    columns = ["photo", "status", *POSE_COLUMNS, *SCORES]
+    columns = ["photo", "verdict", *POSE_COLUMNS, *SCORES]
     table = None if out is None else CsvFile(out / "results.csv", columns)
     start = time.monotonic()
     video = None
@@ -370,15 +372,12 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
 def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:
     """A pose, or why there is none, as JSON values."""
     from ..registration import FailedRegistration
-    from ..registration.following import BELIEVED_CONFIDENCE
 
     if isinstance(result, FailedRegistration):
-        status = "lost" if isinstance(result.error, LostObjectError) else "failed"
-        return {"status": status, "message": str(result.error)}
-    believed = (result.confidence or 0.0) >= BELIEVED_CONFIDENCE
+        return {"verdict": result.verdict, "message": str(result.error)}
     pose = {key: getattr(result, key).tolist() for key in ("rotation", "translation", "quaternion")}
     scores = {"confidence": result.confidence, "edge_support": result.edge_support}
-    return {"status": "ok" if believed else "unsure", **pose, **scores}
+    return {"verdict": result.verdict, **pose, **scores}
 
 
 def _cells(pose: dict[str, Any]) -> list[Any]:
@@ -386,4 +385,4 @@ def _cells(pose: dict[str, Any]) -> list[Any]:
     numbers = [""] * 12
     if "rotation" in pose:
         numbers = [*itertools.chain(*pose["rotation"]), *pose["translation"]]
-    return [pose["frame"], pose["status"], *numbers, *(pose.get(name, "") for name in SCORES)]
+    return [pose["frame"], pose["verdict"], *numbers, *(pose.get(name, "") for name in SCORES)]

@@ -234,7 +234,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"failed: {more} more", file=notes)
     table = "" if arguments.out is None else f"; see {out}/results.csv"
     print(f"{counts}{table}", file=notes)
-    if not counts.ok:
+    if not counts.posed:
         message = "no photograph could be registered; the message of each gives the reason"
         raise InvalidInputError(message, subject=arguments.list or "")
     if not arguments.strict or STARTED in os.environ:  # the process that started this one reports
@@ -251,10 +251,12 @@ def _strict_code(reliable: int, failed: int) -> int:
 
 def _counted(out: Path) -> tuple[int, int]:
     """Numbers of reliable and of failed photographs among results that other processes wrote."""
+    from ..jobs.store import has_pose
+
     lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
     rows = [json.loads(line) for line in lines]
     reliable = sum(bool(row.get("reliable")) for row in rows)
-    return reliable, sum(row["status"] != "ok" for row in rows)
+    return reliable, sum(not has_pose(row) for row in rows)
 
 
 @contextmanager
@@ -343,7 +345,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         _write_pose(arguments, document)
     if not arguments.json:
         print("pose in the world (model to world)")
-        for view in document["views"]:
+        for view in document["photographs"]:
             print(f"{view['name']}: {view_in_words(view)}")
     _finish(arguments, document)
     return result.reliable
@@ -418,10 +420,11 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
     )
     print(
-        f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence {confidence}"
+        f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence "
+        f"{confidence}, {document['verdict']}"
     )
     if not document["reliable"]:
-        print(f"no reliable match: take the pose as a guess; {_advice(document)}")
+        print(f"take the pose as a guess; {_advice(document)}")
     _print_rivals(document)
     if ", " in document.get("inputs", {}).get("mesh", ""):
         print(f"mesh: {document['mesh']}")
@@ -463,9 +466,9 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
 
     if document["ambiguous"] is None:
         return
-    for rival, probability in list(zip(document["top"], document["probabilities"], strict=False))[
-        1:
-    ]:
+    poses = zip(document["hypotheses"], document["probabilities"], strict=False)
+    rivals = list(poses)[1:]
+    for rival, probability in rivals:
         if probability >= RIVAL_FRACTION * document["confidence"]:
             print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
@@ -473,7 +476,7 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         "mirror": "are mirror images",
         "several": "differ",
     }
-    none = f"none of them: {two_decimals(document['none'])}"
+    none = f"none of them: {two_decimals(document['no_match_probability'])}"
     print(
         f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or "
         f"--near"

@@ -175,7 +175,7 @@ def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
     if content.get("frame") == "world":
         message = (
             "a result of several photographs, whose pose is in the world; give that in one "
-            "camera, as in 'views'"
+            "camera, as in 'photographs'"
         )
         raise InvalidInputError(message)
     if "rotation" in content and content.get("translation", ...) is None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..jobs.outputs import output_folder
 from ..jobs.runner import results_digest, run_entries, thumbnail_of
-from ..jobs.store import ResultStore, Row, to_json
+from ..jobs.store import ResultStore, Row, has_pose, to_json
 from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
@@ -146,7 +146,7 @@ def report(
     summary = {
         **benchmark.summary(samples, rows, errors),
         **detection,
-        "failed": sum(row["status"] == "failed" for row in rows),
+        "failed": sum(not has_pose(row) for row in rows),
         "skipped": dict(sorted(skipped.items())),
         "protocol": settings["protocol"],
         "limit": limit,
@@ -176,12 +176,12 @@ def _write_page(
     for i, row, error in zip(scored, rows, errors.tolist(), strict=True):
         number = row.get("confidence")
         confidence = "not calibrated" if number is None else f"confidence {two_decimals(number)}"
-        if row["status"] == "failed":
-            kind = "failed"
+        if not has_pose(row):
+            kind = row["verdict"]
             caption = row["message"]
             rank = (2.0, 0.0)
         elif math.isnan(error):
-            kind = "reliable" if row["reliable"] else "doubtful"
+            kind = row["verdict"]
             caption = f"pose unknown, {confidence}"
             rank = 1.0, -(number or 0.0)
         else:
@@ -197,7 +197,7 @@ def _write_page(
         )
     known = [error for error in errors.tolist() if not math.isnan(error)]
     right = sum(error < RIGHT_DEG for error in known)
-    failed = sum(row["status"] == "failed" for row in rows)
+    failed = sum(not has_pose(row) for row in rows)
     title = (
         f"{len(rows)} objects: {right} of {len(known)} within {RIGHT_DEG:g} degrees, {failed} "
         f"failed"

@@ -2,6 +2,7 @@
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -14,7 +15,7 @@ from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
-from ..registration.result import two_decimals
+from ..registration.result import two_decimals, verdict_counts
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
@@ -22,7 +23,7 @@ from .entry import Entry, entry_of
 from .options import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .outputs import output_folder
 from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
-from .store import ResultStore, Row
+from .store import ResultStore, Row, has_pose
 
 BOX = ("x0", "y0", "x1", "y1")
 CAMERA = ("fx", "fy", "cx", "cy")
@@ -35,7 +36,7 @@ POSE_COLUMNS = (
 )
 """Columns of a pose: the rotation row by row, and the translation."""
 
-RESULT_COLUMNS = ("status", "message", "confidence", "reliable", *POSE_COLUMNS)
+RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS)
 """Columns of ``results.csv`` after those of the list."""
 
 REPORTS = ("results.csv", "index.html")  # written from all results at the end
@@ -223,19 +224,24 @@ def _without_empty_end(cells: Sequence[str], least: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Counts:
-    """Numbers of rows with a pose, and with a reliable one; ``failures``: number, name and reason
-    of each other row."""
+    """Numbers of rows by verdict; ``failures``: number, name and reason of each without a pose."""
 
-    ok: int
-    reliable: int
+    verdicts: Mapping[str, int]
     failures: tuple[str, ...]
 
+    @property
+    def posed(self) -> int:
+        """Number of rows with a pose."""
+        return sum(self.verdicts.values()) - len(self.failures)
+
+    @property
+    def reliable(self) -> int:
+        """Number of rows with a reliable pose."""
+        return self.verdicts.get("reliable", 0)
+
     def __str__(self) -> str:
-        failed = len(self.failures)
-        return (
-            f"{self.ok + failed} photographs: {self.ok} ok, {failed} failed, {self.reliable} "
-            f"reliable"
-        )
+        total = sum(self.verdicts.values())
+        return f"{total} photographs: {verdict_counts(self.verdicts)}"
 
 
 def register_list(
@@ -281,20 +287,18 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
         message = row["message"]
         reliable = row.get("reliable", False)
         confidence = row.get("confidence") or 0.0
-        kind = "failed" if message else "reliable" if reliable else "doubtful"
-        caption = message or f"confidence {two_decimals(confidence)}, {kind}"
+        verdict = row["verdict"]
+        caption = message or f"{verdict}, confidence {two_decimals(confidence)}"
         picture = thumbnail_of(out, row)
         rank = bool(message), not reliable, -confidence, number
-        shown.append(SheetEntry(number, entry.name, caption, kind, picture, rank))
+        shown.append(SheetEntry(number, entry.name, caption, verdict, picture, rank))
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
         lines.append(
             [*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)]
         )
-    counts = Counts(
-        len(shown) - len(failures), sum(shot.kind == "reliable" for shot in shown), tuple(failures)
-    )
+    counts = Counts(Counter(shot.kind for shot in shown), tuple(failures))
     write_sheet(out / "index.html", str(counts), shown, table="results.csv")
     store.rewrite(_rows(entries, store))
     write_csv(out / "results.csv", lines)
@@ -310,12 +314,12 @@ def _rows(entries: Sequence[Entry], store: ResultStore) -> Iterator[Row]:
 
 
 def _result_cells(row: Row) -> list[str]:
-    if row["status"] != "ok":
-        return [row["status"], row["message"], "", "false", *[""] * 12]
+    if not has_pose(row):
+        return [row["verdict"], row["message"], "", "false", *[""] * 12]
     confidence = "" if row["confidence"] is None else str(row["confidence"])
     pose = [*(v for line in row["rotation"] for v in line), *(row["translation"] or [""] * 3)]
     return [
-        "ok",
+        row["verdict"],
         "; ".join(row["warnings"]),
         confidence,
         "true" if row["reliable"] else "false",

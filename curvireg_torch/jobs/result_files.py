@@ -117,7 +117,7 @@ def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:
     if document["translation"] is None:
         raise InvalidInputError("--format ros: a pose without translation; give a camera")
     w, x, y, z = document["quaternion"]
-    frame = "world" if isinstance(document["views"], list) else "camera_optical_frame"
+    frame = "world" if document["frame"] == "world" else "camera_optical_frame"
     px, py, pz = (v * UNITS[document["unit"] or "m"] for v in document["translation"])
     text = f"""header:
   stamp: {{sec: 0, nanosec: 0}}
@@ -134,7 +134,7 @@ def write_lost(out: Path, message: str) -> None:
     _remove(out)
     write_file(
         out / "result.json",
-        to_json({"schema": SCHEMA, "status": "lost", "message": message}).encode(),
+        to_json({"schema": SCHEMA, "verdict": "lost", "message": message}).encode(),
     )
 
 

@@ -242,8 +242,8 @@ def register_rig(
     document = result_document(
         result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
     )
-    document |= {"frame": "world", "inputs": {"rig": str(path), "box": None}}
-    for row, view in zip(document["views"], seen, strict=True):
+    document |= {"inputs": {"rig": str(path), "box": None}}
+    for row, view in zip(document["photographs"], seen, strict=True):
         row |= {"name": view.name, "photo": str(view.photo), "camera": view.camera.describe()}
         row["T_cam_from_world"] = view.T_cam_from_world.tolist()
     return result, document, seen

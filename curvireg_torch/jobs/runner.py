@@ -22,14 +22,14 @@ from ..errors import (
 )
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
-from ..registration.result import SCHEMA, places_document
+from ..registration.result import SCHEMA, line_document, places_document, verdict_of_error
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
 from .entry import Entry
 from .photograph import register_entry
-from .store import ResultStore, Row, workers
+from .store import ResultStore, Row, has_pose, workers
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
 """Parts of the package that no stored result depends on."""
@@ -64,7 +64,7 @@ def run_entries(
     library, the entry's own request and every file of its meshes. Entries of the same meshes follow
     each other, so that only one bank is in memory, and are registered side by side on torch's
     threads; each row is on disk as soon as it is known. An input that cannot be used makes a row
-    with ``failed`` as ``status`` and does not stop the others. ``reports``, files that are written
+    with ``failed`` as ``verdict`` and does not stop the others. ``reports``, files that are written
     from all results, are removed first.
 
     Returns:
@@ -172,12 +172,14 @@ def _row(
         return failed_row(error, seconds=seconds, **places)
     describer = registrar.of_model(found.model).describer
     write_file(picture, thumbnail(describer, found.projection, found.image, found.box.tolist()))
-    return {"status": "ok", "message": "", **found.document}
+    return {"message": "", **line_document(found.document)}
 
 
 def failed_row(error: Exception | str, **values: Any) -> Row:
     """The row of an entry without a pose; ``skipped`` names a file that could not be read."""
-    return {"schema": SCHEMA, "status": "failed", "message": " ".join(str(error).split()), **values}
+    verdict = verdict_of_error(error) if isinstance(error, Exception) else "failed"
+    message = " ".join(str(error).split())
+    return {"schema": SCHEMA, "verdict": verdict, "message": message, **values}
 
 
 def thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
@@ -187,4 +189,4 @@ def thumbnail_path(out: Path, digests: Mapping[str, str]) -> Path:
 
 def thumbnail_of(out: Path, row: Row) -> Path | None:
     """The picture of a row; None if it has no pose."""
-    return thumbnail_path(out, row["digests"]) if row["status"] == "ok" else None
+    return thumbnail_path(out, row["digests"]) if has_pose(row) else None

@@ -21,6 +21,11 @@ Row = dict[str, Any]
 T = TypeVar("T")
 
 
+def has_pose(row: Mapping[str, Any]) -> bool:
+    """Whether the photograph of a row has a pose, whatever the verdict on it."""
+    return row["verdict"] not in ("lost", "failed")
+
+
 @dataclass(frozen=True)
 class Workers:
     """This process is number ``rank`` of the ``size`` ones that share an evaluation or a list; 0

@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..errors import CurviregError
+from ..errors import CurviregError, LostObjectError
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import PosePrior, object_frame
@@ -40,7 +40,11 @@ STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from
 # Deviation of an estimated focal length, as a fraction, from which it is hardly measured
 WEAK_PERSPECTIVE = 0.15
 # Version of the keys of result.json; raised when a key is removed or changes its meaning
-SCHEMA = 3
+SCHEMA = 4
+# How sure an answer is, surest first; the last two have no pose
+VERDICTS = ("reliable", "unsure", "no match", "lost", "failed")
+# Keys of result.json that have another name in the lines of results.jsonl
+LINE_KEYS = {"hypotheses": "top", "no_match_probability": "none"}
 CONVENTIONS = {  # docs/results.md describes all keys
     "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of "
     "the mesh file",
@@ -255,7 +259,7 @@ class Registration:
         return self.probabilities[0] if self.probabilities else None
 
     @property
-    def none(self) -> float | None:
+    def no_match_probability(self) -> float | None:
         """Probability that no hypothesis is right; None for pipelines without calibration."""
         return max(0.0, 1.0 - sum(self.probabilities)) if self.probabilities else None
 
@@ -286,6 +290,18 @@ class Registration:
         return deviations is not None and bool(deviations[0].isfinite().any())
 
     @property
+    def verdict(self) -> str:
+        """How sure the answer is: "reliable"; "no match" if it is more probable that no hypothesis
+        is right than that the first one is; else "unsure". Every command, page and picture uses
+        these words, and "lost" or "failed" of a :class:`FailedRegistration`."""
+        if self.reliable:
+            return "reliable"
+        no_match = self.no_match_probability
+        if self.confidence is None or no_match is None or no_match <= self.confidence:
+            return "unsure"
+        return "no match"
+
+    @property
     def quaternion(self) -> Tensor:
         """(4,) float64 unit quaternion (w, x, y, z) of ``rotation``, w >= 0."""
         x, y, z, w = Rotation.from_matrix(self.rotation.numpy()).as_quat(canonical=True)
@@ -307,8 +323,7 @@ class Registration:
             else ", ".join(f"{v:.6g}" for v in self.translation.tolist())
         )
         lines = [
-            f"Registration: {verdict(self.confidence, self.none, self.reliable)}, confidence "
-            f"{confidence}",
+            f"Registration: {self.verdict}, confidence {confidence}",
             f"rotation    [[{rows[0]}],",
             *(f"             [{row}]{end}" for row, end in zip(rows[1:], (",", "]"), strict=True)),
             f"translation {'unknown without a camera' if t is None else f'[{t}]'}",
@@ -342,12 +357,14 @@ class Registration:
             **self.hypotheses[0].pose_dict(),
             "quaternion": self.quaternion.tolist(),
             "T_cam_from_model": _plain(self.T_cam_from_model),
+            "frame": self._frame,
             "score": self.score,
+            "verdict": self.verdict,
             "confidence": self.confidence,
             "reliable": self.reliable,
             "warnings": [*self.warnings, *self.notes],
             "probabilities": list(self.probabilities),
-            "none": self.none,
+            "no_match_probability": self.no_match_probability,
             "ambiguous": self.ambiguous,
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
@@ -357,7 +374,7 @@ class Registration:
             "corrected_box": _plain(self.corrected_box),
             "camera": self.camera and self.camera.describe(),
             "camera_source": self.camera and self.camera.source,
-            "top": [],
+            "hypotheses": [],
         }
         for one in self.hypotheses:
             terms = {name: float(raw[0, one.view]) for name, raw in self.ranking.terms.items()}
@@ -368,12 +385,19 @@ class Registration:
                 "view": one.view,
                 "terms": terms,
             }
-            document["top"].append({**one.pose_dict(), **more})
+            document["hypotheses"].append({**one.pose_dict(), **more})
         if self.prior is not None:
             document["prior"] = {**self.prior.to_dict(), "contradiction": self.prior_contradiction}
         if self.views:
-            document["views"] = [view.to_dict() for view in self.views]
+            document["photographs"] = [view.to_dict() for view in self.views]
         return document
+
+    @property
+    def _frame(self) -> str:
+        """What the rotation and the translation are relative to."""
+        if self.views:
+            return "world"
+        return "allocentric" if self.translation is None else "camera"
 
 
 def _plain(values: Tensor | None) -> list[Any] | None:
@@ -393,6 +417,11 @@ class FailedRegistration:
     error: CurviregError
 
     ok = False
+
+    @property
+    def verdict(self) -> str:
+        """Whether the object was not found, "lost", or something else is wrong, "failed"."""
+        return verdict_of_error(self.error)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -428,7 +457,7 @@ def result_document(
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
-        "views": len(bank),
+        "bank_views": len(bank),
         **result.to_dict(),
         "symmetries": 1 if symmetries is None else len(symmetries),
         "pipeline": registrar.pipeline.describe(),
@@ -521,22 +550,30 @@ def camera_in_words(document: Mapping[str, Any]) -> list[str]:
 
 
 def view_in_words(view: Mapping[str, Any]) -> str:
-    """Why a photograph of several, one of a document's ``views``, does not count, or how much it
-    does; empty if its pose was set by hand, so that nobody has compared it."""
+    """Why a photograph of several, one of a document's ``photographs``, does not count, or how
+    much it does; empty if its pose was set by hand, so that nobody has compared it."""
     counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"
     return view["failure"] or counts
 
 
-def verdict(probability: float | None, none: float | None, reliable: bool) -> str:
-    """Return "likely" for a reliable answer, "no match" if none of them is more probable than it,
-    else "unsure"."""
-    if reliable:
-        return "likely"
-    return (
-        "no match"
-        if probability is not None and none is not None and none > probability
-        else "unsure"
-    )
+def verdict_of_error(error: Exception) -> str:
+    """The verdict on a photograph without a pose: "lost" or "failed"."""
+    return "lost" if isinstance(error, LostObjectError) else "failed"
+
+
+def verdict_counts(verdicts: Mapping[str, int]) -> str:
+    """Numbers of photographs by verdict, in words; the counts of other words do not matter.
+
+    Example:
+        >>> verdict_counts({"reliable": 2, "failed": 1})
+        '2 reliable, 0 unsure, 0 no match, 0 lost, 1 failed'
+    """
+    return ", ".join(f"{verdicts.get(verdict, 0)} {verdict}" for verdict in VERDICTS)
+
+
+def line_document(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of ``result.json`` under the keys of a line of ``results.jsonl``."""
+    return {LINE_KEYS.get(key, key): value for key, value in document.items()}
 
 
 def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:

@@ -70,6 +70,7 @@ def render_depth(
         InvalidInputError, MeshError, MissingFileError, RenderingError.
 
     Example:
+        >>> import torch
         >>> K = torch.tensor([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]])
         >>> T = torch.eye(4); T[2, 3] = 4.0
         >>> depth = render_depth(trimesh.creation.box((1.0, 1.0, 1.0)), T, K, (64, 64))

@@ -121,7 +121,8 @@ def _start(pool: ThreadPoolExecutor, workers: int) -> None:
     """Start all threads of a pool, and let torch count threads for the process as before.
 
     A thread takes this number over with its first call of torch, and keeps it: those that the
-    caller starts during the jobs would compute single-threaded ever after.
+    caller starts during the jobs would compute single-threaded ever after. One that starts in the
+    moment before the number is set back still does.
     """
     with _starting:
         threads = _on_new_thread(torch.get_num_threads)

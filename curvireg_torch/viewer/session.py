@@ -463,7 +463,7 @@ class Session:
             Path(self.rig_name), views, registrar, bank_seconds=seconds
         )
         document["mesh"] = self.name(request.meshes[0])
-        for row, shot in zip(document["views"], shots, strict=True):
+        for row, shot in zip(document["photographs"], shots, strict=True):
             row["photo"] = self.name(row["photo"])
             row["camera"] = shot.view.camera.at(shot.size).describe() if shot.view else None
         boxes = [view.box for view in registration.views]
@@ -479,8 +479,8 @@ class Session:
         if registration is not result.registration:
             document |= registration.to_dict()
             if registration.views:
-                rows = zip(result.document["views"], document["views"], strict=True)
-                document["views"] = [{**row, **moved} for row, moved in rows]
+                rows = zip(result.document["photographs"], document["photographs"], strict=True)
+                document["photographs"] = [{**row, **moved} for row, moved in rows]
             if "detection" in document:
                 first, *others = document["detection"]["instances"]
                 first = {**first, "confidence": registration.confidence, **answer.pose.pose_dict()}
@@ -493,7 +493,7 @@ class Session:
         result = self.shot.require_result()
         (request, boxes), prior = result.inputs, result.registration.prior
         mesh = repr(self.usable_name(request.meshes[0]))
-        rows = result.document["views"]
+        rows = result.document.get("photographs", [])
         photos = [repr(self.usable_name(path)) for path in request.photos]
         if self.shot.is_undistorted:
             read = (

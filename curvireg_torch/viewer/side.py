@@ -11,7 +11,7 @@ from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
-from ..registration.result import pose_in_words, remarks, two_decimals, verdict, view_in_words
+from ..registration.result import pose_in_words, remarks, two_decimals, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot, numbers
@@ -24,7 +24,7 @@ DOWNLOADS = {
     "pose.glb": ("pose.glb", "model/gltf-binary"),
 }
 VERDICTS = {
-    "likely": "Nine in ten such answers are right. Look whether the contours fit all the same.",
+    "reliable": "Nine in ten such answers are right. Look whether the contours fit all the same.",
     "unsure": "It may be another of the answers below, or none. Choose the one whose contours fit.",
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose "
     "another answer.",
@@ -127,8 +127,7 @@ class Answers:
         pose = result.answer.pose
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
-        word = verdict(document["confidence"], document["none"], document["reliable"])
-        word = "by hand" if answer.edits else word
+        word = "by hand" if answer.edits else document["verdict"]
         set_text(self.word, word)
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
         set_text(self.meaning, VERDICTS[word])
@@ -157,7 +156,7 @@ class Answers:
         if shot.view is not None:
             told = [
                 (self.session.name(view["photo"]), view_in_words(view))
-                for view in document["views"]
+                for view in document["photographs"]
             ]
             lines += [f"{name}: {words}" for name, words in told if words]
         lines += [*document["warnings"], *remarks(document), *answer.edits]

@@ -16,7 +16,7 @@ from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
-from ..registration.result import pose_in_words, two_decimals, verdict
+from ..registration.result import pose_in_words, two_decimals
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from .contours import close_up, draw_window
@@ -31,7 +31,7 @@ GAP = 10  # px between pictures
 PAPER = (255, 255, 255)
 INK = (30, 30, 30)
 FAINT = (100, 100, 100)
-VERDICT_COLOURS = {"likely": (20, 125, 65), "unsure": (185, 105, 0), "no match": (190, 40, 40)}
+VERDICT_COLOURS = {"reliable": (20, 125, 65), "unsure": (185, 105, 0), "no match": (190, 40, 40)}
 LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. White: the box."
 
 
@@ -182,7 +182,7 @@ def _draw_caption(
 ) -> None:
     """Verdict and pose in words, and the meaning of the colours."""
     x, y = corner
-    word = verdict(result.confidence, result.none, result.reliable)
+    word = result.verdict
     font = ImageFont.load_default(size)
     badge = word
     if result.confidence is not None:

@@ -22,7 +22,7 @@ _PAGE = """<!DOCTYPE html>
 body {{ font: 14px/1.4 system-ui, sans-serif; margin: 1.5rem; background: #fff; color: #222 }}
 #all {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(14rem, 1fr)); gap: 1rem }}
 figure {{ margin: 0; padding: .5rem; border: 1px solid #ccc; border-top: 4px solid #b33 }}
-figure.reliable, figure.right {{ border-top-color: #2a7 }} figure.doubtful {{ border-top-color: #d90 }}
+figure.reliable, figure.right {{ border-top-color: #2a7 }} figure.unsure {{ border-top-color: #d90 }}
 img {{ width: 100%; height: 14rem; object-fit: contain; background: #eee }}
 figcaption {{ overflow-wrap: anywhere }}
 </style></head><body><h1>{title}</h1>
@@ -37,7 +37,8 @@ figcaption {{ overflow-wrap: anywhere }}
 class SheetEntry:
     """A photograph on the page: the number of its row, from 1, its name, and the outcome in words.
 
-    ``kind`` is "right" or "reliable" (green), "doubtful" (orange), "wrong" or "failed" (red);
+    ``kind`` is "right" or "wrong" where the pose is known, else the verdict: "reliable" and "right"
+    are green, "unsure" is orange, the others are red;
     ``picture`` is the file of its thumbnail; ``rank`` is smaller for better ones.
     """
 
@@ -87,4 +88,5 @@ def _figure(entry: SheetEntry) -> str:
         data = base64.b64encode(entry.picture.read_bytes()).decode()
         picture = f'<img alt="contours over {name}" src="data:image/jpeg;base64,{data}">'
     caption = f"<b>{entry.number}</b> {name}<br>{html.escape(entry.caption)}"
-    return f'<figure class="{entry.kind}">{picture}<figcaption>{caption}</figcaption></figure>'
+    kind = entry.kind.replace(" ", "-")
+    return f'<figure class="{kind}">{picture}<figcaption>{caption}</figcaption></figure>'

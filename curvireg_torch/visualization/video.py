@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import LostObjectError
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.result import two_decimals, verdict
+from ..registration.result import two_decimals
 from .contours import draw_window
 from .overlay import VERDICT_COLOURS
 
@@ -120,9 +119,7 @@ def annotated_frame(
 def caption(result: Registration | FailedRegistration) -> tuple[str, tuple[int, int, int]]:
     """How sure the result is, in words and as a colour."""
     if isinstance(result, FailedRegistration):
-        return "lost" if isinstance(result.error, LostObjectError) else "failed", VERDICT_COLOURS[
-            "no match"
-        ]
-    word = verdict(result.confidence, result.none, result.reliable)
+        return result.verdict, VERDICT_COLOURS["no match"]
+    word = result.verdict
     number = "" if result.confidence is None else f", confidence {two_decimals(result.confidence)}"
     return word + number, VERDICT_COLOURS[word]

@@ -15,7 +15,7 @@ from tests.registration.test_several import EASY, rig_of
 
 CAMERA = ["260", "260", "119.5", "89.5"]
 RESULTS = [
-    *("status", "message", "confidence", "reliable"),
+    *("verdict", "message", "confidence", "reliable"),
     *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
 ]
 RESULTS += ["tx", "ty", "tz"]

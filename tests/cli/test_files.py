@@ -36,7 +36,7 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     assert register("--list", path, folder / "truck.safetensors") == 0
     out = tmp_path / "out"
     page = (out / "index.html").read_text(encoding="utf-8")
-    assert "<h1>4 photographs: 3 ok, 1 failed" in page
+    assert "<h1>4 photographs: 0 reliable, 3 unsure, 0 no match, 0 lost, 1 failed" in page
     assert not re.search(r'<script>alert|(src|href)="(?!data:)|http', page)
     figures = re.findall(r'<figure class="(\w+)">(.*?)</figure>', page, flags=re.DOTALL)
     # Nothing is calibrated: the order is that of the list.
@@ -45,7 +45,7 @@ def test_list_page_shows_every_row_best_first(folder, register, tmp_path):
     for row, (_, text) in zip(np.roll(table(out), -1), figures, strict=True):
         assert html.escape(row["photo"]) in text
         pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', text)
-        assert len(pictures) == (row["status"] == "ok")
+        assert len(pictures) == (row["verdict"] != "failed")
         for picture in pictures:
             pixels = cv2.imdecode(
                 np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR
@@ -85,7 +85,7 @@ def test_pose_for_ros_is_in_metres(tmp_path):
         "translation": [1000.0, -2000.0, 500.0],
         "quaternion": [0.5, 0.1, 0.2, 0.3],
         "unit": "mm",
-        "views": 9,
+        "frame": "camera",
     }
     write_pose_stamped(tmp_path / "pose.yaml", document)
     text = (tmp_path / "pose.yaml").read_text()

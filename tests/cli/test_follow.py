@@ -53,12 +53,12 @@ def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     _, scenes = frames
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
     closing = capsys.readouterr().out
-    assert "4 frames: 3 of 4 believed, 0 unsure, 0 lost, 1 failed" in closing
+    assert "4 frames: 3 reliable, 0 unsure, 0 no match, 0 lost, 1 failed" in closing
     rate = re.search(r", ([\d.]+) frames per second; see", closing)
     assert rate is not None
     assert float(rate[1]) > 0.0
     rows = table(tmp_path)
-    assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
+    assert [row["verdict"] for row in rows] == ["reliable"] * 3 + ["failed"]
     for row, (_, _, T) in zip(rows, scenes, strict=False):
         check_pose(row, T, 4.0, 0.04)
     assert all(0.5 <= float(row["confidence"]) <= 1.0 for row in rows[:3])
@@ -83,7 +83,7 @@ def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
     assert follow("--camera", *CAMERA, "--out", tmp_path, "--json", source="turn.avi") == 0
     assert boxes == [frames[1][0][1].tolist(), None, None]
     printed = capsys.readouterr()
-    assert "3 of 3 believed" in printed.err
+    assert "3 frames: 3 reliable, 0 unsure" in printed.err
     lines = [json.loads(line) for line in printed.out.splitlines()]
     rows = table(tmp_path)
     assert (
@@ -92,7 +92,7 @@ def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
         == [f"turn-00000{k}" for k in range(3)]
     )
     for line, row in zip(lines, rows, strict=True):
-        assert (line["status"], line["confidence"]) == (row["status"], float(row["confidence"]))
+        assert (line["verdict"], line["confidence"]) == (row["verdict"], float(row["confidence"]))
         assert line["translation"] == [float(row[name]) for name in ("tx", "ty", "tz")]
         assert len(line["quaternion"]) == 4
     assert [line["seconds"] for line in lines] == sorted(line["seconds"] for line in lines)
@@ -125,9 +125,9 @@ def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path
         check_pose(row, T, 4.0, 0.04)
 
 
-@pytest.mark.parametrize(("confidence", "status"), [(None, "ok"), (0.2, "unsure")])
+@pytest.mark.parametrize(("confidence", "verdict"), [(None, "reliable"), (0.2, "no match")])
 def test_follow_starts_from_a_known_pose_and_its_confidence(
-    frames, follow, tmp_path, monkeypatch, confidence, status
+    frames, follow, tmp_path, monkeypatch, confidence, verdict
 ):
     """No registration confirms a doubtful one here."""
     T = frames[1][0][2]
@@ -153,7 +153,7 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
     rows = table(tmp_path / "out")
     for row, (_, _, T) in zip(rows, frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)
-    assert rows[0]["status"] == status
+    assert rows[0]["verdict"] == verdict
 
 
 @pytest.mark.parametrize(("source", "code"), [("shots", 130), ("0", 0)])
@@ -175,12 +175,12 @@ def test_follow_keeps_the_poses_before_an_interruption(
         monkeypatch.setattr(cv2, "VideoCapture", lambda _: capture(file))
     monkeypatch.setattr(OverlayVideo, "add", interrupted)
     assert follow("--camera", *CAMERA, "--out", tmp_path, source=source) == code
-    statuses = [row["status"] for row in table(tmp_path)]
+    verdicts = [row["verdict"] for row in table(tmp_path)]
     if source == "0":
-        assert statuses == ["ok"]
+        assert verdicts == ["reliable"]
         assert not (tmp_path / "overlay.mp4").exists()
     else:
-        assert statuses == ["ok", "ok"]
+        assert verdicts == ["reliable", "reliable"]
         assert [image.shape for _, image in Video(tmp_path / "overlay.mp4")] == [(3, 180, 240)]
 
 
@@ -196,10 +196,10 @@ def test_follow_keeps_no_pose_in_memory_and_writes_each_at_once(follow, tmp_path
     monkeypatch.setattr(OverlayVideo, "add", watched)
     tally = Tally()
     for number in range(1000):
-        tally.add({"status": "ok", "rotation": [number]}, 0.5)
+        tally.add({"verdict": "reliable", "rotation": [number]}, 0.5)
     assert len(pickle.dumps(tally)) < 300
     assert str(tally).startswith(
-        "1000 frames: 1000 of 1000 believed, 0 unsure, 0 lost, 0 failed, 2.0 frames per"
+        "1000 frames: 1000 reliable, 0 unsure, 0 no match, 0 lost, 0 failed, 2.0 frames per"
     )
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 0
     assert rows == [1, 2, 3, 4]
@@ -215,5 +215,5 @@ def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):
 def test_the_message_of_a_tally_is_that_of_the_first_frame():
     tally = Tally()
     for message in ("first", "second"):
-        tally.add({"status": "failed", "message": message}, 1.0)
+        tally.add({"verdict": "failed", "message": message}, 1.0)
     assert (tally.first_message, tally.frames) == ("first", 2)

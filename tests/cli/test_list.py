@@ -86,35 +86,34 @@ def test_list_reports_every_row_in_order(register_list, tmp_path, capsys):
         zip(ROWS, rows, documents, strict=True), start=1
     ):
         assert [row[name] for name in names][: len(cells)] == cells
-        assert (document["row"], document["status"], document["message"]) == (
+        assert (document["row"], document["verdict"], document["message"]) == (
             number,
-            row["status"],
+            row["verdict"],
             row["message"],
         )
         if isinstance(expected, str):
             (message,) = row["message"].splitlines()
             assert expected in message
-            assert [row[name] for name in ("status", *RESULTS[2:])] == [
+            assert [row[name] for name in ("verdict", *RESULTS[2:])] == [
                 "failed",
                 "",
                 "false",
                 *[""] * 12,
             ]
         else:
-            assert (row["status"], row["message"]) == ("ok", "")
+            assert (row["verdict"], row["message"]) == ("unsure", "")
             assert (row["confidence"], row["reliable"]) == ("", "false"), "not calibrated"
             R = torch.tensor(document["rotation"], dtype=torch.float64)
             assert expected is None or float(rotation_error(R, scene(expected)[2][:3, :3])) < 15
             assert [[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)] == R.tolist()
     check_pose(rows[0], scene(0)[2], 15.0, 0.1)
-    assert [rows[1][name] for name in ("tx", "ty", "tz")] == [""] * 3
+    assert "" not in [rows[1][name] for name in ("tx", "ty", "tz")], "of an estimated camera"
+    assert (documents[0]["camera_source"], documents[1]["camera_source"]) == ("given", "estimated")
     assert documents[0]["columns"] == dict(zip(names, ROWS[0][0], strict=True))
     reliable = sum(row["reliable"] == "true" for row in rows)
     printed = capsys.readouterr().out.strip()
-    assert (
-        printed.splitlines()[-1]
-        == f"14 photographs: 4 ok, 10 failed, {reliable} reliable; see {out}/results.csv"
-    )
+    verdicts = f"{reliable} reliable, {4 - reliable} unsure, 0 no match, 0 lost, 10 failed"
+    assert printed.splitlines()[-1] == f"14 photographs: {verdicts}; see {out}/results.csv"
 
 
 def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch):
@@ -139,13 +138,13 @@ def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch)
     rows = [[mesh, "photos/0.png", *box_of(0)] for mesh in meshes]
     assert register_list("meshes.csv", f"mesh,{HEADER}", *rows) == 0
     found = table(tmp_path / "out")
-    assert [row["status"] for row in found] == [
-        "ok",
-        "ok",
-        "ok",
+    assert [row["verdict"] for row in found] == [
+        "unsure",
+        "unsure",
+        "unsure",
         "failed",
         "failed",
-        "ok",
+        "unsure",
         "failed",
     ]
     assert "none.ply" in found[3]["message"]
@@ -153,13 +152,13 @@ def test_list_opens_each_mesh_once(folder, register_list, tmp_path, monkeypatch)
     assert opened == ["truck.safetensors", "other.safetensors", "cut.safetensors"]
     assert register_list("meshes.csv", f"mesh,{HEADER}", *rows, mesh=None, out="no mesh") == 0
     found = table(tmp_path / "no mesh")
-    assert [row["status"] for row in found] == [
+    assert [row["verdict"] for row in found] == [
         "failed",
-        "ok",
+        "unsure",
         "failed",
         "failed",
         "failed",
-        "ok",
+        "unsure",
         "failed",
     ]
     assert "no MESH" in found[0]["message"]
@@ -183,7 +182,8 @@ LIMITED = [
         {"viewpoint": [180.0, 20.0, 0.0], "within": 45.0, "elevation": [-10.0, 80.0]},
     ),
     ("", "", {"elevation": [-10.0, 80.0]}),
-    ("distance", "1 2", "distance: needs the camera"),
+    ("distance", "1 2", {"distance": [1.0, 2.0], "elevation": [-10.0, 80.0]}),
+    ("distance", "1", "distance: expected"),
     ("azimuth", "140", "azimuth: expected LOW HIGH"),
     ("azimuth", "from 140", "azimuth: expected LOW HIGH, finite numbers, got 'from 140'"),
     ("side", "top", "side"),
@@ -203,10 +203,10 @@ def test_list_has_limits_of_each_row(register_list, tmp_path):
     assert register_list("limited.csv", header, *([*photo, *row] for row in rows), words=words) == 0
     for (*_, expected), row in zip(LIMITED, lines(tmp_path / "out"), strict=True):
         if isinstance(expected, str):
-            assert row["status"] == "failed"
+            assert row["verdict"] == "failed"
             assert expected in row["message"]
         else:
-            assert row["status"] == "ok"
+            assert row["verdict"] != "failed"
             assert {k: v for k, v in row["prior"].items() if k != "contradiction"} == expected
 
 
@@ -221,15 +221,16 @@ def test_register_files_folders_and_patterns(folder, register, document, refused
         *(str(photos / name) for name in names),
         str(folder / "none.png"),
     ]
-    assert ([row["status"] for row in rows], capsys.readouterr().err) == (
-        ["ok"] * 6 + ["failed"],
+    assert ([row["verdict"] for row in rows], capsys.readouterr().err) == (
+        ["unsure"] * 6 + ["failed"],
         "",
     )
     assert register(photos / "2.png", bank, out="one") == 0
     alone = document("one")
     listed = lines(tmp_path / "out")[0]
-    for key in ("rotation", "score", "confidence", "top", "pipeline"):
+    for key in ("rotation", "score", "confidence", "verdict", "pipeline"):
         assert alone[key] == listed[key], key
+    assert (alone["hypotheses"], alone["no_match_probability"]) == (listed["top"], listed["none"])
     assert not (tmp_path / "one" / "results.csv").exists()
     refused(register(folder / "nothing*.png", bank), "nothing*.png: no photographs")
 
@@ -282,7 +283,7 @@ def test_register_every_nth_frame_of_a_video(folder, register, refused, tmp_path
     assert register(folder / "turn.avi", bank, "--every", "2") == 0
     rows = table(tmp_path / "out")
     assert [row["photo"] for row in rows] == [f"{folder / 'turn.avi'}:00000{n}" for n in (0, 2, 4)]
-    assert [row["status"] for row in rows] == ["ok"] * 3
+    assert [row["verdict"] for row in rows] == ["unsure"] * 3
     assert not list((tmp_path / "out").rglob("*.png")), "no frame is written"
     entries = list_photographs(RegisterOptions((folder / "turn.avi",)), every=2)
     for entry, expected in zip(entries, (frames[0], frames[2], frames[1]), strict=True):
@@ -301,7 +302,7 @@ def test_boxes_of_a_detector_are_found_by_the_name_of_each_photograph(folder, re
     words = "--boxes", tmp_path / "boxes.json", "--no-refine"
     assert register(folder / "photos", folder / "truck.safetensors", *words, out="boxes") == 0
     rows = lines(tmp_path / "boxes")
-    assert [row["status"] for row in rows] == ["ok", "ok", "failed"]
+    assert [row["verdict"] for row in rows] == ["unsure", "unsure", "failed"]
     assert rows[0]["inputs"]["box"] == pytest.approx(
         [x0 - 0.5, y0 - 0.5, x1 - 0.5, y1 - 0.5], abs=1e-3
     )
@@ -332,13 +333,13 @@ def test_photographs_of_telephones_in_folders_and_alone(folder, register, tmp_pa
     heic.save(shots / "IMG_2.HEIC", quality=95, exif=exif(1, 38))
     cv2.imwrite(str(shots / "IMG_1.JPG"), pixels[..., ::-1])
     assert register(shots, folder / "truck.safetensors", "--box", *box_of(0)) == 0
-    assert [(row["inputs"]["photo"][-10:], row["status"]) for row in lines(tmp_path / "out")] == [
-        ("/IMG_1.JPG", "ok"),
-        ("IMG_2.HEIC", "ok"),
+    assert [(row["inputs"]["photo"][-10:], row["verdict"]) for row in lines(tmp_path / "out")] == [
+        ("/IMG_1.JPG", "unsure"),
+        ("IMG_2.HEIC", "unsure"),
     ]
     # counted, not left out, where there is no decoder
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     assert register(shots, folder / "truck.safetensors", "--box", *box_of(0), out="without") == 0
     jpeg, missing = lines(tmp_path / "without")
-    assert jpeg["status"] == "ok"
+    assert jpeg["verdict"] != "failed"
     assert "HEIC needs pi-heif: pip install 'curvireg_torch[heic]'" in missing["message"]

@@ -21,10 +21,10 @@ def test_register_writes_result_and_overlay(register_one, document, tmp_path, ca
     result = document()
     # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     check_pose(result, scene(0)[2], 15.0, 0.05)
-    assert len(result["top"]) == 3
+    assert len(result["hypotheses"]) == 3
     assert cv2.imread(str(tmp_path / "out" / "overlay.png")).std() > 20
     assert (np.shape(result["covariance"]), len(result["probabilities"])) == ((6, 6), 3)
-    assert sum(result["probabilities"]) + result["none"] == pytest.approx(1.0)
+    assert sum(result["probabilities"]) + result["no_match_probability"] == pytest.approx(1.0)
     deviations = result["standard_deviations"]
     assert deviations["translation"] == pytest.approx(
         [result["covariance"][i][i] ** 0.5 for i in (3, 4, 5)]
@@ -120,7 +120,7 @@ def test_register_equals_registrar_bit_by_bit(folder, register_one, document, mo
     for name in ("rotation", "translation"):
         assert written[name] == getattr(result, name).tolist()
     assert (written["score"], written["confidence"]) == (result.score, result.confidence)
-    assert [top["rotation"] for top in written["top"]] == [
+    assert [one["rotation"] for one in written["hypotheses"]] == [
         h.rotation.tolist() for h in result.hypotheses
     ]
     assert written["pipeline"] == registrar.pipeline.describe()
@@ -139,7 +139,7 @@ def test_register_limits_the_pose(register_one, document):
         "elevation": [-90, 90],
         "contradiction": "better outside",
     }
-    for pose in result["top"]:
+    for pose in result["hypotheses"]:
         assert (pose["viewpoint"]["azimuth"] - low) % 360 <= 80 + 1e-6
 
 
@@ -281,7 +281,7 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(
     pose["translation"][0] += 100.0
     path.write_text(json.dumps(pose))
     assert register_one(*words, box=()) == 2
-    assert document()["status"] == "lost"
+    assert document()["verdict"] == "lost"
     assert "outside the photograph" in capsys.readouterr().err
 
 

@@ -53,12 +53,17 @@ def test_views_write_one_pose_in_the_world(rig, folder, tmp_path, capsys):
     document = json.loads((tmp_path / "result.json").read_text())
     check_pose(document, WORLD, 1.5, SHARE)
     assert (document["frame"], document["T_cam_from_model"]) == ("world", None)
-    assert [view["photo"] for view in document["views"]] == [
+    assert [view["photo"] for view in document["photographs"]] == [
         str(place / row[0]) for row in [*rows, ["none.png"]]
     ]
-    assert [view["failure"] is None for view in document["views"]] == [True, True, True, False]
-    assert "no such file" in document["views"][3]["failure"]
-    assert document["views"][0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
+    assert [view["failure"] is None for view in document["photographs"]] == [
+        True,
+        True,
+        True,
+        False,
+    ]
+    assert "no such file" in document["photographs"][3]["failure"]
+    assert document["photographs"][0]["camera"]["matrix"][0] == [260.0, 0.0, 119.5]
     w, *xyz = document["quaternion"]
     R = Rotation.from_quat([*xyz, w]).as_matrix()
     assert pytest.approx(torch.tensor(document["rotation"]).numpy(), abs=1e-6) == R

@@ -26,9 +26,9 @@ def test_evaluate_pascal3d(pascal, tmp_path):
     assert skipped["missing_image"] == 1, "objects that the dataset leaves out are counted"
     assert "other_class" not in skipped, "objects of other classes are not"
     rows = rows_of(benchmark, tmp_path / "out")
-    found = {key: (row.get("skipped"), row["status"]) for key, row in rows.items()}
+    found = {key: (row.get("skipped"), row["verdict"]) for key, row in rows.items()}
     scored = dict.fromkeys(
-        ("car/2008_000001/0", "car/2008_000002/1", "car/2008_000002/2"), (None, "ok")
+        ("car/2008_000001/0", "car/2008_000002/1", "car/2008_000002/2"), (None, "unsure")
     )
     broken = {"car/2008_000003/8": "unreadable_image", "sofa/2008_000002/0": "unreadable_mesh"}
     assert found == {**scored, **{key: (reason, "failed") for key, reason in broken.items()}}

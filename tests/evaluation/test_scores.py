@@ -19,7 +19,7 @@ from tests._support.miniature import pascal_object, write_image, write_mesh, wri
 
 SECONDS = {"bank": 2.0, "register": 0.5}
 PICTURE = {"width": 80, "height": 60}
-FAILED = {"status": "failed", "message": "?"}
+FAILED = {"verdict": "failed", "message": "?"}
 
 
 def rotated(sample, axis, degrees):
@@ -44,7 +44,7 @@ def scores_of(benchmark, out, rows):
         head = {
             "key": entry.key,
             "digests": {"request": ""},
-            "status": "ok",
+            "verdict": "reliable",
             "message": "",
             "seconds": SECONDS,
         }

@@ -131,13 +131,15 @@ def test_evaluation_scores_the_pose_in_the_first_photograph(trucks, tmp_path):
     summary = run(benchmark, tmp_path / "out")
     assert summary["protocol"] == "cad=annotated pose=any box=annotated views=3 seed=0"
     assert (summary["n"], summary["failed"], summary["skipped"]) == (7, 0, {"unreadable_image": 1})
-    rows = [row for row in rows_of(benchmark, tmp_path / "out").values() if row["status"] == "ok"]
+    rows = [
+        row for row in rows_of(benchmark, tmp_path / "out").values() if row["verdict"] != "failed"
+    ]
     failures = Counter()
     for row in rows:
-        assert len(row["views"]) == 3
-        np.testing.assert_allclose(row["views"][0]["rotation"], row["rotation"])
-        np.testing.assert_allclose(row["views"][0]["translation"], row["translation"])
-        failures.update(view["failure"] is not None for view in row["views"])
+        assert len(row["photographs"]) == 3
+        np.testing.assert_allclose(row["photographs"][0]["rotation"], row["rotation"])
+        np.testing.assert_allclose(row["photographs"][0]["translation"], row["translation"])
+        failures.update(view["failure"] is not None for view in row["photographs"])
     drawn = sum(
         view.photo == broken
         for entry in benchmark.entries

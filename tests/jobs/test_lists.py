@@ -75,7 +75,7 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
     for settings in ({"top": 1}, {"top": 2}):
         done.clear()
         for _ in range(2):
-            assert register_rows(rows, tmp_path / "out", registrar, settings).ok == 5
+            assert register_rows(rows, tmp_path / "out", registrar, settings).posed == 5
         assert done == rows[:4], "equal rows are registered once"
 
 
@@ -93,14 +93,14 @@ def test_names_that_are_not_utf8_do_not_end_a_list(registrar, entry, tmp_path):
     (folder / os.fsdecode(b"gar\xe7on.png")).write_text("no picture")
     photos = list_photographs(RegisterOptions((folder,), entry.meshes, entry.box))
     counts = register_rows(photos, tmp_path / "out", registrar)
-    assert (counts.ok, len(counts.failures)) == (1, 1)
+    assert (counts.posed, len(counts.failures)) == (1, 1)
     assert r"gar\udce7on.png" in counts.failures[0]
     rows = table(tmp_path / "out")
     assert [os.path.basename(row["photo"]) for row in rows] == [
         r"caf\udce9.png",
         r"gar\udce7on.png",
     ]
-    assert [row["status"] for row in rows] == ["ok", "failed"]
+    assert [row["verdict"] for row in rows] == ["unsure", "failed"]
     assert r"caf\udce9.png" in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
 
 

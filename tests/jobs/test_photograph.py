@@ -106,7 +106,7 @@ def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
 def test_result_is_shown_in_ten_lines_and_in_notebooks(result):
     lines = repr(result).splitlines()
     assert len(lines) <= 10
-    assert lines[0].startswith("Registration: likely, confidence ")
+    assert lines[0].startswith("Registration: reliable, confidence ")
     assert len(repr(result)) < 800
     shown = result._repr_html_()
     assert shown.startswith('<img alt="contours on the photograph" src="data:image/jpeg;base64,')

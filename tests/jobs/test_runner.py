@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
+from curvireg_torch.data.pose_files import PoseFile
 from curvireg_torch.errors import InvalidInputError, MeshError
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
@@ -53,7 +54,7 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         assert str(registrar) == entry.meshes[0].name
         first = sum(label[1] == entry.label[1] for label in labels) == 1
         assert (bank_seconds > 0) == first, "the first pays for the bank"
-        return {"status": "ok"}
+        return {"verdict": "reliable"}
 
     def open_registrar(meshes):
         assert not any(reference() for reference in opened), (
@@ -160,11 +161,15 @@ VIEWS = (View("z.png", Path("z.png"), None, CAMERA, torch.eye(4)),)
 OTHERS = {
     "name": "y.png",
     "instances": 2,
-    "start_confidence": 0.5,
     "as_stored": True,
     "views": VIEWS,
 }
-OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": ((1.0, 0.0, 0.0, 0.0),)}
+OTHERS |= {"prior": PosePrior(distance=(1.0, 2.0)), "start": PoseFile(torch.eye(4))}
+STARTS = (
+    PoseFile(2.0 * torch.eye(4)),
+    PoseFile(torch.eye(4), unit="mm"),
+    PoseFile(torch.eye(4), confidence=0.5),
+)
 BOXES = ((1.0, 2.0, 3.0, 4.25), None)
 CAMERAS = (replace(CAMERA, size=(5, 6)), None, "exif", 50.0)
 
@@ -179,6 +184,10 @@ def test_request_covers_every_option_and_other_views():
         changed = replace(ENTRY, **{name: value})
         assert changed.request() != ENTRY.request() == replace(ENTRY).request(), (name, value)
         assert changed.key != ENTRY.key == replace(ENTRY, cells={"note": "y"}).key, (name, value)
+    started = replace(ENTRY, start=OTHERS["start"])
+    for start in STARTS:
+        changed = replace(ENTRY, start=start)
+        assert changed.request() != started.request() != ENTRY.request(), start
     values = {
         "box": (1.0, 2.0, 3.0, 4.0),
         "camera": Camera(2 * torch.eye(3) - torch.diag(torch.tensor([0.0, 0, 1]))),

@@ -160,17 +160,14 @@ def test_only_the_default_pipeline_is_calibrated():
 def test_uncalibrated_pipeline_gives_no_number():
     image, box, _ = scene(0)
     result = truck_registrar()([image], box[None], CAMERA)[0]
-    assert (result.confidence, result.none, result.probabilities, result.ambiguous) == (
-        None,
-        None,
-        (),
-        None,
-    )
+    assert result.confidence is result.no_match_probability is result.ambiguous is None
+    assert result.probabilities == ()
     assert not result.reliable
     assert result.covariance is None
     assert result.hypotheses[0].covariance is not None
     document = json.loads(json.dumps(result.to_dict(), allow_nan=False))
-    assert (document["confidence"], document["none"], document["probabilities"]) == (None, None, [])
+    assert (document["confidence"], document["no_match_probability"]) == (None, None)
+    assert document["probabilities"] == []
 
 
 @pytest.mark.parametrize(("seed", "camera"), [(0, CAMERA), (1, None)])
@@ -197,7 +194,7 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
         result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]
     )
     assert len(result.probabilities) == len(result.hypotheses)
-    assert sum(result.probabilities) + result.none == pytest.approx(1.0)
+    assert sum(result.probabilities) + result.no_match_probability == pytest.approx(1.0)
 
 
 def test_confidence_is_higher_for_the_object_than_for_clutter():

@@ -57,7 +57,8 @@ def registered(benchmark, case):
     assert len({entry.meshes for entry, _ in chosen}) == 1
     mesh = cr.load_mesh(chosen[0][0].meshes[0], unit=benchmark.unit)
     pipeline = cr.Pipeline().with_pose_prior(benchmark.protocol.pose)
-    registrar = cr.Registrar(cr.ViewBank.build(mesh, pipeline=pipeline, progress=False))
+    bank = cr.ViewBank.build(mesh, pipeline=pipeline, progress=False)
+    registrar = cr.Registrar(bank, mesh_is="exact" if benchmark.gives_camera else "similar")
     for entry, known in chosen:
         yield (
             known,

@@ -70,7 +70,8 @@ def test_refine_refuses_wrong_arguments_and_a_start_that_does_not_show_the_mesh(
     for move, message in (
         ((0.0, 0.0, -100.0), "outside the photograph"),
         ((50.0, 0.0, 0.0), "outside the photograph"),
-        ((0.0, 0.0, 1000.0), "less than 12 px wide; check unit and distance"),
+        ((0.0, 0.0, 100.0), "less than 12 px wide; check unit and distance"),
+        ((0.0, 0.0, 1000.0), "the translation is about 1000 times too large"),
     ):
         image, _, T = scene(0)
         T = T.clone()

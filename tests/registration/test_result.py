@@ -2,6 +2,7 @@
 words."""
 
 import json
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,18 +10,21 @@ import pytest
 import torch
 
 from curvireg_torch import Registration
+from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_viewpoint
 from curvireg_torch.geometry.pose_prior import object_frame
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration import Detection, Hypothesis
+from curvireg_torch.registration import Detection, FailedRegistration, Hypothesis
 from curvireg_torch.registration.result import (
+    VERDICTS,
     ambiguity,
     detection_document,
+    line_document,
     pose_in_words,
     remarks,
     result_document,
     two_decimals,
-    verdict,
+    verdict_counts,
 )
 
 
@@ -74,9 +78,16 @@ def test_to_dict_replaces_unbounded_deviations_by_null():
 
 def test_result_document_leaves_out_terms_that_did_not_compare_a_view():
     document = result_document(registration(), REGISTRAR, {"bank": 1.0})
-    assert [list(pose["terms"]) for pose in document["top"]] == [["hog", "appearance"], ["hog"]]
-    assert [pose["score"] for pose in document["top"]] == pytest.approx([0.7, 0.6])
-    assert (document["views"], document["unit"], document["seconds"]) == (2, "mm", {"bank": 1.0})
+    assert [list(pose["terms"]) for pose in document["hypotheses"]] == [
+        ["hog", "appearance"],
+        ["hog"],
+    ]
+    assert [pose["score"] for pose in document["hypotheses"]] == pytest.approx([0.7, 0.6])
+    assert (document["bank_views"], document["unit"], document["seconds"]) == (
+        2,
+        "mm",
+        {"bank": 1.0},
+    )
     assert document["symmetries"] == 3
     assert "3 orientations" in remarks(document)[0]
     json.dumps(document, allow_nan=False)
@@ -139,9 +150,36 @@ def test_pose_and_verdict_in_words():
             assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
     # A high confidence that is not reliable, because of a questionable camera, is no reason to be
     # sure.
-    assert (verdict(0.95, 0.03, True), verdict(0.95, 0.03, False)) == ("likely", "unsure")
-    assert (verdict(0.4, 0.39, False), verdict(0.4, 0.41, False)) == ("unsure", "no match")
-    assert verdict(None, None, False) == "unsure"
+    sure = replace(registration(covariance=0.01 * torch.eye(6).double()), probabilities=(0.95,))
+    doubtful = replace(sure, warnings=("the camera is questionable",))
+    assert (sure.verdict, doubtful.verdict) == ("reliable", "unsure")
+    for probabilities, word in (
+        ((0.4, 0.21), "unsure"),
+        ((0.4, 0.19), "no match"),
+        ((0.5,), "unsure"),
+        ((), "unsure"),
+    ):
+        assert replace(sure, probabilities=probabilities).verdict == word
+
+
+def test_photographs_without_a_pose_have_a_verdict_too():
+    lost = FailedRegistration(LostObjectError("not found"))
+    failed = FailedRegistration(InvalidInputError("no such file"))
+    assert (lost.verdict, failed.verdict) == ("lost", "failed")
+    assert VERDICTS[3:] == ("lost", "failed")
+    words = verdict_counts(Counter(["lost", "reliable", "reliable"]))
+    assert words == "2 reliable, 0 unsure, 0 no match, 1 lost, 0 failed"
+
+
+def test_lines_of_results_jsonl_keep_their_keys():
+    document = registration(confidence=0.5).to_dict()
+    line = line_document(document)
+    assert line["top"] == document["hypotheses"]
+    assert line["none"] == document["no_match_probability"]
+    assert not {"hypotheses", "no_match_probability"} & line.keys()
+    assert not {"top", "none"} & document.keys()
+    others = document.keys() - {"hypotheses", "no_match_probability"}
+    assert {key: line[key] for key in others} == {key: document[key] for key in others}
 
 
 def test_confidence_is_never_shown_as_more_than_it_is():
@@ -169,7 +207,10 @@ def test_ambiguity():
     hypotheses = tuple(replace(h, allocentric_rotation=R) for h, R in pairs)
     for second, word in ((0.31, "mirror"), (0.29, None)):
         result = replace(found, hypotheses=hypotheses, probabilities=(0.6, second))
-        assert (result.ambiguous, result.none) == (word, pytest.approx(0.4 - second))
+        assert (result.ambiguous, result.no_match_probability) == (
+            word,
+            pytest.approx(0.4 - second),
+        )
 
 
 def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_determine():

@@ -81,16 +81,22 @@ def test_write_file_keeps_the_old_content_if_interrupted(
 ) -> None:
     monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(number))
     monkeypatch.setattr("curvireg_torch.matching.list_cache", lambda: files.write_file(path, NEW))
-    before = [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]
-    # a shell ignores it for jobs in the background
-    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handlers = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    # a shell ignores the first for jobs in the background, nohup the last
+    before = {name: signal.signal(name, handler) for name, handler in handlers.items()}
     try:
         with pytest.raises(SystemExit, match=str(code)):
             sys.exit(main(["cache"]))
+        after = {name: signal.getsignal(name) for name in handlers}
     finally:
-        signal.signal(signal.SIGINT, ignored)
+        for name, handler in before.items():
+            signal.signal(name, handler)
     assert (path.read_bytes(), list(path.parent.iterdir())) == (OLD, [path])
-    assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)] == before
+    assert after == handlers
 
 
 def test_a_command_below_nohup_outlives_its_terminal() -> None:

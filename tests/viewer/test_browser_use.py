@@ -134,7 +134,7 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
     browser.wait(lambda: browser.part("answer-2").get_attribute("aria-pressed") == "true", "chosen")
     assert browser.part("answer-1").get_attribute("aria-pressed") == "false"
     second = saved(browser)
-    assert second["rotation"] == first["top"][1]["rotation"] != first["rotation"]
+    assert second["rotation"] == first["hypotheses"][1]["rotation"] != first["rotation"]
     for name, start in (("pose.glb", b"glTF"), ("overlay.png", b"\x89PNG")):
         browser.click(f"download-{name.replace('overlay.png', 'picture')}")
         assert browser.downloaded(name).startswith(start)
@@ -220,9 +220,9 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "contradicted")
     browser.wait(lambda: browser.part("turn-the-hint-around"), "repair")
-    assert browser.text("verdict") != "likely"
+    assert browser.text("verdict") != "reliable"
     browser.click("turn-the-hint-around")
-    browser.wait(lambda: browser.text("verdict") == "likely", "the right way round")
+    browser.wait(lambda: browser.text("verdict") == "reliable", "the right way round")
     browser.click("no-hint")
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "as before")
@@ -439,7 +439,7 @@ def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):
     browser.click("download-result.json")
     document = json.loads(browser.downloaded("result.json"))
     assert document["frame"] == "world"
-    assert [view["photo"] for view in document["views"]] == ["table-4.png", "table-5.png"]
+    assert [view["photo"] for view in document["photographs"]] == ["table-4.png", "table-5.png"]
     assert float(rotation_error(torch.tensor(document["rotation"]), torch.eye(3))) < 3
     browser.picture("viewer-rig")
     browser.click("no-rig")

@@ -54,10 +54,13 @@ def test_a_signal_removes_the_uploads_and_no_program_is_told_the_address(tmp_pat
     environment |= {"BROWSER": f"{browser} %s", "SEEN": str(seen), "TMPDIR": str(tmp_path)}
     environment |= {"PYTHONPATH": str(Path.cwd()), "CURVIREG_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "curvireg_torch", "view", "--host", host]
-    with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True
-        )
+    before = signal.signal(number, signal.SIG_DFL)  # a process below nohup inherits that it ignores
+    try:
+        with (tmp_path / "log").open("w") as log:
+            pipes = {"stdout": subprocess.PIPE, "stderr": log, "text": True}
+            process = subprocess.Popen(command, env=environment, **pipes)
+    finally:
+        signal.signal(number, before)
     try:
         address = re.search(r"http://\S+", process.stdout.readline())[0]
         wait(seen.is_file)

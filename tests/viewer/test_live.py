@@ -111,7 +111,7 @@ def test_the_page_shows_each_pose_until_ctrl_c(tmp_path, monkeypatch, capsys):
     assert [json.loads(line)["frame"] for line in printed.out.splitlines()] == [
         f"frame-00000{k}" for k in range(3)
     ]
-    assert "3 frames: 3 of 3 believed" in printed.err
+    assert "3 frames: 3 reliable" in printed.err
     ((address, page, policy),) = pages
     assert address in printed.err
     assert "live" in page

@@ -73,12 +73,12 @@ def test_a_rig_on_the_page_gives_the_files_of_the_command(workspace, rig, tmp_pa
     document = json.loads(to_json(session.document()))
     assert float(rotation_error(torch.tensor(document["rotation"]).double(), WORLD[:3, :3])) < 1.5
     assert [*document] == [*written, "viewer"]
-    for row in written["views"]:
+    for row in written["photographs"]:
         row["photo"] = Path(row["photo"]).name
     for key in document.keys() - {"viewer", "inputs", "mesh", "seconds"}:
         assert document[key] == written[key], key
     assert (document["mesh"], document["inputs"]["rig"]) == ("truck.safetensors", "rig.csv")
-    for shot, view in zip((first, second, third), document["views"], strict=True):
+    for shot, view in zip((first, second, third), document["photographs"], strict=True):
         assert (shot.projection[0][:3, :3].tolist(), shot.found_box.tolist()) == (
             view["rotation"],
             view["box"],
@@ -110,7 +110,7 @@ def test_photographs_of_no_row_and_rows_without_photograph_are_named(found):
     assert session.rig_gaps() == f"{missing}; not in the rig: other.png; registered alone"
     other, first, last = session.shots
     assert [shot.result is first.result for shot in (other, first, last)] == [False, True, True]
-    assert len(session.document()["views"]) == 2
+    assert len(session.document()["photographs"]) == 2
     assert session.command() == "", "the command would miss a photograph"
 
 
@@ -123,7 +123,7 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
         document = json.loads(to_json(session.document()))
         world = torch.tensor(document["rotation"]).double()
         assert document["rotation"] == first.answer.pose.rotation.tolist()
-        for shot, row in zip((first, last), document["views"], strict=True):
+        for shot, row in zip((first, last), document["photographs"], strict=True):
             torch.testing.assert_close(
                 shot.projection[0][:3, :3], shot.view.T_cam_from_world[:3, :3] @ world
             )
@@ -135,7 +135,7 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
         return document
 
     last.choose(1)
-    assert check()["rotation"] == first.result.document["top"][1]["rotation"]
+    assert check()["rotation"] == first.result.document["hypotheses"][1]["rotation"]
     before = first.projection[0]
     moved = first.result.moved(before, translation=(0.2, 0, 0))
     first.place(moved)
@@ -157,7 +157,7 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
     last.set_box(None)
     assert session.inputs() != first.result.inputs
     search(workspace)
-    rows = session.document()["views"]
+    rows = session.document()["photographs"]
     assert rows[0]["box"] == drawn
     assert rows[1]["box"] != list(last.box_before)
     first.set_box(before)
@@ -219,7 +219,7 @@ def test_a_distorting_camera_of_the_rig_is_waited_for_and_removed_from_its_photo
     assert session.command() == "curvireg register --views rig.csv truck.safetensors --out result"
     assert session.options.camera is None
     search(workspace)
-    assert session.document()["views"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0, 0]
+    assert session.document()["photographs"][0]["camera"]["distortion"] == [-0.2, 0, 0, 0, 0]
     asyncio.run(workspace.open_rig(None))
     assert [shot.is_undistorted for shot in session.shots] == [False, False, False]
 

@@ -76,7 +76,15 @@ def test_command_gives_the_same_result_bit_by_bit(session, registered):
     )
     written = run_command(folder, session.command())
     document = json.loads(to_json(session.document()))
-    for key in ("rotation", "translation", "score", "confidence", "covariance", "top", "pipeline"):
+    for key in (
+        "rotation",
+        "translation",
+        "score",
+        "confidence",
+        "covariance",
+        "hypotheses",
+        "pipeline",
+    ):
         assert document[key] == written[key], key
     assert document["inputs"]["box"] == written["inputs"]["box"]
     assert document["viewer"] == {"command": session.command(), "hypothesis": 0, "by_hand": []}
@@ -91,7 +99,7 @@ def test_without_a_box_the_answer_is_a_detection(session, registered):
         session.shot.choose(number)
         document = json.loads(to_json(session.document()))
         assert document["detection"]["instances"][0]["rotation"] == document["rotation"]
-    assert document["rotation"] != document["top"][1]["rotation"]
+    assert document["rotation"] != document["hypotheses"][1]["rotation"]
     assert document["rotation"] == run_command(registered[1], session.command())["rotation"]
 
 
@@ -100,18 +108,18 @@ def test_the_chosen_answer_is_the_result_with_its_own_verdict(session, registere
     first = session.document()
     session.shot.choose(1)
     document = json.loads(to_json(session.document()))
-    assert document["rotation"] == first["top"][1]["rotation"]
-    assert document["translation"] == first["top"][1]["translation"]
-    assert document["score"] == first["top"][1]["score"]
-    assert [top["rotation"] for top in document["top"]] == [
-        first["top"][k]["rotation"] for k in (1, 0)
+    assert document["rotation"] == first["hypotheses"][1]["rotation"]
+    assert document["translation"] == first["hypotheses"][1]["translation"]
+    assert document["score"] == first["hypotheses"][1]["score"]
+    assert [one["rotation"] for one in document["hypotheses"]] == [
+        first["hypotheses"][k]["rotation"] for k in (1, 0)
     ]
     assert document["viewer"]["hypothesis"] == 1
     # A pipeline that was calibrated has probabilities; each answer has its own.
     calibrated = replace(found, probabilities=(0.95, 0.03))
     session.shot.result = replace(session.shot.result, registration=calibrated)
     assert (session.document()["confidence"], session.document()["reliable"]) == (0.03, False)
-    assert (session.document()["probabilities"], session.document()["none"]) == (
+    assert (session.document()["probabilities"], session.document()["no_match_probability"]) == (
         [0.03, 0.95],
         pytest.approx(0.02),
     )
@@ -152,9 +160,16 @@ def test_a_pose_set_by_hand_is_the_result_without_a_probability(session):
         shift, torch.tensor([0.05 * describer.radius, 0, 0], dtype=torch.float64)
     )
     document = json.loads(to_json(session.document()))
-    assert document["rotation"] == pose.rotation.tolist() == document["top"][0]["rotation"]
-    assert len(document["top"]) == 2
-    for name in ("confidence", "none", "score", "edge_support", "covariance", "ambiguous"):
+    assert document["rotation"] == pose.rotation.tolist() == document["hypotheses"][0]["rotation"]
+    assert len(document["hypotheses"]) == 2
+    for name in (
+        "confidence",
+        "no_match_probability",
+        "score",
+        "edge_support",
+        "covariance",
+        "ambiguous",
+    ):
         assert document[name] is None, name
     assert (document["reliable"], document["probabilities"], document["confidence_features"]) == (
         False,

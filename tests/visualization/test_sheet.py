@@ -45,7 +45,7 @@ def test_thumbnail_draws_contours_on_the_object(scale):
 
 def test_write_sheet_shows_the_best_and_the_worst(tmp_path):
     entry = sheet.SheetEntry(
-        number=0, name="a.png", caption="", kind="doubtful", picture=tmp_path / "none.jpg"
+        number=0, name="a.png", caption="", kind="unsure", picture=tmp_path / "none.jpg"
     )
     rows = [replace(entry, number=k) for k in range(7, 0, -1)]
     sheet.write_sheet(tmp_path / "index.html", "7 photographs", rows, table="results.csv", each=2)

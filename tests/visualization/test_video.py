@@ -43,7 +43,7 @@ def test_overlay_video_has_every_frame(registered, tmp_path):
 
 
 def test_caption_says_how_sure_the_pose_is(registered):
-    for confidence, expected in ((0.95, "likely"), (0.6, "unsure"), (0.4, "no match")):
+    for confidence, expected in ((0.95, "reliable"), (0.6, "unsure"), (0.4, "no match")):
         result = replace(registered[1], probabilities=(confidence,))
         assert caption(result)[0] == f"{expected}, confidence {confidence:.2f}"
     assert (caption(LOST)[0], caption(FailedRegistration(InvalidInputError("no")))[0]) == (
