@@ -68,7 +68,7 @@ COPIED_PAGES = {
 }
 """Files outside ``docs`` and the pages of the site that show them."""
 
-SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "S", "T", "V", "W", "size"}
+SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "Precision", "S", "T", "V", "W", "size"}
 """Words in docstrings that napoleon mistakes for types, type variables, torch's Module, and private
 types."""
 

@@ -92,7 +92,7 @@ def register_options(
         limits = limits_from_options(vars(arguments))
         prior_from_limits(limits)
     except InvalidInputError as error:
-        raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
+        raise InvalidInputError(f"--{error}") from error
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     common: dict[str, Any] = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}

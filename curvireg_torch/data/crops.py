@@ -120,7 +120,7 @@ def crops(
         transform: function of each crop (3, size, size), for instance an augmentation of colours.
 
     Returns:
-        A dataset of dicts of tensors:
+        A dataset whose samples are dictionaries:
 
         - ``image`` (3, size, size) float32 in [0, 1]
         - ``rotation`` (3, 3) float32 model to OpenCV camera as annotated, NaN if unknown

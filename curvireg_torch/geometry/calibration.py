@@ -47,8 +47,8 @@ class Camera:
         size: (H, W) of the photographs that it was calibrated with; None: that of any photograph.
         focal_deviation: standard deviation of the focal length, as a fraction of it; 0 of a known
             one.
-        source: one of :data:`SOURCES`: "given"; "exif", by the metadata of the photograph's file;
-            "estimated" in the photograph itself.
+        source: "given"; "exif", by the metadata of the photograph's file; or "estimated" in the
+            photograph itself.
 
     Raises:
         InvalidInputError: an unusable matrix, a wrong number of coefficients, or a deviation that

@@ -17,7 +17,7 @@ from ..geometry.pose_prior import PosePrior
 from ..registration.inputs import ImageItem, image_items
 from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
-from .options import CAMERA_OPTIONS, RegisterOptions, prior_from_limits
+from .options import RegisterOptions, prior_from_limits
 from .views import View
 
 # standard deviation of the focal length of a given field of view, as a fraction of it
@@ -131,8 +131,10 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     if camera is not None:
         return camera, "exif"
     if given == "exif" or entry.start is not None:
-        what = "no focal length in its EXIF" if given == "exif" else "--start: needs the camera"
-        raise InvalidInputError(f"{what}; give {CAMERA_OPTIONS}", subject=entry.name)
+        is_insisted = given == "exif"
+        wanted = "no focal length in its EXIF" if is_insisted else "a start pose needs the camera"
+        message = f"{wanted}; give the camera"
+        raise InvalidInputError(message, subject=entry.name, kind="camera")
     return None, None
 
 

@@ -115,7 +115,7 @@ def register(
         camera: fx, fy, cx, cy in px, a (3, 3) camera matrix, a :class:`Camera`, or the path of a
             calibration file; "exif" insists on the focal length of the photograph's EXIF data.
             None: this one, if there is one, or else the focal length is estimated in the
-                photograph; ``result.camera`` tells which.
+            photograph; ``result.camera`` tells which.
         mask: (H, W) of the object, white, or its path; ``FILE:LABEL`` for one label of a picture of
             labels.
         prior: limits on the pose.

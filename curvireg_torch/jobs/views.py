@@ -1,6 +1,5 @@
 """Several photographs of an object in one pose, and their registration together."""
 
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..data import read_photo
-from ..errors import CurviregError, InvalidInputError
+from ..errors import CurviregError
 from ..geometry import Camera, undistorted
 from ..registration import Registrar, Registration
 
@@ -61,5 +60,4 @@ def register_views(
     try:
         return registrar.register_views(images, boxes, matrices, poses), seen
     except CurviregError as error:
-        named = re.sub(r"\bimage (\d+)\b", lambda number: views[int(number[1])].name, f"{error}")
-        raise InvalidInputError(named) from error
+        raise error.with_image_names([view.name for view in views]) from error

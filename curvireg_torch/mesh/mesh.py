@@ -52,8 +52,7 @@ def load_mesh(
             .stp, .iges, .igs and .dae.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
             None: that which the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else
-                m. An object that would be smaller
-            than 5 mm or larger than 100 m gets a warning.
+            m. An object that would be smaller than 5 mm or larger than 100 m gets a warning.
         up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
             ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
             other formats.
@@ -103,7 +102,8 @@ def load_mesh(
     if not 0.005 <= size <= 100.0:
         advice = "" if found.unit else "; if that is wrong, give the unit (mm?)"
         message = f"in unit {mesh.units!r} the object is {size:g} m across{advice}"
-        warnings.warn(CurviregWarning(message, subject=path), stacklevel=2)
+        kind = "" if found.unit else "unit"
+        warnings.warn(CurviregWarning(message, subject=path, kind=kind), stacklevel=2)
     for warning in mesh_warnings(mesh):
         warnings.warn(CurviregWarning(warning.text, subject=path), stacklevel=2)
     return mesh

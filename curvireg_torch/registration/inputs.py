@@ -201,9 +201,7 @@ def image_items(
                 raise InvalidInputError(f"{where} {message}")
             return item
         except CurviregError as error:
-            return error.with_subject(
-                ": ".join([f"image {i}", *([error.subject] if error.subject else [])])
-            )
+            return error.of_image(i)
 
     return OnDemand(item, n)
 
@@ -240,7 +238,7 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
         try:
             check_pose(pose, "T_cam_from_world")
         except InvalidInputError as error:
-            raise error.with_subject(f"image {i}") from None
+            raise error.of_image(i) from None
         same = (T[:i] - pose).flatten(1).abs().amax(dim=1) <= 1e-9 * float(pose.abs().max())
         for j in same.nonzero()[:1, 0].tolist():
             one = items[j]
@@ -251,10 +249,9 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
                 and _contradict(one, other)
             ):
                 raise InvalidInputError(
-                    f"T_cam_from_world: the same as of image {j}, which shows something else; "
-                    f"give each photograph "
-                    "the pose of its own camera",
-                    subject=f"image {i}",
+                    "T_cam_from_world: the same, but they show different things; give each "
+                    "photograph the pose of its own camera",
+                    images=(i, j),
                 )
     return T
 

@@ -217,8 +217,7 @@ class Registrar:
             boxes: (B, 4) x0, y0, x1, y1 in px; None searches for the object, see :func:`detect`.
             camera_matrices: (B, 3, 3) or (3, 3) in px, a :class:`Camera`, or a list of these. None:
                 the camera of the EXIF data; without, its focal length is estimated with the pose,
-                see :mod:`.focal`, or with a similar mesh, rotations are relative to a camera that
-                looks at the box.
+                or with a similar mesh, rotations are relative to a camera that looks at the box.
             prior: what is known of the poses in advance, one for all photographs or a list.
             masks: B masks (H, W) of the objects, white in bool, uint8 or floating in [0, 1], paths,
                 or None for some photographs with boxes. Contours are fitted to them; without boxes
@@ -403,7 +402,7 @@ class Registrar:
             try:
                 return function(item, index)
             except CurviregError as error:
-                return FailedRegistration(error.with_subject(f"image {index}"))
+                return FailedRegistration(error.with_subject("").of_image(index))
 
         return map_on_threads(run, range(len(items)), device=self.bank.device)
 

@@ -6,6 +6,7 @@ import inspect
 import re
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -87,10 +88,43 @@ def test_reference_lists_every_public_name() -> None:
         assert resolve(dotted) is getattr(curvireg_torch, name), dotted
 
 
-def test_messages_are_listed_with_what_to_do():
-    spec = importlib.util.spec_from_file_location("messages", DOCS / "messages.py")
+def module_of_docs(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_commands_is_current():
+    """``python docs/command_reference.py`` writes it."""
+    page = module_of_docs("command_reference").page()
+    assert (DOCS / "commands.md").read_text(encoding="utf-8") == page
+    for heading in ("register", "evaluate bop", "plot overlay", "cache"):
+        assert f"\n## curvireg {heading}\n" in page
+    for option in ("--top TOP", "--no-refine", "--every N", "--quiet", "--out DIR"):
+        assert f"| `{option}` |" in page
+
+
+SEARCHED = {
+    "STEP": "guides/unit-and-up.md",
+    "HEIC": "guides/photographs.md",
+    "URDF": "guides/unit-and-up.md",
+    "Unity": "guides/blender-unity.md",
+    "Blender": "guides/blender-unity.md",
+    "ONNX": "guides/layers.md",
+    "unknown focal length": "guides/no-camera.md",
+}
+
+
+@pytest.mark.parametrize(("word", "page"), SEARCHED.items())
+def test_what_people_search_for_is_on_its_page(word: str, page: str) -> None:
+    assert word in (DOCS / page).read_text(encoding="utf-8")
+
+
+def test_messages_are_listed_with_what_to_do():
+    module = module_of_docs("messages")
     photographs, meshes = module.page(ROOT / "curvireg_torch").split("## Meshes")
     assert "| frame … cannot be read | save the video again |" in photographs  # an f-string
     assert "| every face is degenerate (area 0) | repair the mesh |" in meshes

@@ -293,9 +293,17 @@ _PLAIN_SIZES = {plain(name) for name in SIZES}
 
 
 def _own_result(record: Record) -> Camera:
-    """The object "camera" of result.json: its size is height, width."""
+    """The object "camera" of result.json: its size is height, width. A focal length that was
+    estimated remains as uncertain as it was."""
     camera = plain_camera(record)
-    return camera if camera.size is None else replace(camera, size=(camera.size[1], camera.size[0]))
+    if camera.size is not None:
+        camera = replace(camera, size=(camera.size[1], camera.size[0]))
+    deviations = record.numbers("focal_deviation")
+    if not deviations:
+        return camera
+    # the metadata that an "exif" refers to are another photograph's
+    source = "estimated" if record.get("source") == "estimated" else "given"
+    return replace(camera, focal_deviation=deviations[0], source=source)
 
 
 def _ros(record: Record) -> Camera:
