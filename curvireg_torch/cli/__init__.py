@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError, CurviregWarning
-from ..evaluation.opening import CAMERA_OPTIONS
+from ..jobs.options import CAMERA_OPTIONS
 from ..utils.files import terminable
 from ..version import __version__
 from . import commands, compare, follow, inspect, register

@@ -8,8 +8,8 @@ from typing import Any
 from nicegui import ui
 
 from ..errors import MAX_VIEWER_FACES
-from ..evaluation.store import to_json
 from ..geometry import Camera, rotation_error
+from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, two_decimals, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES

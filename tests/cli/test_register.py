@@ -71,7 +71,7 @@ def test_register_upright_mesh_with_another_up_axis(
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
     monkeypatch.setattr(
-        "curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened")
+        "curvireg_torch.jobs.options.open_registrar", lambda *_: pytest.fail("opened")
     )
     refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
     refused(register_one("--camera", "exif"), "0.png", "no focal length")

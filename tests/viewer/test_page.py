@@ -9,8 +9,8 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 from nicegui.client import Client
 from nicegui.page import page
 
-from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import Camera
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer.page import Steps
 from curvireg_torch.viewer.side import Answers, Inputs, Preview
 from curvireg_torch.viewer.stage import Stage
