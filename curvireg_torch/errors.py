@@ -9,6 +9,7 @@ the limit. Readers use no network, and open only the named file and, for meshes,
 in its folder or a given one.
 """
 
+from collections.abc import Sequence
 from copy import copy
 from typing import Any, Self
 
@@ -16,18 +17,46 @@ from typing import Any, Self
 class _SubjectError(Exception):
     """Message and subject of errors and warnings."""
 
-    def __init__(self, message: str = "", *, subject: object = "") -> None:
+    def __init__(
+        self,
+        message: str = "",
+        *,
+        subject: object = "",
+        images: Sequence[int] = (),
+        causes: "Sequence[CurviregError]" = (),
+        kind: str = "",
+    ) -> None:
         super().__init__(message)
         self.message = message
         self.subject = str(subject)
+        self.images = tuple(images)
+        self.causes = tuple(causes)
+        self.kind = kind
 
     def __str__(self) -> str:
-        return f"{self.subject}: {self.message}" if self.subject else self.message
+        numbers = " and ".join(f"image {number}" for number in self.images)
+        reasons = "; ".join(map(str, self.causes))
+        parts = (numbers, self.subject, self.message, reasons)
+        return ": ".join(part for part in parts if part)
 
     def with_subject(self, subject: object) -> Self:
-        """A copy about another subject."""
+        """A copy about another subject, whatever it was about before."""
         other = copy(self)
         other.subject = str(subject)
+        other.images = ()
+        return other
+
+    def of_image(self, number: int) -> Self:
+        """A copy about the same subject in a photograph, by its number from 0."""
+        other = copy(self)
+        other.images = (number,)
+        return other
+
+    def with_image_names(self, names: Sequence[str]) -> Self:
+        """A copy that calls photographs by their names instead of numbers."""
+        named = " and ".join(names[number] for number in self.images)
+        other = self.with_subject(": ".join(part for part in (named, self.subject) if part))
+        other.causes = tuple(cause.with_image_names(names) for cause in self.causes)
         return other
 
 
@@ -38,6 +67,10 @@ class CurviregError(_SubjectError):
         message: what is wrong and what to do.
         subject: the file, photograph or option that the error is about, "" if the message names it.
             ``str(error)`` is ``"subject: message"``.
+        images: numbers from 0 of the photographs, of several, that the error is about.
+        causes: errors of single photographs, which together are the reason.
+        kind: what would help, for programs that know how to give it, such as "camera" or "unit";
+            "" for everything else. The command line adds its options.
 
     Example:
         >>> error = ImageError("truncated; download it again", subject="photo.jpg")

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError, CurviregWarning
+from ..jobs.options import with_advice
 from ..utils.files import terminable
 from ..version import __version__
 from . import commands, compare, follow, inspect, register
@@ -92,10 +93,11 @@ def _run(arguments: argparse.Namespace) -> int:
         except (CurviregError, OSError) as error:
             if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
-            advice = (
-                "" if isinstance(error, CurviregError) else "; check that it exists and can be read"
-            )
-            print(f"curvireg: error: {error}{advice}", file=sys.stderr)
+            if isinstance(error, CurviregError):
+                text = with_advice(error)
+            else:
+                text = f"{error}; check that it exists and can be read"
+            print(f"curvireg: error: {text}", file=sys.stderr)
             return 2
 
 

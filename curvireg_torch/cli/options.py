@@ -1,5 +1,5 @@
 """Commands and their arguments, from the declarations in
-:mod:`curvireg_torch.evaluation.opening`."""
+:mod:`curvireg_torch.jobs.options`."""
 
 import argparse
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, MissingDependencyError
-from ..evaluation.opening import (
+from ..jobs.options import (
     PRIOR_OPTIONS,
     Numbers,
     RegisterOptions,
@@ -92,7 +92,7 @@ def register_options(
         limits = limits_from_options(vars(arguments))
         prior_from_limits(limits)
     except InvalidInputError as error:
-        raise InvalidInputError(f"--{error}".replace("--viewpoint:", "--near:", 1)) from error
+        raise InvalidInputError(f"--{error}") from error
     check_camera(given.get("camera"), given.get("guess"))
     check_device(given.get("device", "cpu"), "--device")
     common: dict[str, Any] = {"photos": tuple(photos), "meshes": tuple(meshes), "limits": limits}

@@ -102,7 +102,8 @@ def load_mesh(
     if not 0.005 <= size <= 100.0:
         advice = "" if found.unit else "; if that is wrong, give the unit (mm?)"
         message = f"in unit {mesh.units!r} the object is {size:g} m across{advice}"
-        warnings.warn(CurviregWarning(message, subject=path), stacklevel=2)
+        kind = "" if found.unit else "unit"
+        warnings.warn(CurviregWarning(message, subject=path, kind=kind), stacklevel=2)
     for warning in mesh_warnings(mesh):
         warnings.warn(CurviregWarning(warning.text, subject=path), stacklevel=2)
     return mesh

@@ -87,7 +87,7 @@ def detect(
             for one in found
             if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
         ]
-        return [*convincing] or [_lost(found, f"image {index}")]
+        return [*convincing] or [_lost(found, index)]
 
     found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
@@ -124,13 +124,13 @@ def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":
     return proposals
 
 
-def _lost(found: Sequence[Registration], subject: str) -> FailedRegistration:
+def _lost(found: Sequence[Registration], index: int) -> FailedRegistration:
     """The answer where no place is convincing: the most likely one, without its pose."""
     best = max(found, key=lambda one: one.confidence or 0.0)
     assert best.detection is not None
     place = f"at the most likely place, box {corners(best.detection.box.tolist())}"
     seen = f"the object is seen with a probability of {two_decimals(best.confidence or 0.0)}"
-    error = LostObjectError(f"not found: {place}, {seen}; give a box", subject=subject)
+    error = LostObjectError(f"not found: {place}, {seen}; give a box", images=(index,))
     error.detection = best.detection
     return FailedRegistration(error)
 

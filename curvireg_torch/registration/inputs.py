@@ -42,11 +42,7 @@ from .framing import clipped
 # 0.98.
 MIN_BOX_SIDE = 12
 MAX_FRACTION = 1.5  # largest coordinate of a box that is probably meant in fractions of the picture
-FRACTIONS = (
-    "box: in px, not fractions of the photograph; multiply them, or give --box-format "
-    "fractions, "
-    "or yolo"
-)
+FRACTIONS = "box: in px, not fractions of the photograph; multiply them by its size"
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of
 # 113 to 3 degrees
@@ -188,7 +184,7 @@ def image_items(
             item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
                 if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
-                    raise InvalidInputError(FRACTIONS)
+                    raise InvalidInputError(FRACTIONS, kind="fractions")
                 small = min(item.size) < MIN_BOX_SIDE
                 where = (
                     "the photograph has" if small else "the part of the photograph in the box has"
@@ -201,9 +197,7 @@ def image_items(
                 raise InvalidInputError(f"{where} {message}")
             return item
         except CurviregError as error:
-            return error.with_subject(
-                ": ".join([f"image {i}", *([error.subject] if error.subject else [])])
-            )
+            return error.of_image(i)
 
     return OnDemand(item, n)
 
@@ -240,7 +234,7 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
         try:
             check_pose(pose, "T_cam_from_world")
         except InvalidInputError as error:
-            raise error.with_subject(f"image {i}") from None
+            raise error.of_image(i) from None
         same = (T[:i] - pose).flatten(1).abs().amax(dim=1) <= 1e-9 * float(pose.abs().max())
         for j in same.nonzero()[:1, 0].tolist():
             one = items[j]
@@ -251,10 +245,9 @@ def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Ten
                 and _contradict(one, other)
             ):
                 raise InvalidInputError(
-                    f"T_cam_from_world: the same as of image {j}, which shows something else; "
-                    f"give each photograph "
-                    "the pose of its own camera",
-                    subject=f"image {i}",
+                    "T_cam_from_world: the same, but they show different things; give each "
+                    "photograph the pose of its own camera",
+                    images=(i, j),
                 )
     return T
 

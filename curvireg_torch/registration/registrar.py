@@ -402,7 +402,7 @@ class Registrar:
             try:
                 return function(item, index)
             except CurviregError as error:
-                return FailedRegistration(error.with_subject(f"image {index}"))
+                return FailedRegistration(error.with_subject("").of_image(index))
 
         return map_on_threads(run, range(len(items)), device=self.bank.device)
 

@@ -215,12 +215,12 @@ class Rig:
         """The photographs that were registered, if there are any, in the unit of the mesh."""
         usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
         if not usable:
-            reasons = [
-                f"image {i}: {one.message}"
+            causes = [
+                one.with_subject("").of_image(i)
                 for i, one in found.items()
                 if isinstance(one, CurviregError)
             ]
-            raise InvalidInputError(f"no photograph can be registered: {'; '.join(reasons)}")
+            raise InvalidInputError("no photograph can be registered", causes=causes)
         rig = Rig(registrar, usable)
         rig.check_unit()
         return rig
@@ -243,7 +243,7 @@ class Rig:
                 f"T_cam_from_world: by its size the object is {float(distance[0]):.3g} away, by "
                 f"the cameras' rays "
                 f"{float(factor[0] * distance[0]):.3g}; give translations in the mesh's unit",
-                subject=f"image {self.photographs[0].index}",
+                images=(self.photographs[0].index,),
             )
 
     def centres(self, T: Tensor) -> Tensor:

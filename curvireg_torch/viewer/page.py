@@ -149,9 +149,7 @@ class Steps:
         self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
         self.no_photo.set_visibility(shot.photo is not None)
-        self.use_mm.set_visibility(
-            "(mm?)" in workspace.messages.get("mesh", "") and session.options.unit != "mm"
-        )
+        self.use_mm.set_visibility(workspace.asks_for_unit and session.options.unit != "mm")
         words = (
             "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"
         )

@@ -9,7 +9,7 @@ import time
 import traceback
 import warnings
 import zipfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from contextvars import ContextVar
 from dataclasses import replace
 from io import FileIO
@@ -25,7 +25,7 @@ from ..errors import (
     InvalidInputError,
     OutputError,
 )
-from ..evaluation.opening import RegisterOptions
+from ..jobs.options import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
 from .session import STATIC, UNPACKED, Session
@@ -73,6 +73,7 @@ class Workspace:
         self.session = Session(options, folder)
         self.folder = folder
         self.messages: dict[str, str] = {}
+        self.asks_for_unit = False
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving = dict[Path, tuple[str, int]]()
         self.started = 0.0
@@ -102,6 +103,8 @@ class Workspace:
 
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
         self.messages.pop(part, None)
+        if part == "mesh":
+            self.asks_for_unit = False
         caught: list[Any] = []
         _caught.set(caught)
         try:
@@ -109,6 +112,7 @@ class Workspace:
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
                 self.messages.pop("pose", None)
             if caught:
+                self._note_unit(caught)
                 self._show(part, "; ".join(map(self.session.describe_warning, caught)))
             return True if result is None else result
         except CurviregError as error:
@@ -119,6 +123,11 @@ class Workspace:
             traceback.print_exc()
             self._show(part, f"{type(error).__name__}: {error}; see the terminal")
         return None
+
+    def _note_unit(self, caught: Iterable[Any]) -> None:
+        """Remember whether one of the warnings asks for the unit of the mesh."""
+        kinds = {getattr(warning, "kind", "") for warning in caught}
+        self.asks_for_unit = self.asks_for_unit or "unit" in kinds
 
     def _show(self, part: str, message: str) -> None:
         """Show a message, in which uploaded files have their names alone."""
@@ -286,11 +295,13 @@ class Workspace:
             warnings.simplefilter("always", UserWarning)
             self.session.load()
         if caught:
+            self._note_unit(warning.message for warning in caught)
             self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
 
     async def load_sample(self) -> None:
         """Open the photograph of the sample, its mesh and its box."""
         self.messages.clear()
+        self.asks_for_unit = False
         await self.run("file", self._open_sample, stop=True)
 
     def _open_sample(self) -> None:

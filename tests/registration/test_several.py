@@ -221,7 +221,7 @@ def test_bad_rigs_name_the_photograph():
             lambda T: in_another_unit(T, 0.001),
             "image 0: T_cam_from_world: by its size .* mesh's unit",
         ),
-        (lambda T: T[[0, 1, 1]], "image 2: T_cam_from_world: the same as of image 1"),
+        (lambda T: T[[0, 1, 1]], "image 2 and image 1: T_cam_from_world: the same, but"),
         (
             lambda T: torch.cat([T[:1], 1.1 * T[1:2], T[2:]]),
             "image 1: T_cam_from_world: expected rigid",

@@ -185,6 +185,22 @@ def test_errors_keep_message_and_subject(name: str) -> None:
     assert str(type(error)("unusable")) == "unusable"
 
 
+def test_errors_carry_the_numbers_of_photographs() -> None:
+    names = ["a.png", "b.png", "c.png"]
+    error = InvalidInputError("unusable", subject="mask.png", kind="camera").of_image(2)
+    assert str(error) == "image 2: mask.png: unusable"
+    assert str(error.with_image_names(names)) == "c.png: mask.png: unusable"
+    assert str(error.with_subject("photo.jpg")) == "photo.jpg: unusable"
+    assert error.with_image_names(names).kind == "camera"
+    pair = InvalidInputError("the same", images=(2, 0))
+    assert str(pair.with_image_names(names)) == "c.png and a.png: the same"
+    both = InvalidInputError("none", causes=[InvalidInputError("dark").of_image(1), pair])
+    assert str(both) == "none: image 1: dark; image 2 and image 0: the same"
+    named = pickle.loads(pickle.dumps(both)).with_image_names(names)
+    assert str(named) == "none: b.png: dark; c.png and a.png: the same"
+    assert both.causes[0].images == (1,)
+
+
 def test_check_square_pixels_accepts_ten_per_cent() -> None:
     for ratio in (1.0 / 1.099, 1.0, 1.099):
         checks.check_square_pixels(changed(CAMERA, (0, 0, 220.1 * ratio)))

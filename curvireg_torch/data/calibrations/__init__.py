@@ -69,8 +69,8 @@ class Calibrations:
             front, _, name = str(path).rpartition(":")
             file = Path(front)
         if not os.path.isfile(file):
-            message = "no such file; check the path of the calibration, or use --camera exif"
-            raise MissingFileError(message, subject=path)
+            message = "no such file; check the path of the calibration"
+            raise MissingFileError(message, subject=path, kind="calibration")
         try:
             if file not in self._files:
                 self._files[file] = _Cameras(_document(file))
@@ -78,8 +78,8 @@ class Calibrations:
         except RecursionError:
             raise InvalidInputError("nested too deeply; write it again", subject=path) from None
         except InvalidInputError as error:
-            message = f"{error}; without a calibration, use --camera exif"
-            raise InvalidInputError(message, subject=path) from error
+            kind = error.kind or "calibration"
+            raise InvalidInputError(str(error), subject=path, kind=kind) from error
 
 
 def _document(file: Path) -> Any:
