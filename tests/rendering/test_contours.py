@@ -42,7 +42,7 @@ def contour_points(unit: float) -> ContourPoints:
     return MeshContours(stairs(unit)).points(T, K[None], 128)
 
 
-@pytest.mark.parametrize("unit", [1e-3, 80.0])
+@pytest.mark.parametrize("unit", [1e-4, 80.0])
 def test_contours_do_not_depend_on_the_unit(unit):
     one = contour_points(1.0)
     same = contour_points(unit)
@@ -62,7 +62,7 @@ def test_every_view_has_creases_beside_its_occluding_contours():
     assert not bool(points.outline[:, MAX_OCCLUDING:].any())
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1.0, 80.0])
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 80.0])
 def test_edges_that_reach_behind_the_camera_have_no_points(unit):
     """A long bar that passes the camera: only whole edges in front of it count."""
     bar = trimesh.creation.box((0.4, 0.4, 10.0))
