@@ -184,13 +184,13 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
         return (
-            "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, "
+            "the rig holds the cameras, and a rig takes no pose prior; leave --fov, "
             "--azimuth, ... out"
         )
     if arguments.start_convention is not None and arguments.start is None:
         return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
-        return "--start: refines this pose alone; leave limits on the pose out"
+        return "--start: refines this pose alone; leave the pose prior out"
     without_camera = arguments.camera is arguments.guess is None and arguments.mesh_is == "similar"
     if "distance" in limits and not listed and without_camera:
         return f"--distance: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
@@ -472,15 +472,13 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         if probability >= RIVAL_FRACTION * document["confidence"]:
             print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
-        "half turn": "differ by a half turn",
+        "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",
         "several": "differ",
     }
     none = f"none of them: {two_decimals(document['no_match_probability'])}"
-    print(
-        f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or "
-        f"--near"
-    )
+    decides = "a pose prior decides: --side, --azimuth or --near"
+    print(f"the poses {words[document['ambiguous']]}; {none}; {decides}")
 
 
 def _advice(document: Mapping[str, Any]) -> str:

@@ -311,14 +311,8 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
             raise InvalidInputError("side: give it or azimuth")
         given["azimuth"] = PosePrior.side(side).azimuth
     if near is not None:
-        from ..utils.checks import check_numbers
-
-        # an error names the shorter form, which was given
-        numbers = check_numbers((*near, 0.0)[:3], "near", 3)
-        given |= {
-            "viewpoint": tuple(numbers.tolist()),
-            "within": WITHIN if within is None else within,
-        }
+        given["viewpoint"] = (*near, 0.0)[:3]
+        given["within"] = WITHIN if within is None else within
     elif within is not None:
         raise InvalidInputError("within: expected near beside it")
     return given

@@ -412,7 +412,7 @@ class Session:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
         if shot.view is not None and (request.limits or {}).keys() - QUALIFIERS:
-            raise InvalidInputError("a hint: photographs of a rig take none; press No hint")
+            raise InvalidInputError("a pose prior: photographs of a rig take none; press No prior")
         self.searched = tuple(shots)
         try:
             registrar = self._open_registrar(request)

@@ -162,7 +162,7 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
     assert rows[1]["box"] != list(last.box_before)
     first.set_box(before)
     session.set_limits(azimuth=(0.0, 90.0))
-    with pytest.raises(InvalidInputError, match="a hint: photographs of a rig take none"):
+    with pytest.raises(InvalidInputError, match="a pose prior: photographs of a rig take none"):
         session.register()
     session.remove_limits()
 
