@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInputError
+from ..errors import CurviregError, InvalidInputError
 from ..utils.choices import (
     BOX_FORMATS,
     DEFAULT,
@@ -38,6 +38,22 @@ if TYPE_CHECKING:
 
 CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
 """How the command line takes a camera."""
+
+ADVICE = {
+    "camera": f": {CAMERA_OPTIONS}",
+    "calibration": "; without a calibration, use --camera exif",
+    "view": ", as --fov DEG",
+    "opengl": "; or give --start-convention opengl",
+    "fractions": ", or give --box-format fractions, or yolo",
+    "corners": ", or --box-format xywh",
+}
+"""Options that help, by the kind of an error. Messages of the library name no options."""
+
+
+def with_advice(error: CurviregError) -> str:
+    """The text of an error, for the command line."""
+    return f"{error}{ADVICE.get(error.kind, '')}"
+
 
 WITHIN = 45.0  # degrees of ``within`` beside ``near`` if none are given
 QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by themselves

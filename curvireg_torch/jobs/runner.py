@@ -28,6 +28,7 @@ from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
 from .entry import Entry, observe
+from .options import with_advice
 from .photograph import register_observation
 from .store import ResultStore, Row, has_pose, workers
 
@@ -179,7 +180,8 @@ def _row(
 def failed_row(error: Exception | str, **values: Any) -> Row:
     """The row of an entry without a pose; ``skipped`` names a file that could not be read."""
     verdict = verdict_of_error(error) if isinstance(error, Exception) else "failed"
-    message = " ".join(str(error).split())
+    text = with_advice(error) if isinstance(error, CurviregError) else str(error)
+    message = " ".join(text.split())
     return {"schema": SCHEMA, "verdict": verdict, "message": message, **values}
 
 

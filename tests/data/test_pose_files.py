@@ -113,7 +113,7 @@ def test_opengl_poses_look_along_minus_z(tmp_path):
 
 def test_what_is_no_pose_is_refused(tmp_path):
     for content, words in (
-        ({"rotation": R.tolist(), "translation": None}, "register with --camera first"),
+        ({"rotation": R.tolist(), "translation": None}, "register with a camera first"),
         (
             {"frame": "world", "rotation": R.tolist(), "translation": [0, 0, 1]},
             "whose pose is in the world",
