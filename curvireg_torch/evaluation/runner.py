@@ -32,7 +32,9 @@ from .store import ResultStore, Row, has_pose, workers
 POSE_SOURCES = (
     *(
         "data",
+        "calibration.py",
         "filters",
+        "fitting",
         "geometry",
         "matching",
         "features",
