@@ -79,9 +79,7 @@ from .features import (
 from .pipeline import (
     Pipeline as Pipeline,
 )
-from .evaluation.photograph import (
-    register as register,
-)
+from .jobs.photograph import register as register
 from .registration import (
     Registrar as Registrar,
     Registration as Registration,

@@ -69,8 +69,8 @@ class CurviregError(_SubjectError):
             ``str(error)`` is ``"subject: message"``.
         images: numbers from 0 of the photographs, of several, that the error is about.
         causes: errors of single photographs, which together are the reason.
-        kind: what would help, for programs that know how to give it: "camera", "calibration",
-            "unit"; "" for everything else.
+        kind: what would help, for programs that know how to give it, such as "camera" or "unit";
+            "" for everything else. The command line adds its options.
 
     Example:
         >>> error = ImageError("truncated; download it again", subject="photo.jpg")

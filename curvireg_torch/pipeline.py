@@ -1,4 +1,5 @@
-"""Everything that decides a result, in one frozen value: the only source of defaults."""
+"""The settings of a method that may be chosen, in one frozen value: the only source of their
+defaults. Constants of single steps stand at the top of the file of the step."""
 
 import json
 import math

@@ -14,19 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import CurviregError, CurviregWarning
-from ..evaluation.opening import CAMERA_OPTIONS
+from ..jobs.options import with_advice
 from ..utils.files import terminable
 from ..version import __version__
 from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
-
-ADVICE = {
-    "camera": f": {CAMERA_OPTIONS}",
-    "calibration": "; without a calibration, use --camera exif",
-}
-"""Options that help, by the kind of an error, whose message is that of the library."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -99,12 +93,11 @@ def _run(arguments: argparse.Namespace) -> int:
         except (CurviregError, OSError) as error:
             if arguments.debug or isinstance(error, BrokenPipeError):
                 raise
-            advice = (
-                ADVICE.get(error.kind, "")
-                if isinstance(error, CurviregError)
-                else "; check that it exists and can be read"
-            )
-            print(f"curvireg: error: {error}{advice}", file=sys.stderr)
+            if isinstance(error, CurviregError):
+                text = with_advice(error)
+            else:
+                text = f"{error}; check that it exists and can be read"
+            print(f"curvireg: error: {text}", file=sys.stderr)
             return 2
 
 

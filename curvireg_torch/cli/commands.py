@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, MissingFileError
-from ..evaluation.opening import whole_number
 from ..evaluation.registry import DATASETS
+from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from ..version import __version__
@@ -69,7 +69,7 @@ def build_bank(arguments: argparse.Namespace) -> None:
         )
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
-    from ..evaluation.outputs import check_output_file
+    from ..jobs.outputs import check_output_file
 
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
     from ..matching import ViewBank
@@ -177,7 +177,7 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
         )
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
-    from ..evaluation.store import run_processes
+    from ..jobs.store import run_processes
     from ..utils.threads import one_torch_thread
 
     kind = DATASETS[arguments.dataset]
@@ -287,14 +287,15 @@ def draw(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(
             f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"
         )
-    from ..evaluation.outputs import check_output_file
+    from ..jobs.outputs import check_output_file
 
     check_output_file(
         arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
     )
     from ..data import read_photo
-    from ..evaluation.opening import open_registrar
-    from ..evaluation.photograph import register_entry
+    from ..jobs.entry import entry_of
+    from ..jobs.opening import open_registrar
+    from ..jobs.photograph import register_entry
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
 
@@ -302,7 +303,7 @@ def draw(arguments: argparse.Namespace) -> None:
     photo = read_photo(arguments.photo)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
-        found = register_entry(options.entry(arguments.photo), photo, registrar)
+        found = register_entry(entry_of(arguments.photo, options), photo, registrar)
         if arguments.kind == "viewpoints":
             figure = plots.viewpoints(registrar.bank, found)
         elif arguments.kind == "fields":
@@ -336,9 +337,10 @@ def demo(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
     out = arguments.out
     from ..data import read_photo
-    from ..evaluation.outputs import output_folder
-    from ..evaluation.photograph import register_entry
     from ..geometry import Camera, rotation_error
+    from ..jobs.entry import entry_of
+    from ..jobs.outputs import output_folder
+    from ..jobs.photograph import register_entry
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png, to_uint8
@@ -353,7 +355,7 @@ def demo(arguments: argparse.Namespace) -> None:
             options, box=tuple(scene.box.tolist()), camera=Camera(scene.camera_matrix)
         )
         with opened_registrar(options) as (registrar, seconds):
-            entry = options.entry(out / "photo.png")
+            entry = entry_of(out / "photo.png", options)
             photo = read_photo(out / "photo.png")
             found = register_entry(entry, photo, registrar, bank_seconds=seconds)
         assert found.translation is not None

@@ -15,7 +15,7 @@ from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, ImageError, InvalidInputError, MissingFileError
-from ..evaluation.opening import CAMERA_OPTIONS
+from ..jobs.options import CAMERA_OPTIONS
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
 from .options import (
@@ -31,7 +31,7 @@ from .options import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ..evaluation.opening import RegisterOptions
+    from ..jobs.options import RegisterOptions
     from ..registration import FailedRegistration, Registrar, Registration
 
     Frame = tuple[str, Tensor | ImageError]  # its name, and its pixels or why they cannot be read
@@ -109,7 +109,7 @@ def run(arguments: argparse.Namespace) -> None:
         check_viewer("follow --show")
     with ExitStack() as stack:
         if out is not None:
-            from ..evaluation.outputs import output_folder
+            from ..jobs.outputs import output_folder
 
             frames = [] if live else _files(Path(source))
             inputs = input_files(arguments, arguments.mesh, *frames)
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _files(source: Path) -> list[Path]:
     """The files that are read: photographs of a folder, or a video."""
-    from ..evaluation.lists import find_photographs
+    from ..jobs.lists import find_photographs
 
     return find_photographs(source) if source.is_dir() else [source]
 
@@ -188,8 +188,8 @@ def _follow(
     """Follow the object; each pose is in ``out / "results.csv"`` once it is known."""
     from tqdm import tqdm
 
-    from ..evaluation.lists import POSE_COLUMNS
-    from ..evaluation.opening import open_registrar
+    from ..jobs.lists import POSE_COLUMNS
+    from ..jobs.opening import open_registrar
     from ..visualization import OverlayVideo
 
     frames, count, fps = _live(source) if live else _frames(options.photos[0])
@@ -246,8 +246,9 @@ def _poses(
     took."""
     import torch
 
-    from ..evaluation.opening import prior_from_limits, start_in_unit
     from ..geometry import Camera, undistorted
+    from ..jobs.entry import start_in_unit
+    from ..jobs.options import prior_from_limits
     from ..mesh.mesh import mesh_unit
     from ..registration import FailedRegistration, Follower
 
@@ -287,15 +288,15 @@ def _poses(
 def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
     from ..data import Photo, read_photo
-    from ..evaluation.lists import find_photographs
-    from ..evaluation.photograph import camera_of
+    from ..jobs.entry import camera_of, entry_of
+    from ..jobs.lists import find_photographs
 
     source = options.photos[0]
     photo = Photo(image, 1, None, ())
     if source.is_dir():
         source = find_photographs(source)[0]
         photo = read_photo(source) if options.guess == "exif" else photo
-    camera, _ = camera_of(options.entry(source), photo)
+    camera, _ = camera_of(entry_of(source, options), photo)
     assert camera is not None  # the command refuses to start without one
     return camera.at((image.shape[-2], image.shape[-1])).matrix
 
@@ -303,7 +304,7 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
     """The frames of a video or a folder, their number, and frames per second."""
     from ..data import Video, read_photo
-    from ..evaluation.lists import find_photographs, is_video
+    from ..jobs.lists import find_photographs, is_video
 
     if is_video(path):
         video = Video(path)

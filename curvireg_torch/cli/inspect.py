@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError
-from ..evaluation.opening import whole_number
+from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
 from .options import MESH, METHOD, add_command, add_options, input_files, register_options
@@ -60,11 +60,11 @@ def run_inspect(arguments: argparse.Namespace) -> int:
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
     from tqdm import tqdm
 
-    from ..evaluation.lists import find_photographs
-    from ..evaluation.outputs import output_folder
     from ..inspection import inspect
     from ..inspection.facts import mesh_facts
     from ..inspection.page import report_lines, report_page
+    from ..jobs.lists import find_photographs
+    from ..jobs.outputs import output_folder
     from ..matching import cached_bank
     from ..registration import Registrar
 

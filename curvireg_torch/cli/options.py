@@ -1,5 +1,5 @@
 """Commands and their arguments, from the declarations in
-:mod:`curvireg_torch.evaluation.opening`."""
+:mod:`curvireg_torch.jobs.options`."""
 
 import argparse
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, MissingDependencyError
-from ..evaluation.opening import (
+from ..jobs.options import (
     PRIOR_OPTIONS,
     Numbers,
     RegisterOptions,

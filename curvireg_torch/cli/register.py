@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
-from ..evaluation.opening import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
+from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .options import (
     PHOTOGRAPH,
@@ -26,8 +26,8 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from ..evaluation.lists import Counts
-    from ..evaluation.opening import RegisterOptions
+    from ..jobs.lists import Counts
+    from ..jobs.options import RegisterOptions
     from ..registration import Registrar
 
 # photographs of a list that could not be registered, of which the command prints the reason
@@ -184,13 +184,13 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "the list holds boxes, masks and cameras; leave --box, --mask and --camera out"
     if rig is not None and (arguments.guess is not None or limits):
         return (
-            "the rig holds the cameras, and a rig takes no limits on the pose; leave --fov, "
+            "the rig holds the cameras, and a rig takes no pose prior; leave --fov, "
             "--azimuth, ... out"
         )
     if arguments.start_convention is not None and arguments.start is None:
         return "--start-convention: of the pose of --start; give it too"
     if arguments.start is not None and limits:
-        return "--start: refines this pose alone; leave limits on the pose out"
+        return "--start: refines this pose alone; leave the pose prior out"
     without_camera = arguments.camera is arguments.guess is None and arguments.mesh_is == "similar"
     if "distance" in limits and not listed and without_camera:
         return f"--distance: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
@@ -206,7 +206,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    from ..evaluation.store import STARTED, run_processes
+    from ..jobs.store import STARTED, run_processes
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, arguments.photos, arguments.meshes)
@@ -251,7 +251,7 @@ def _strict_code(reliable: int, failed: int) -> int:
 
 def _counted(out: Path) -> tuple[int, int]:
     """Numbers of reliable and of failed photographs among results that other processes wrote."""
-    from ..evaluation.store import has_pose
+    from ..jobs.store import has_pose
 
     lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
     rows = [json.loads(line) for line in lines]
@@ -275,7 +275,7 @@ def _one_result(arguments: argparse.Namespace, *inputs: Path) -> Iterator[None]:
     if arguments.out is None:
         yield
         return
-    from ..evaluation.outputs import output_folder
+    from ..jobs.outputs import output_folder
 
     with output_folder(arguments.out, "register", inputs=input_files(arguments, *inputs)):
         yield
@@ -284,15 +284,16 @@ def _one_result(arguments: argparse.Namespace, *inputs: Path) -> Iterator[None]:
 def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register one photograph, write and print the result; returns whether it is reliable."""
     from ..data import read_photo
-    from ..evaluation.photograph import check_entry, register_entry
-    from ..evaluation.result_files import write_lost
     from ..geometry import Camera
+    from ..jobs.entry import check_entry, entry_of
+    from ..jobs.photograph import register_entry
+    from ..jobs.result_files import write_lost
     from ..registration.result import camera_in_words
 
     out = arguments.out
     path = options.photos[0]
     photo = read_photo(path)
-    entry = options.entry(path)
+    entry = entry_of(path, options)
     check_entry(entry, photo)
     with _one_result(arguments, *entry.files):
         if options.progress and not (options.box or options.boxes or options.mask or options.start):
@@ -327,8 +328,8 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
     """Register the photographs of a rig together, write and print the result; returns whether it is
     reliable."""
-    from ..evaluation.result_files import write_views
-    from ..evaluation.rigs import read_rig, register_rig
+    from ..jobs.result_files import write_views
+    from ..jobs.rigs import read_rig, register_rig
     from ..registration.result import view_in_words
 
     out = arguments.out
@@ -352,7 +353,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 
 def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
     """Write the pose in the format of another tool, if one is asked for."""
-    from ..evaluation.result_files import write_pose_stamped
+    from ..jobs.result_files import write_pose_stamped
 
     if arguments.format:
         write_pose_stamped(arguments.out / "pose.yaml", document)
@@ -360,7 +361,7 @@ def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None
 
 def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
     """Print the result."""
-    from ..evaluation.store import to_json
+    from ..jobs.store import to_json
 
     if arguments.json:
         print(to_json(document), end="")
@@ -372,8 +373,8 @@ def _register_several(
     options: "RegisterOptions", arguments: argparse.Namespace, out: Path
 ) -> "Counts | None":
     """Register photographs that are named one by one, or by a list."""
-    from ..evaluation.lists import list_photographs, read_list, register_list
-    from ..evaluation.opening import open_registrar
+    from ..jobs.lists import list_photographs, read_list, register_list
+    from ..jobs.opening import open_registrar
     from ..pipeline import field_digest
 
     if arguments.list is None:
@@ -471,15 +472,13 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         if probability >= RIVAL_FRACTION * document["confidence"]:
             print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
-        "half turn": "differ by a half turn",
+        "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",
         "several": "differ",
     }
     none = f"none of them: {two_decimals(document['no_match_probability'])}"
-    print(
-        f"the poses {words[document['ambiguous']]}; {none}; a hint decides: --side, --azimuth or "
-        f"--near"
-    )
+    decides = "a pose prior decides: --side, --azimuth or --near"
+    print(f"the poses {words[document['ambiguous']]}; {none}; {decides}")
 
 
 def _advice(document: Mapping[str, Any]) -> str:
@@ -514,7 +513,7 @@ def opened_registrar(options: "RegisterOptions") -> "Iterator[tuple[Registrar, f
     its stages."""
     from tqdm import tqdm
 
-    from ..evaluation.opening import open_registrar
+    from ..jobs.opening import open_registrar
 
     # None: where there is no terminal
     start = time.perf_counter()

@@ -181,7 +181,7 @@ def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
     if "rotation" in content and content.get("translation", ...) is None:
         raise InvalidInputError(
             "a result without a translation, as of a photograph without a camera; register with "
-            "--camera first"
+            "a camera first"
         )
     rotation, translation = (
         next((content[key] for key in keys if key in content), None)

@@ -1,9 +1,7 @@
-"""Evaluation on datasets, and registration of lists of photographs.
+"""Evaluation on datasets: their objects, what the method is told of them, and the scores.
 
-Both become values of one type, ``runner.Entry``, which one resumable loop registers, in one process
-or several, and whose results one store keeps. The command is
-``curvireg evaluate pascal3d|bop|web ROOT --out DIR``. To add a dataset, write a :class:`Benchmark`
-and add a row to ``registry.DATASETS``.
+The command is ``curvireg evaluate pascal3d|bop|web ROOT --out DIR``. To add a dataset, write a
+:class:`Benchmark` and add a row to ``registry.DATASETS``.
 """
 
 import lazy_loader

@@ -223,7 +223,7 @@ def in_words(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
 
 def to_document(a: Run, b: Run, comparisons: Sequence[Comparison]) -> str:
     """The comparison as JSON."""
-    from .store import to_json
+    from ..jobs.store import to_json
 
     return to_json(
         {"a": a.name, "b": b.name, "comparisons": [asdict(each) for each in comparisons]}

@@ -11,19 +11,20 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..jobs.outputs import output_folder
+from ..jobs.runner import results_digest, run_entries, thumbnail_of
+from ..jobs.store import ResultStore, Row, has_pose, to_json
 from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
 from ..registration.result import two_decimals
 from ..utils.checks import check_positive
-from ..utils.files import code_digest, write_file
+from ..utils.files import write_file
 from ..version import __version__
 from ..visualization.sheet import SheetEntry, write_sheet
-from .benchmarks import Benchmark, copy_shown, detection_recall
-from .outputs import output_folder
-from .runner import POSE_SOURCES, run_entries, thumbnail_of
-from .store import ResultStore, Row, has_pose, to_json
+from .benchmark import Benchmark
+from .detection import copy_shown, detection_recall
 
 __all__ = ["evaluate", "report"]
 
@@ -85,7 +86,7 @@ def evaluate(
         "pipeline": pipeline.describe(),
         "renderer": renderer,
         "version": __version__,
-        "code": code_digest(*POSE_SOURCES),
+        "code": results_digest(),
     }
 
     def open_registrar(meshes: tuple[Path, ...]) -> Registrar:

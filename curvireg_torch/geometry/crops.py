@@ -36,8 +36,8 @@ def check_boxes(boxes: Tensor, sizes: Sequence[tuple[int, int]]) -> None:
             )
         if x1 <= x0 or y1 <= y0:
             raise InvalidInputError(
-                f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height, or "
-                f"--box-format xywh"
+                f"{name}: expected X0 < X1 and Y0 < Y1; give corners, not width and height",
+                kind="corners",
             )
         if x1 <= -0.5 or y1 <= -0.5 or x0 >= W - 0.5 or y0 >= H - 0.5:
             raise InvalidInputError(

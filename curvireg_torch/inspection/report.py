@@ -60,9 +60,9 @@ class Inspection:
         share = len(self.alike) / max(len(self.pairs), 1)
         if share >= MANY_ALIKE:
             remedy = (
-                "give a hint (--azimuth, --side)"
+                "give a pose prior (--azimuth, --side)"
                 if self.facts.is_coloured
-                else "give a texture or a hint"
+                else "give a texture or a pose prior"
             )
             warnings.append(
                 f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}"

@@ -215,7 +215,7 @@ def _conditions(
         camera_name: lambda photograph, symmetries: _register(
             registrar, photograph, other, symmetries
         ),
-        f"with a hint: azimuth within {HINT_DEGREES:g} degrees": with_hint,
+        f"with a pose prior: azimuth within {HINT_DEGREES:g} degrees": with_hint,
         "with a second photograph from another side": with_two,
     }
     if has_colours(registrar.bank.mesh):

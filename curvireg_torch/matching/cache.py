@@ -21,7 +21,8 @@ from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..utils.files import code_digest, tensor_digest, text_digest
+from ..utils.files import tensor_digest, text_digest
+from ..utils.sources import import_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
 #: Size limit of the cache in bytes; least recently used banks are removed. $CURVIREG_CACHE_LIMIT
@@ -29,17 +30,8 @@ from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 CACHE_LIMIT = 2_000_000_000
 # Age from which an incomplete file counts as the remains of a killed process
 ABANDONED_SECONDS = 3600.0
-# Code that turns a mesh into described views: a bank that another version of it built is not found
-_SOURCES = (
-    "features",
-    "filters",
-    "geometry",
-    "mesh",
-    "rendering",
-    "terms.py",
-    "pipeline.py",
-    "matching/describe.py",
-)
+# A bank that another version of this file, or of anything that it imports, built is not found
+_BUILDER = "matching/bank.py"
 
 
 class CachedBank(NamedTuple):
@@ -91,7 +83,7 @@ def bank_key(
         f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
     }
     facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer]
-    digests = [code_digest(*_SOURCES), tensor_digest(tensors, size=16)]
+    digests = [import_digest(_BUILDER), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
 
 

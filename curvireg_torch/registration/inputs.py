@@ -42,11 +42,7 @@ from .framing import clipped
 # 0.98.
 MIN_BOX_SIDE = 12
 MAX_FRACTION = 1.5  # largest coordinate of a box that is probably meant in fractions of the picture
-FRACTIONS = (
-    "box: in px, not fractions of the photograph; multiply them, or give --box-format "
-    "fractions, "
-    "or yolo"
-)
+FRACTIONS = "box: in px, not fractions of the photograph; multiply them by its size"
 SMALL_BOX_SIDE = 24  # Pixels; of a smaller box a result carries a warning
 # Focal lengths of usual cameras, as multiples of the photograph's longer side: fields of view of
 # 113 to 3 degrees
@@ -188,7 +184,7 @@ def image_items(
             item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
                 if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
-                    raise InvalidInputError(FRACTIONS)
+                    raise InvalidInputError(FRACTIONS, kind="fractions")
                 small = min(item.size) < MIN_BOX_SIDE
                 where = (
                     "the photograph has" if small else "the part of the photograph in the box has"

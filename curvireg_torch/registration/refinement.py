@@ -102,13 +102,13 @@ def refine_item(
     K = item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
-        raise LostObjectError(why_outside(describer.hull, T[0], K, item.size))
+        raise why_outside(describer.hull, T[0], K, item.size) or LostObjectError(OUTSIDE)
     T = T[visible]
     boxes = boxes[visible]
     if float((boxes[:, 2:] - boxes[:, :2]).amin(dim=1).max()) < MIN_BOX_SIDE:
         problem = why_outside(describer.hull, T[0], K, item.size)
         tiny = f"at the start the mesh is less than {MIN_BOX_SIDE} px wide; check unit and distance"
-        raise LostObjectError(tiny if problem == OUTSIDE else problem)
+        raise problem or LostObjectError(tiny)
     images = [item.image] * len(T)
     each = torch.arange(len(T))
     query = registrar.matcher.query(images, boxes.float())

@@ -519,7 +519,7 @@ def remarks(document: Mapping[str, Any]) -> list[str]:
     contradiction = document.get("prior", {}).get("contradiction")
     lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
     if contradiction == "better outside":
-        lines.append("the photograph fits much better outside the limits on the pose; check them")
+        lines.append("the photograph fits much better outside the pose prior; check it")
     elif contradiction is not None:
         lines.append("the pose lies at one of its limits; widen it to see whether it stays")
     if (count := document.get("symmetries", 1)) > 1:

@@ -5,8 +5,9 @@ from itertools import product
 import torch
 from torch import Tensor
 
+from ..errors import LostObjectError
 from .inputs import MIN_BOX_SIDE
-from .tracker import OUTSIDE, boxes_at
+from .tracker import boxes_at
 
 FACTORS = {
     1000.0: "too small, as metres beside a mesh in mm",
@@ -15,14 +16,15 @@ FACTORS = {
 """Factors between translations and the mesh's unit, and what they mean."""
 
 OPENGL = (
-    "at the start the object lies behind the camera: a pose of OpenGL's camera? Then give "
-    "--start-convention opengl"
+    "at the start the object lies behind the camera: a pose of OpenGL's camera? Then turn y and z "
+    "around"
 )
 
 
-def why_outside(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> str:
-    """What is probably wrong with a pose (4, 4) at which a mesh is not seen: the message of an
-    error.
+def why_outside(
+    hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]
+) -> LostObjectError | None:
+    """What is probably wrong with a pose (4, 4) at which a mesh is not seen; None if nobody knows.
 
     Args:
         hull: (V, 3) points of the mesh.
@@ -38,9 +40,10 @@ def why_outside(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> st
             continue
         unit = "" if factor == 1.0 else f"{FACTORS[factor]}; give translations in the mesh's unit"
         if sign == 1.0:
-            return f"at the start the translation is about 1000 times {unit}"
-        return f"{OPENGL}. Its translation is about 1000 times {unit}" if unit else OPENGL
-    return OUTSIDE
+            return LostObjectError(f"at the start the translation is about 1000 times {unit}")
+        also = f". Its translation is about 1000 times {unit}" if unit else ""
+        return LostObjectError(f"{OPENGL}{also}", kind="opengl")
+    return None
 
 
 def _is_seen(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> bool:

@@ -14,7 +14,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +26,6 @@ MAX_NAME = 60  # characters of the name of an uploaded file
 FindFile = Callable[[str], Path]
 """Where a file lies that another file names. ``folder.joinpath`` follows any name, :func:`only_in`
 none out of a folder."""
-
-_PACKAGE = Path(__file__).parents[1]
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -303,17 +300,4 @@ def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
     for name, x in sorted(tensors.items()):
         digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
         digest.update(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
-    return digest.hexdigest()
-
-
-@cache
-def code_digest(*parts: str) -> str:
-    """16 hexadecimal digits of ``parts`` of the package: folders with their code, weights and
-    constants, and files."""
-    digest = hashlib.blake2b(digest_size=8)
-    for part in parts:
-        path = _PACKAGE / part
-        inside = sorted(p for p in path.rglob("*") if p.suffix in (".py", ".json", ".safetensors"))
-        for source in inside if path.is_dir() else [path]:
-            digest.update(source.read_bytes())
     return digest.hexdigest()

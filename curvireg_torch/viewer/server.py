@@ -26,7 +26,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import MAX_MESH_BYTES, InvalidInputError, OutputError
-from ..evaluation.opening import RegisterOptions
+from ..jobs.options import RegisterOptions
 from ..utils.files import file_name, hangup_signals, signals_handled, terminable
 from ..utils.threads import one_torch_thread
 from .page import build_page

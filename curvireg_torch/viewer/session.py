@@ -22,14 +22,16 @@ from ..errors import (
     InvalidInputError,
     MissingFileError,
 )
-from ..evaluation.opening import QUALIFIERS, WITHIN, RegisterOptions, check_camera, open_registrar
-from ..evaluation.photograph import register_entry
-from ..evaluation.result_files import View
-from ..evaluation.rigs import read_rig, register_rig
 from ..geometry import undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
+from ..jobs.entry import entry_of
+from ..jobs.opening import open_registrar
+from ..jobs.options import QUALIFIERS, WITHIN, RegisterOptions, check_camera
+from ..jobs.photograph import register_entry
+from ..jobs.rigs import read_rig, register_rig
+from ..jobs.views import View
 from ..matching import ViewBank
 from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up, mesh_warnings
 from ..registration import Registrar, Registration
@@ -410,7 +412,7 @@ class Session:
             raise InvalidInputError("register: choose a photograph and a mesh first")
         check_camera(request.camera, request.guess)
         if shot.view is not None and (request.limits or {}).keys() - QUALIFIERS:
-            raise InvalidInputError("a hint: photographs of a rig take none; press No hint")
+            raise InvalidInputError("a pose prior: photographs of a rig take none; press No prior")
         self.searched = tuple(shots)
         try:
             registrar = self._open_registrar(request)
@@ -435,7 +437,7 @@ class Session:
     ) -> tuple[Found, list[Tensor | None]]:
         ((shot,), camera) = shots, self.options.camera
         assert shot.photo is not None
-        entry = request.entry(request.photos[0])
+        entry = entry_of(request.photos[0], request)
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
         found = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from ..data.images import Photo
 from ..errors import InvalidInputError
-from ..evaluation.opening import RegisterOptions
-from ..evaluation.result_files import View, views_glb, views_picture
 from ..geometry import rotation_error, rotation_from_axis_angle
 from ..geometry.cameras import rotation_towards
+from ..jobs.options import RegisterOptions
+from ..jobs.result_files import views_glb, views_picture
+from ..jobs.views import View
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png

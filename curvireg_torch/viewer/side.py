@@ -8,8 +8,8 @@ from typing import Any
 from nicegui import ui
 
 from ..errors import MAX_VIEWER_FACES
-from ..evaluation.store import to_json
 from ..geometry import Camera, rotation_error
+from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
 from ..registration.result import pose_in_words, remarks, two_decimals, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
@@ -185,8 +185,8 @@ class Answers:
             if "viewpoint" in limits:
                 azimuth, *rest = limits["viewpoint"]
                 around = {**limits, "viewpoint": ((azimuth + 180.0) % 360.0, *rest)}
-                found["Turn the hint around"] = lambda: search_with(limits=around)
-            found["Search without the hint"] = lambda: search_with(limits=front)
+                found["Turn the prior around"] = lambda: search_with(limits=around)
+            found["Search without the prior"] = lambda: search_with(limits=front)
         if box is not None:
             found["Search with that box"] = lambda: search_with(box=tuple(round(v, 1) for v in box))
         return found
@@ -341,7 +341,8 @@ def _typed_numbers(text: str | None) -> tuple[float, ...] | None:
 
 
 class Preview:
-    """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a hint."""
+    """The mesh in 3D. Turned with the mouse until it looks as in the photograph, it is a pose
+    prior."""
 
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
@@ -353,7 +354,7 @@ class Preview:
             self.place = region("div", "preview", data_testid="preview")
             with region("div", "row"):
                 button("It looks like this", self._hint, "looks-like-this")
-                self.no_hint = button("No hint", self.session.remove_limits, "no-hint", "quiet")
+                self.no_prior = button("No prior", self.session.remove_limits, "no-prior", "quiet")
                 for name, label in (("up", "Mark what is up"), ("front", "Mark the front")):
                     button(
                         label,
@@ -361,7 +362,7 @@ class Preview:
                         f"mark-{name}",
                         "quiet",
                     )
-            self.facts = text("p", "", "facts", data_testid="hint-facts")
+            self.facts = text("p", "", "facts", data_testid="prior-facts")
 
     async def _hint(self) -> None:
         if self.scene is not None:
@@ -382,18 +383,18 @@ class Preview:
             self.session.set_limits(front=axis)
 
     async def refresh(self) -> None:
-        """Show the mesh of the session, if it or its frame changed, and the hint."""
+        """Show the mesh of the session, if it or its frame changed, and the pose prior."""
         mesh = self.session.mesh
         limits = self.session.options.limits or {}
         self.section.set_visibility(mesh is not None)
-        hint = limits.keys() - {"front"}
-        self.no_hint.set_visibility(bool(hint))
+        limiting = limits.keys() - {"front"}
+        self.no_prior.set_visibility(bool(limiting))
         words = "Turn it with the mouse until it looks as in the photograph: that helps the search."
         if "viewpoint" in limits:
             at = "azimuth {:g}, elevation {:g}".format(*limits["viewpoint"])
-            words = f"Hint: seen from {at}, within {limits['within']:g} degrees."
-        elif hint:
-            words = "There are limits on the pose; the command line below has them."
+            words = f"Pose prior: seen from {at}, within {limits['within']:g} degrees."
+        elif limiting:
+            words = "There is a pose prior; the command line below has it."
         set_text(self.facts, f"Click on the side that is {self.mark}." if self.mark else words)
         if self.shown == (mesh, limits.get("front")):
             return

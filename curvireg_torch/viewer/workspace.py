@@ -25,7 +25,7 @@ from ..errors import (
     InvalidInputError,
     OutputError,
 )
-from ..evaluation.opening import RegisterOptions
+from ..jobs.options import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
 from .session import STATIC, UNPACKED, Session

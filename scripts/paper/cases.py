@@ -14,7 +14,7 @@ from torch import Tensor
 from curvireg_torch.data import read_image
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.evaluation.benchmarks import UNOCCLUDED
+from curvireg_torch.evaluation.bop import UNOCCLUDED
 from curvireg_torch.geometry import crop_images, rotation_towards
 from curvireg_torch.geometry.viewpoint import DEFAULT_DISTANCE
 from curvireg_torch.mesh import mesh_centre, mesh_radius

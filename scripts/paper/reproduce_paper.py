@@ -44,9 +44,9 @@ from tqdm import tqdm
 
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
-from curvireg_torch.evaluation.runner import POSE_SOURCES
+from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.utils.files import code_digest, file_digest, text_digest
+from curvireg_torch.utils.files import file_digest, text_digest
 from scripts._shared import commit, write_json
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
@@ -128,7 +128,7 @@ def collect(
     phase: str, cases: list[Case], settings: BankSettings, pose: str, arguments: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """The records of all cases; those of each mesh are stored when they are known."""
-    code = code_digest(*POSE_SOURCES) + own_digest()
+    code = results_digest() + own_digest()
     # In a fixed random order: the part that an interrupted run has measured is a fair one.
     groups = sorted(
         by_mesh(cases),

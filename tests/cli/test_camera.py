@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
+import curvireg_torch as cr
 from curvireg_torch import Camera, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
+from curvireg_torch.errors import InvalidInputError
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, check_pose, lines, written
 from tests._support.scenes import scene, write_photo
@@ -198,3 +200,18 @@ def test_strict_tells_by_the_exit_code_whether_a_result_is_reliable(folder, tmp_
         )
         == code
     )
+
+
+def test_the_command_line_names_the_options_that_help(folder, capsys):
+    """The library, which others call from Python, does not know them."""
+    photo = folder / "photos" / "0.png"
+    words = ["register", str(photo), str(folder / "truck.safetensors"), "--box", *box_of(0)]
+    assert main([*words, "--camera", "exif", "--json"]) == 2
+    printed = capsys.readouterr().err
+    assert "no focal length in its EXIF; give the camera: --camera FX FY CX CY" in printed
+    with pytest.raises(InvalidInputError, match="no focal length") as error:
+        cr.register(photo, folder / "truck.safetensors", box=box_of(0), camera="exif")
+    assert error.value.kind == "camera"
+    assert "--" not in str(error.value).replace(str(photo), "")
+    assert main([*words, "--camera", str(folder / "none.yaml"), "--json"]) == 2
+    assert "without a calibration, use --camera exif" in capsys.readouterr().err

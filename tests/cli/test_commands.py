@@ -15,14 +15,14 @@ import trimesh
 from curvireg_torch import __main__
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregWarning
-from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.matching import cached_bank
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import DEFAULT, PRESETS, ViewPolicy
 from scripts.robustness.wrong_inputs import cases
 from tests._support.scenes import truck_bank
-from tests.evaluation.small import SMALL
+from tests._support.small import SMALL
 from tests.viewer.test_session import write_scene
 
 

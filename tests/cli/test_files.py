@@ -17,8 +17,8 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation.outputs import MARKER
-from curvireg_torch.evaluation.result_files import write_pose_stamped
+from curvireg_torch.jobs.outputs import MARKER
+from curvireg_torch.jobs.result_files import write_pose_stamped
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
 
@@ -71,7 +71,7 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     )
     np.testing.assert_allclose(T[:3], np.c_[found["rotation"], found["translation"]], atol=1e-5)
     # For a mesh that is too large, none is written and an older one is removed.
-    monkeypatch.setattr("curvireg_torch.evaluation.result_files.MAX_GLB_FACES", 10)
+    monkeypatch.setattr("curvireg_torch.jobs.result_files.MAX_GLB_FACES", 10)
     assert register(*words, "--format", "ros") == 0
     assert {"pose.yaml"} == {"pose.glb", "pose.yaml"} & {
         path.name for path in (tmp_path / "out").iterdir()
@@ -117,7 +117,7 @@ def test_a_file_that_cannot_be_drawn_costs_no_other(
 ):
     threads(n)
     fail = Mock(side_effect=InvalidInputError("it cannot be drawn"))
-    monkeypatch.setattr(f"curvireg_torch.evaluation.result_files.{draws}", fail)
+    monkeypatch.setattr(f"curvireg_torch.jobs.result_files.{draws}", fail)
     words = [
         folder / "photos" / "0.png",
         folder / "truck.safetensors",

@@ -8,7 +8,7 @@ import pytest
 from curvireg_torch.cli import main
 from curvireg_torch.cli.follow import Tally
 from curvireg_torch.data import Video
-from curvireg_torch.evaluation.outputs import MARKER
+from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Follower
 from curvireg_torch.visualization import OverlayVideo
 from tests._support.exif import exif, with_exif

@@ -11,10 +11,10 @@ import torch
 import trimesh
 
 from curvireg_torch import ViewBank
-from curvireg_torch.evaluation import photograph
-from curvireg_torch.evaluation.lists import list_photographs, read_list
-from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.jobs import photograph
+from curvireg_torch.jobs.lists import list_photographs, read_list
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
 from tests._support.exif import exif
 from tests._support.lists import CAMERA, RESULTS, box_of, check_pose, lines, table, written

@@ -71,7 +71,7 @@ def test_register_upright_mesh_with_another_up_axis(
 
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
     monkeypatch.setattr(
-        "curvireg_torch.evaluation.opening.open_registrar", lambda *_: pytest.fail("opened")
+        "curvireg_torch.jobs.opening.open_registrar", lambda *_: pytest.fail("opened")
     )
     refused(register_one(box=["900", "5", "950", "90"]), "0.png: box", "entirely outside")
     refused(register_one("--camera", "exif"), "0.png", "no focal length")
@@ -244,10 +244,10 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
     path = folder / "gl.json"
     words = "--start", str(path), "--camera", *CAMERA
     path.write_text(json.dumps({"T_cam_from_model": (flip @ T).tolist()}))
-    refused(
-        register_one(*words, box=()),
-        "behind the camera: a pose of OpenGL's camera? Then give --start-convention opengl",
+    message = (
+        "a pose of OpenGL's camera? Then turn y and z around; or give --start-convention opengl"
     )
+    refused(register_one(*words, box=()), f"behind the camera: {message}")
     assert register_one(*words, "--start-convention", "opengl", box=()) == 0
     assert float(rotation_error(torch.tensor(document()["rotation"]).double(), T[:3, :3])) < 3.0
     entry = {

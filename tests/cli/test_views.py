@@ -11,7 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation.rigs import read_rig
+from curvireg_torch.jobs.rigs import read_rig
 from tests._support.lists import (
     check_pose,
     quaternion,

@@ -312,7 +312,7 @@ REFUSED = {
     ),
     "field of view": (
         {"camera_angle_x": 0.7, "frames": []},
-        "no fl_x; without it, give .* --fov DEG",
+        "no fl_x; without it, give the field of view",
     ),
     "no centre": ({"fl_x": 520.5, "w": 640, "h": 480}, "no cx and cy"),
     "a polynomial of nerfstudio": ({**CORNER, "k4": 0.1}, "k4 of nerfstudio"),

@@ -113,7 +113,7 @@ def test_opengl_poses_look_along_minus_z(tmp_path):
 
 def test_what_is_no_pose_is_refused(tmp_path):
     for content, words in (
-        ({"rotation": R.tolist(), "translation": None}, "register with --camera first"),
+        ({"rotation": R.tolist(), "translation": None}, "register with a camera first"),
         (
             {"frame": "world", "rotation": R.tolist(), "translation": [0, 0, 1]},
             "whose pose is in the world",
@@ -131,3 +131,22 @@ def test_what_is_no_pose_is_refused(tmp_path):
             read_pose(written(tmp_path, content))
     with pytest.raises(MissingFileError, match=r"lost\.json:3: no such file"):
         read_pose(tmp_path / "lost.json:3")
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"schema": 3, "views": 9, "top": [{"rotation": np.eye(3).tolist()}], "none": 0.1},
+        {"schema": 4, "frame": "camera", "bank_views": 9, "hypotheses": [{"rotation": 1}]},
+    ],
+    ids=["schema 3", "schema 4"],
+)
+def test_results_of_both_schemas_are_start_poses(tmp_path, keys):
+    pose = {"rotation": R.tolist(), "translation": t.tolist(), "confidence": 0.8}
+    check(read_pose(written(tmp_path, {**keys, **pose})), confidence=0.8)
+
+
+def test_poses_in_the_world_are_no_start_poses(tmp_path):
+    pose = {"rotation": R.tolist(), "translation": t.tolist(), "frame": "world"}
+    with pytest.raises(InvalidInputError, match="as in 'photographs'"):
+        read_pose(written(tmp_path, pose))

@@ -128,7 +128,7 @@ def in_folder(
 def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     """Run a command in this process; its exit code or message."""
     program = Path(words[0]).name
-    if "--jobs" in words:  # tests/evaluation/test_processes.py starts several
+    if "--jobs" in words:  # tests/jobs/test_processes.py starts several
         words[words.index("--jobs") + 1] = "1"
     if program == "demo.sh":
         last = (ROOT / words[0]).read_text("utf-8").splitlines()[-1]

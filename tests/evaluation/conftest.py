@@ -1,8 +1,7 @@
 import pytest
 
 from curvireg_torch.pipeline import DEFAULT, PRESETS
-
-from .small import SMALL
+from tests._support.small import SMALL
 
 
 @pytest.fixture(autouse=True)

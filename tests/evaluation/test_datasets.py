@@ -10,11 +10,10 @@ from curvireg_torch import Camera
 from curvireg_torch.cli import main, parse
 from curvireg_torch.errors import InvalidInputError, RenderingError
 from curvireg_torch.evaluation import DATASETS, BOPBenchmark, Pascal3DBenchmark, Protocol
-from curvireg_torch.evaluation.outputs import MARKER
+from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.registration import Registrar
 from tests._support.lists import bop_poses, table
-
-from .small import SMALL, rows_of, run
+from tests._support.small import SMALL, rows_of, run
 
 
 def test_evaluate_pascal3d(pascal, tmp_path):
@@ -208,7 +207,7 @@ def test_evaluate_without_boxes_reports_detection(pascal, evaluate, tmp_path, ca
     """The summary has the recall of boxes; thumbnails show the found box."""
     boxes = []
     monkeypatch.setattr(
-        "curvireg_torch.evaluation.runner.thumbnail", lambda *a: boxes.append(a[3]) or b""
+        "curvireg_torch.jobs.runner.thumbnail", lambda *a: boxes.append(a[3]) or b""
     )
     words = ("pascal3d", pascal.root, "--limit", "2", "--protocol", "box=none")
     summary = evaluate(*words)

@@ -10,10 +10,10 @@ import trimesh
 from curvireg_torch.data import Pascal3DPlus
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, PoseFolderBenchmark, Protocol
-from curvireg_torch.evaluation.benchmarks import copy_shown, detection_recall
 from curvireg_torch.evaluation.datasets import report
-from curvireg_torch.evaluation.store import ResultStore, to_json
+from curvireg_torch.evaluation.detection import copy_shown, detection_recall
 from curvireg_torch.geometry import rotation_from_axis_angle, rotation_from_viewpoint
+from curvireg_torch.jobs.store import ResultStore, to_json
 from tests._support.lists import bop_poses, table
 from tests._support.miniature import pascal_object, write_image, write_mesh, write_record
 

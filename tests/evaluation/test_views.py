@@ -9,14 +9,13 @@ import torch
 
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.evaluation import BOPBenchmark, Protocol
-from curvireg_torch.evaluation.benchmarks import same_instances
+from curvireg_torch.evaluation.bop import same_instances
 from curvireg_torch.geometry import transform
 from curvireg_torch.mesh import mesh_radius
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, write_photo
+from tests._support.small import rows_of, run
 from tests.registration.test_several import WORLD, photograph
-
-from .small import rows_of, run
 
 
 def photograph_in_mm(azimuth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -237,7 +237,7 @@ def test_command_writes_report_and_page(tmp_path, capsys):
     assert isinstance(document["warnings"], list)
     assert set(document["expected"]["compared"]) == {
         "without a camera",
-        "with a hint: azimuth within 45 degrees",
+        "with a pose prior: azimuth within 45 degrees",
         "with a second photograph from another side",
     }
     page = (tmp_path / "out" / "inspect.html").read_text()

@@ -160,6 +160,7 @@ def test_load_mesh_warns_of_the_size(tmp_path: Path, size: float, warns: bool) -
     assert ["m across; if that is wrong, give the unit" in str(one.message) for one in caught] == [
         True
     ] * warns
+    assert [one.message.kind for one in caught] == ["unit"] * warns
 
 
 def test_places_of_parts_are_multiplied_from_the_root(tmp_path: Path) -> None:

@@ -10,8 +10,6 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
-from curvireg_torch.evaluation.runner import POSE_SOURCES
-from curvireg_torch.matching import cache
 from curvireg_torch.utils import files
 from curvireg_torch.utils.files import file_name, only_in
 
@@ -166,27 +164,6 @@ def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
     strided = torch.stack([x, x], dim=1)[:, 0].requires_grad_()
     assert files.tensor_digest({"a": strided}) == files.tensor_digest({"a": x})
     assert len(files.tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
-
-
-def test_code_digest_changes_with_any_source(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for decide in (cache._SOURCES, POSE_SOURCES):  # banks and results
-        assert {"features", "filters", "geometry", "mesh", "rendering", "terms.py"} <= set(decide)
-        assert len(files.code_digest(*decide)) == 16
-    monkeypatch.setattr(files, "_PACKAGE", tmp_path)
-    (tmp_path / "room" / "deep").mkdir(parents=True)
-    sources = [tmp_path / "room" / "a.py", tmp_path / "room" / "deep" / "b.py", tmp_path / "c.py"]
-    seen = set()
-    for i, source in enumerate([*sources, *sources]):
-        source.write_text(f"x = {i}")
-        files.code_digest.cache_clear()
-        if i >= 2:
-            seen.add(files.code_digest("room", "c.py"))
-    assert len(seen) == 4
-    with pytest.raises(FileNotFoundError):
-        files.code_digest("no_such_room")
-    files.code_digest.cache_clear()
 
 
 def test_file_name_has_no_folders():

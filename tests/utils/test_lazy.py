@@ -54,9 +54,9 @@ def test_help_imports_nothing_heavy(words):
 
 def test_imports_are_only_those_of_what_is_used():
     assert not imported_by("import curvireg_torch; curvireg_torch.CurviregError") & HEAVY
-    loaded = imported_by("import curvireg_torch.evaluation.opening")
+    loaded = imported_by("import curvireg_torch.jobs.options")
     assert not loaded & HEAVY
-    loaded = imported_by("import curvireg_torch.evaluation.result_files")
+    loaded = imported_by("import curvireg_torch.jobs.result_files")
     assert {"torch", "trimesh"} <= loaded
     assert not loaded & UNUSED
     # kornia takes 0.3 s, sympy a second: torch imports it where it emulates an operation.

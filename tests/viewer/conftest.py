@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support.exif import exif, with_exif
 from tests.viewer.browser import Browser, wait_for

@@ -54,10 +54,12 @@ def test_the_empty_page_says_what_to_do_and_the_sample_loads_in_one_click(browse
 
 
 def hinted_azimuth(browser):
-    """Say that it looks like this; returns the azimuth of the hint."""
+    """Say that it looks like this; returns the azimuth of the prior."""
     browser.click("looks-like-this")
-    browser.wait(lambda: browser.text("hint-facts").startswith("Hint: seen from azimuth"), "hint")
-    return float(re.search(r"azimuth ([\d.]+)", browser.text("hint-facts"))[1])
+    browser.wait(
+        lambda: browser.text("prior-facts").startswith("Pose prior: seen from azimuth"), "hint"
+    )
+    return float(re.search(r"azimuth ([\d.]+)", browser.text("prior-facts"))[1])
 
 
 def test_the_model_turned_with_the_mouse_is_a_hint(browser):
@@ -85,15 +87,15 @@ def test_the_model_turned_with_the_mouse_is_a_hint(browser):
         lambda: abs(before - hinted_azimuth(browser)) < 20, "turned back, and seen from higher up"
     )
     browser.picture("viewer-model", "fold-model")
-    browser.click("no-hint")
+    browser.click("no-prior")
     browser.wait(lambda: "--near" not in browser.text("command"), "no hint")
     browser.click("mark-front")
     browser.wait(
-        lambda: browser.text("hint-facts") == "Click on the side that is front.",
+        lambda: browser.text("prior-facts") == "Click on the side that is front.",
         "asked for the front",
     )
     ActionChains(browser.driver).move_to_element_with_offset(canvas, -22, 0).click().perform()
-    browser.wait(lambda: "Click" not in browser.text("hint-facts"), "clicked")
+    browser.wait(lambda: "Click" not in browser.text("prior-facts"), "clicked")
 
 
 def test_a_search_can_be_stopped_and_started_again(browser):
@@ -219,11 +221,11 @@ def test_a_hint_that_is_the_wrong_way_round_is_turned_around_with_one_click(brow
     browser.wait(lambda: 140 < (start - hinted_azimuth(browser)) % 360 < 220, "seen from behind")
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "contradicted")
-    browser.wait(lambda: browser.part("turn-the-hint-around"), "repair")
+    browser.wait(lambda: browser.part("turn-the-prior-around"), "repair")
     assert browser.text("verdict") != "reliable"
-    browser.click("turn-the-hint-around")
+    browser.click("turn-the-prior-around")
     browser.wait(lambda: browser.text("verdict") == "reliable", "the right way round")
-    browser.click("no-hint")
+    browser.click("no-prior")
     browser.click("register")
     browser.wait(lambda: browser.text("progress") == "done", "as before")
     browser.wait(lambda: browser.text("certainty") == before, "as before")

@@ -9,8 +9,8 @@ pytest.importorskip("nicegui", reason="nicegui is not installed")
 from nicegui.client import Client
 from nicegui.page import page
 
-from curvireg_torch.evaluation.opening import RegisterOptions
 from curvireg_torch.geometry import Camera
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer.page import Steps
 from curvireg_torch.viewer.side import Answers, Inputs, Preview
 from curvireg_torch.viewer.stage import Stage
@@ -123,7 +123,8 @@ def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(worksp
     for preview in previews:
         asyncio.run(preview.refresh())
         assert (
-            preview.facts.content == "Hint: seen from azimuth 90, elevation 0, within 45 degrees."
+            preview.facts.content
+            == "Pose prior: seen from azimuth 90, elevation 0, within 45 degrees."
         )
     assert "--near 90 0 0 --within 45" in session.command()
     session.remove_limits()
@@ -162,7 +163,7 @@ def test_each_remark_has_its_repair(shown, monkeypatch):
     }
     session.set_limits(elevation=(0.0, 10.0))
     repairs = answers._repairs(hint)
-    assert list(repairs) == ["Search without the hint", "Search with that box"]
+    assert list(repairs) == ["Search without the prior", "Search with that box"]
     for repair in repairs.values():
         repair()
     assert session.options.limits == {}

@@ -10,10 +10,10 @@ import torch
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.rigs import BOX, CAMERA, ROTATION, TRANSLATION
-from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import rotation_error
+from curvireg_torch.jobs.options import RegisterOptions
+from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
+from curvireg_torch.jobs.store import to_json
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
@@ -162,7 +162,7 @@ def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
     assert rows[1]["box"] != list(last.box_before)
     first.set_box(before)
     session.set_limits(azimuth=(0.0, 90.0))
-    with pytest.raises(InvalidInputError, match="a hint: photographs of a rig take none"):
+    with pytest.raises(InvalidInputError, match="a pose prior: photographs of a rig take none"):
         session.register()
     session.remove_limits()
 

@@ -16,9 +16,9 @@ from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
 from curvireg_torch.data.pose_files import read_pose
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
-from curvireg_torch.evaluation.opening import WITHIN, RegisterOptions
-from curvireg_torch.evaluation.store import to_json
 from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpoint, undistorted
+from curvireg_torch.jobs.options import WITHIN, RegisterOptions
+from curvireg_torch.jobs.store import to_json
 from curvireg_torch.pipeline import PRESETS, BankSettings, ViewPolicy
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.viewer import session as module

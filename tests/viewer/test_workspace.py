@@ -21,7 +21,7 @@ import trimesh
 from PIL import Image
 
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, OutputError
-from curvireg_torch.evaluation.opening import RegisterOptions
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.viewer import workspace as module
 from curvireg_torch.viewer.workspace import show_warning, unpack
 from tests.viewer.test_session import write_scene

@@ -78,7 +78,8 @@ class Calibrations:
         except RecursionError:
             raise InvalidInputError("nested too deeply; write it again", subject=path) from None
         except InvalidInputError as error:
-            raise InvalidInputError(str(error), subject=path, kind="calibration") from error
+            kind = error.kind or "calibration"
+            raise InvalidInputError(str(error), subject=path, kind=kind) from error
 
 
 def _document(file: Path) -> Any:

@@ -347,7 +347,7 @@ def _nerfstudio(record: Record) -> Camera:
     width = record.number("w")
     height = record.number("h")
     if (fx := record.number("fl_x")) is None:
-        raise InvalidInputError("no fl_x; without it, give the field of view as --fov DEG")
+        raise InvalidInputError("no fl_x; without it, give the field of view", kind="view")
     fy = record.number("fl_y") or fx
     cx = record.number("cx")
     cy = record.number("cy")

@@ -1,4 +1,4 @@
-"""Options of a registration, each declared once, and the registrar that they ask for.
+"""Options of a registration, each declared once.
 
 The command line and the viewer read the declarations, lists those of the limits on the pose.
 Nothing heavy is imported before a file is opened, so that help and mistakes in options appear at
@@ -9,12 +9,12 @@ import argparse
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import BankError, InvalidInputError
+from ..errors import CurviregError, InvalidInputError
 from ..utils.choices import (
     BOX_FORMATS,
     DEFAULT,
@@ -34,13 +34,26 @@ if TYPE_CHECKING:
     from ..features import LearnedCurvilinearSaliency
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
-    from ..matching import ViewBank
     from ..pipeline import Pipeline
-    from ..registration import Registrar
-    from .photograph import Entry
 
 CAMERA_OPTIONS = "--camera FX FY CX CY, --camera FILE (a calibration), --camera exif or --fov DEG"
 """How the command line takes a camera."""
+
+ADVICE = {
+    "camera": f": {CAMERA_OPTIONS}",
+    "calibration": "; without a calibration, use --camera exif",
+    "view": ", as --fov DEG",
+    "opengl": "; or give --start-convention opengl",
+    "fractions": ", or give --box-format fractions, or yolo",
+    "corners": ", or --box-format xywh",
+}
+"""Options that help, by the kind of an error. Messages of the library name no options."""
+
+
+def with_advice(error: CurviregError) -> str:
+    """The text of an error, for the command line."""
+    return f"{error}{ADVICE.get(error.kind, '')}"
+
 
 WITHIN = 45.0  # degrees of ``within`` beside ``near`` if none are given
 QUALIFIERS = {"front"}  # arguments of :class:`PosePrior` that limit nothing by themselves
@@ -301,25 +314,6 @@ class RegisterOptions:
         mesh = self.meshes[0].stem if self.meshes else ""
         return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)
 
-    def entry(self, photo: Path) -> "Entry":
-        """A photograph with the box, camera, meshes and other inputs of these options."""
-        from ..geometry import Camera, camera_matrix
-        from .photograph import Entry
-
-        camera = self.guess if self.camera is None else self.camera
-        camera = (
-            Camera(camera_matrix(*camera))
-            if isinstance(camera, Sequence) and camera != "exif"
-            else camera
-        )
-        start = self.read_start()
-        box = self.box_of(photo)
-        same: dict[str, Any] = {
-            name: getattr(self, name) for name in ("meshes", "mask", "instances")
-        }
-        same |= {"box": box, "start": start, "prior": prior_from_limits(self.limits or {})}
-        return Entry(name=str(photo), photo=photo, camera=camera, **same)
-
 
 def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Arguments of :class:`PosePrior`, of which ``side`` and ``near`` are shorter forms; None
@@ -333,14 +327,8 @@ def limits_from_options(options: Mapping[str, Any]) -> dict[str, Any]:
             raise InvalidInputError("side: give it or azimuth")
         given["azimuth"] = PosePrior.side(side).azimuth
     if near is not None:
-        from ..utils.checks import check_numbers
-
-        # an error names the shorter form, which was given
-        numbers = check_numbers((*near, 0.0)[:3], "near", 3)
-        given |= {
-            "viewpoint": tuple(numbers.tolist()),
-            "within": WITHIN if within is None else within,
-        }
+        given["viewpoint"] = (*near, 0.0)[:3]
+        given["within"] = WITHIN if within is None else within
     elif within is not None:
         raise InvalidInputError("within: expected near beside it")
     return given
@@ -376,79 +364,3 @@ def check_camera(camera: "Sequence[float] | Camera | None", guess: str | float |
             camera_of_view(guess, (1, 1))
     except InvalidInputError as error:
         raise InvalidInputError(f"--{error}") from error
-
-
-def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
-    """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
-    T = start.T.clone()
-    if start.unit is not None:
-        T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
-    return tuple(map(tuple, T.tolist()))
-
-
-def open_registrar(
-    options: RegisterOptions,
-    meshes: Sequence[Path],
-    *,
-    progress: Callable[[str, int, int], object] | None = None,
-) -> "Registrar":
-    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead
-    of showing a bar."""
-    from ..registration import Registrar
-
-    pipeline = options.open_pipeline()
-    banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
-    banks = [bank.to(options.device) for bank in banks]
-    if all(mesh.suffix == ".safetensors" for mesh in meshes):
-        if options.bank_decides:
-            pipeline = banks[0].pipeline
-        elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
-            pipeline = replace(pipeline, views=banks[0].pipeline.views)
-    if not options.refine:
-        pipeline = replace(pipeline, contours=False, search=False)
-    if options.top is not None:
-        pipeline = replace(pipeline, hypotheses=options.top)
-    settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
-    return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
-
-
-def _open_bank(
-    options: RegisterOptions,
-    mesh: Path,
-    pipeline: "Pipeline",
-    progress: bool | Callable[[str, int, int], object],
-) -> "ViewBank":
-    from ..matching import ViewBank, cached_bank
-
-    if mesh.suffix != ".safetensors":
-        loaded = options.load_mesh(mesh)
-        return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
-    bank = ViewBank.load(mesh)
-    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
-    if options.pose not in (None, bank.pipeline.views.pose):
-        built = (
-            "given views"
-            if bank.pipeline.views.pose == "given"
-            else f"--pose {bank.pipeline.views.pose}"
-        )
-        message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
-        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
-    return bank
-
-
-def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
-    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
-    from ..mesh.mesh import mesh_unit, mesh_up
-
-    built_unit = mesh_unit(bank.mesh)
-    built_up = mesh_up(bank.mesh)
-    again = "or build it again with 'curvireg bank'"
-    if unit not in (None, built_unit):
-        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
-        raise BankError(
-            f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path
-        )
-    if up not in (None, built_up):
-        raise BankError(
-            f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path
-        )

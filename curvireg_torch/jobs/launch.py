@@ -1,4 +1,4 @@
-"""``python -m curvireg_torch.evaluation.launch WORDS`` is ``torchrun WORDS`` without its traceback
+"""``python -m curvireg_torch.jobs.launch WORDS`` is ``torchrun WORDS`` without its traceback
 and its log.
 
 A process that fails has printed its own message.

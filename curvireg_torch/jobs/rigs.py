@@ -23,8 +23,7 @@ from ..registration.result import result_document
 from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of
-from .photograph import register_views
-from .result_files import View
+from .views import View, register_views
 
 ROTATION = POSE_COLUMNS[:9]
 TRANSLATION = POSE_COLUMNS[9:]

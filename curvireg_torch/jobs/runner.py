@@ -23,34 +23,28 @@ from ..errors import (
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
 from ..registration.result import SCHEMA, line_document, places_document, verdict_of_error
-from ..utils.files import code_digest, file_digest, text_digest, write_file
+from ..utils.files import file_digest, text_digest, write_file
+from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
-from .photograph import Entry, register_entry
+from .entry import Entry
+from .options import with_advice
+from .photograph import register_entry
 from .store import ResultStore, Row, has_pose, workers
 
-POSE_SOURCES = (
-    *(
-        "data",
-        "calibration.py",
-        "filters",
-        "fitting",
-        "geometry",
-        "matching",
-        "features",
-        "mesh",
-        "registration",
-        "rendering",
-        "terms.py",
-    ),
-    *("utils", "errors.py", "pipeline.py"),
-)
-"""Parts of the package that results depend on."""
+NOT_IN_RESULTS = ("cli", "viewer", "visualization")
+"""Parts of the package that no stored result depends on."""
 
 REPORTS = ("summary.json", "predictions.csv", "results.csv", "index.html")
 """Files that are written from all results at the end; older ones would not match newer results."""
 
 OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]  # opens the registrar of some mesh files
+
+
+def results_digest() -> str:
+    """16 hexadecimal digits of the code that results depend on: rows of another one are not
+    current."""
+    return package_digest(without=NOT_IN_RESULTS)
 
 
 def run_entries(
@@ -78,7 +72,7 @@ def run_entries(
         The store, which holds all entries; None in processes that leave the report to the first
         one.
     """
-    common = json.dumps([dict(settings), code_digest(*POSE_SOURCES)], sort_keys=True)
+    common = json.dumps([dict(settings), results_digest()], sort_keys=True)
     photo_digest = cache(file_digest)
     digest_of_mesh = cache(mesh_digest)
 
@@ -185,7 +179,8 @@ def _row(
 def failed_row(error: Exception | str, **values: Any) -> Row:
     """The row of an entry without a pose; ``skipped`` names a file that could not be read."""
     verdict = verdict_of_error(error) if isinstance(error, Exception) else "failed"
-    message = " ".join(str(error).split())
+    text = with_advice(error) if isinstance(error, CurviregError) else str(error)
+    message = " ".join(text.split())
     return {"schema": SCHEMA, "verdict": verdict, "message": message, **values}
 
 

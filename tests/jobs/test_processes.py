@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 def run(words, *, launcher=PYTHON, **variables):
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY)}
     return subprocess.run(
-        [*launcher, "tests.evaluation.small", *map(str, words)],
+        [*launcher, "tests._support.small", *map(str, words)],
         env={**environment, **{name: str(value) for name, value in variables.items()}},
         cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
     )  # fmt: skip

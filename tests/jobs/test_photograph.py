@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import curvireg_torch as cr
 from curvireg_torch.cli import main
-from curvireg_torch.evaluation.outputs import MARKER
+from curvireg_torch.jobs.outputs import MARKER
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
 from tests._support.scenes import learned_registrar, scene

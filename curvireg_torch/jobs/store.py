@@ -75,7 +75,7 @@ def run_processes(count: int, words: Sequence[str]) -> bool:
     torchrun = [
         sys.executable,
         "-m",
-        "curvireg_torch.evaluation.launch",
+        "curvireg_torch.jobs.launch",
         "--standalone",
         "--nproc-per-node",
         str(count),

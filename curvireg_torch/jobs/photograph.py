@@ -1,10 +1,9 @@
-"""One photograph, or several of one pose: what is known about it, and its registration."""
+"""The registration of one photograph, and its result that can be drawn and saved."""
 
 import base64
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,95 +14,29 @@ from PIL import Image
 from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
-from ..data.frames import VideoFrame
 from ..data.images import photo_of_picture
-from ..data.masks import mask_file
-from ..data.pose_files import PoseFile
-from ..errors import CurviregError, InvalidInputError, MissingFileError
-from ..geometry import Camera, camera_matrix, undistorted
-from ..geometry.cameras import camera_of_view
+from ..errors import InvalidInputError
+from ..geometry import Camera, camera_matrix
 from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration, detect, refine
-from ..registration.inputs import ImageItem, image_item, image_items
+from ..registration.inputs import image_item
 from ..registration.poses import projected_box
 from ..registration.result import detection_document, result_document
-from ..utils.files import file_digest, text_digest
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .opening import check_bank, start_in_unit
+from .entry import Entry, camera_of, check_entry, start_in_unit
+from .opening import check_bank
 from .outputs import output_folder
-from .result_files import View, write_result
+from .result_files import write_result
+from .views import View, register_views
 
 __all__ = ["RegisteredPhotograph", "register"]
 
-# standard deviation of the focal length of a given field of view, as a fraction of it
-VIEW_DEVIATION = 0.1
 THUMBNAIL_SIDE = 480  # pixels of the overlay's longer side in a notebook
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One object in one photograph, to register."""
-
-    # of a list: the texts of the row by column
-    cells: Mapping[str, str] = field(default_factory=dict)
-    name: str = ""  # as the user calls the photograph
-    photo: Path = Path()
-    meshes: tuple[Path, ...] = ()  # of several the best is found
-    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
-    # "exif" insists on the file's; or a horizontal field of view in degrees
-    camera: Camera | str | float | None = None
-    mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
-    instances: int = 1  # without a box, see registration.detect
-    prior: PosePrior | None = None
-    start: PoseFile | None = None  # the pose that is refined; nothing is searched for
-    # other photographs, found together with this one, whose camera is their world
-    views: tuple[View, ...] = ()
-    # boxes refer to the pixels in the file; else the EXIF orientation is applied first
-    as_stored: bool = False
-    label: str = ""  # of a dataset's object: a name that no other object has
-    frame: VideoFrame | None = None  # of the video ``photo``
-    error: str = ""  # why the object cannot be registered
-
-    def request(self) -> list[Any]:
-        """All that the result depends on besides the content of files."""
-        prior = None if self.prior is None else self.prior.to_dict()
-        camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
-        given = [self.name, self.box, camera, self.instances, prior]
-        views = [
-            (view.box, view.camera.describe(), view.T_cam_from_world.tolist())
-            for view in self.views
-        ]
-        mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
-        start = (
-            None
-            if self.start is None
-            else (self.start.T.tolist(), self.start.unit, self.start.confidence)
-        )
-        return [*given, start, views, self.as_stored, *mask]
-
-    def read(self) -> Photo:
-        """The photograph, or the frame; errors are those of :func:`read_photo`."""
-        if self.frame is not None:
-            return Photo(self.frame.read(), 1, None, ())
-        return read_photo(self.photo, as_stored=self.as_stored)
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """The photographs, meshes and mask that are read."""
-        masks = [mask_file(self.mask)[0]] if isinstance(self.mask, str | PathLike) else []
-        photos = [self.photo, *(view.photo for view in self.views)]
-        return (*photos, *self.meshes, *masks)
-
-    @property
-    def key(self) -> str:
-        """The label, or a digest of the request and the mesh files: equal rows of a list are
-        registered once."""
-        return self.label or text_digest(repr((self.request(), self.meshes)))
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
@@ -245,20 +178,6 @@ def register(
     return register_entry(entry, photo, registrar)
 
 
-def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
-    """The photograph and what is known about it; refuses what cannot be used, as before meshes are
-    opened."""
-    if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
-        raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
-    boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
-    item = image_items(
-        [photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks
-    )[0]
-    if isinstance(item, CurviregError):
-        raise item.with_subject(entry.name)
-    return item
-
-
 def register_entry(
     entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> RegisteredPhotograph:
@@ -344,61 +263,3 @@ def _camera_document(found: Camera | None, given: Camera | None) -> dict[str, An
     elif given is not None:
         found = replace(given, matrix=found.matrix, focal_deviation=found.focal_deviation)
     return {"camera": found and found.describe(), "camera_source": found and found.source}
-
-
-def register_views(
-    views: Sequence[View], registrar: Registrar, *, as_stored: bool = False
-) -> tuple[Registration, list[View]]:
-    """Register several photographs together, see :meth:`.Registrar.register_views`, without their
-    distortion.
-
-    Returns:
-        The registration; and the photographs with their pixels without distortion, cameras and
-        boxes of these. One that could not be read has no pixels.
-    """
-    seen = []
-    for view in views:
-        image = view.image
-        # the registrar reports what cannot be read, and goes on without it
-        with suppress(CurviregError, OSError):
-            image = read_photo(view.photo, as_stored=as_stored).image if image is None else image
-        if image is not None:
-            try:
-                camera = view.camera.at((image.shape[-2], image.shape[-1]))
-                straight = undistorted(
-                    image, camera, None if view.box is None else torch.tensor(view.box)
-                )
-            except CurviregError as error:
-                raise error.with_subject(view.name) from error
-            box = None if straight.box is None else straight.box.tolist()
-            view = replace(view, image=straight.image, box=box, camera=camera)
-        seen.append(view)
-    images = [view.photo if view.image is None else view.image for view in seen]
-    boxes = [None if view.image is None else view.box for view in seen]
-    matrices = torch.stack([v.camera.matrix for v in seen])
-    poses = torch.stack([v.T_cam_from_world for v in seen])
-    try:
-        return registrar.register_views(images, boxes, matrices, poses), seen
-    except CurviregError as error:
-        raise error.with_image_names([view.name for view in views]) from error
-
-
-def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
-    """The camera, or None if it is unknown, and its source; that of a calibration has a size or
-    distortion."""
-    given = entry.camera
-    if isinstance(given, Camera):
-        return given, "file" if given.size or given.distorts else "given"
-    if given not in (None, "exif"):
-        H, W = photo.image.shape[-2:]
-        return Camera(camera_of_view(float(given), (H, W)), focal_deviation=VIEW_DEVIATION), "fov"
-    # boxes of datasets come with what is to be known
-    camera = None if entry.as_stored else photo.camera()
-    if camera is not None:
-        return camera, "exif"
-    if given == "exif" or entry.start is not None:
-        is_insisted = given == "exif"
-        wanted = "no focal length in its EXIF" if is_insisted else "a start pose needs the camera"
-        message = f"{wanted}; give the camera"
-        raise InvalidInputError(message, subject=entry.name, kind="camera")
-    return None, None

@@ -12,10 +12,13 @@ import torch
 from curvireg_torch import Camera, PosePrior
 from curvireg_torch.data.pose_files import PoseFile
 from curvireg_torch.errors import InvalidInputError, MeshError
-from curvireg_torch.evaluation import runner
-from curvireg_torch.evaluation.photograph import Entry, View
-from curvireg_torch.evaluation.runner import run_entries
-from curvireg_torch.evaluation.store import Workers, run_processes
+from curvireg_torch.jobs import runner
+from curvireg_torch.jobs.entry import Entry
+from curvireg_torch.jobs.runner import run_entries
+from curvireg_torch.jobs.store import Workers, run_processes
+from curvireg_torch.jobs.views import View
+from curvireg_torch.utils import sources
+from curvireg_torch.utils.files import write_file
 
 
 @pytest.fixture
@@ -106,8 +109,33 @@ def test_other_requests_settings_and_code_are_registered_again(entries, tmp_path
     assert registered(changed, tmp_path / "out") == ["0a"]
     assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
     assert registered(changed, tmp_path / "out", settings={"top": 2}) == []
-    monkeypatch.setattr(runner, "code_digest", lambda *_: "newer")
+    monkeypatch.setattr(runner, "results_digest", lambda: "newer")
     assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
+
+
+@pytest.mark.parametrize(
+    ("changed", "count"),
+    [
+        ("jobs/photograph.py", 4),
+        ("registration/constants.json", 4),
+        ("terms.py", 4),
+        ("viewer/page.py", 0),
+        ("cli/register.py", 0),
+        ("visualization/overlay.py", 0),
+    ],
+)
+def test_rows_of_other_code_are_registered_again(changed, count, entries, tmp_path, monkeypatch):
+    package = tmp_path / "package"
+    for name in ("cli/a.py", "viewer/b.py", "visualization/c.py", changed):
+        write_file(package / name, b"x = 1")
+    monkeypatch.setattr(sources, "PACKAGE", package)
+    sources.package_digest.cache_clear()
+    registered(entries, tmp_path / "out")
+    write_file(package / changed, b"x = 2")
+    sources.package_digest.cache_clear()
+    assert len(registered(entries, tmp_path / "out")) == count
+    monkeypatch.undo()
+    sources.package_digest.cache_clear()
 
 
 def test_missing_photographs_are_tried_again(entries, tmp_path):

@@ -7,10 +7,10 @@ import pytest
 
 from curvireg_torch.data import calibrations
 from curvireg_torch.errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
-from curvireg_torch.evaluation import rigs
-from curvireg_torch.evaluation.lists import read_list
-from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.rigs import read_rig
+from curvireg_torch.jobs import rigs
+from curvireg_torch.jobs.lists import read_list
+from curvireg_torch.jobs.options import RegisterOptions
+from curvireg_torch.jobs.rigs import read_rig
 from curvireg_torch.utils.files import only_in
 from tests._support.doubling import check_linear
 from tests._support.lists import written

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation.outputs import FILES, MARKER, check_output_file, output_folder
+from curvireg_torch.jobs.outputs import FILES, MARKER, check_output_file, output_folder
 
 
 def marked(folder):

@@ -1,4 +1,4 @@
-"""Short evaluations. ``python -m tests.evaluation.small WORDS`` is the command line with a small
+"""Short evaluations. ``python -m tests._support.small WORDS`` is the command line with a small
 bank.
 
 ``CURVIREG_TEST_KILL=n`` kills the process with signal 9 in its n-th write of a result, whose last

@@ -19,9 +19,9 @@ from ..registration.result import two_decimals, verdict_counts
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
-from .opening import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
+from .entry import Entry, entry_of
+from .options import PRIOR_OPTIONS, RegisterOptions, limits_from_cells, prior_from_limits
 from .outputs import output_folder
-from .photograph import Entry
 from .runner import OpenRegistrar, failed_row, run_entries, thumbnail_of
 from .store import ResultStore, Row, has_pose
 
@@ -129,7 +129,7 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
     entries = []
     for path in options.photos:
         if is_video(path):
-            common = options.entry(path)
+            common = entry_of(path, options)
             entries += [
                 replace(common, name=name, frame=frame) for name, frame in video_frames(path, every)
             ]
@@ -141,7 +141,7 @@ def list_photographs(options: RegisterOptions, *, every: int = 1) -> list[Entry]
 def _entry_of(photo: Path, options: RegisterOptions) -> Entry:
     """The entry of a photograph; its ``error`` is why a detector's file has no box for it."""
     try:
-        return options.entry(photo)
+        return entry_of(photo, options)
     except CurviregError as error:
         if options.boxes is None:
             raise

@@ -3,7 +3,7 @@ from unittest.mock import Mock
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
-from curvireg_torch.evaluation.store import ResultStore, Workers
+from curvireg_torch.jobs.store import ResultStore, Workers
 
 DIGESTS = {"request": "a", "photo": "b"}
 

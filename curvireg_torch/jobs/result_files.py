@@ -1,14 +1,12 @@
 """The files of one result: ``result.json``, ``overlay.png``, ``pose.glb`` and ``pose.yaml``."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..geometry import Camera
 from ..registration import Registrar, Registration
 from ..registration.result import SCHEMA
 from ..utils.choices import UNITS
@@ -19,21 +17,10 @@ from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
 from .store import to_json
+from .views import View
 
 # of the largest mesh that is written: viewers are slow with files above 30 MB
 MAX_GLB_FACES = 300_000
-
-
-@dataclass(frozen=True)
-class View:
-    """One of several photographs of an object in one pose."""
-
-    name: str  # as the user calls the photograph
-    photo: Path
-    box: Sequence[float] | None  # x0, y0, x1, y1 in px
-    camera: Camera
-    T_cam_from_world: Tensor  # (4, 4) float64, lengths in the mesh's unit
-    image: Tensor | None = None  # its pixels, if it was read
 
 
 def write_result(

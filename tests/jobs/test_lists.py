@@ -10,10 +10,10 @@ import torch
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.evaluation import lists, photograph, runner
-from curvireg_torch.evaluation.lists import find_photographs, list_photographs, read_list
-from curvireg_torch.evaluation.opening import RegisterOptions
-from curvireg_torch.evaluation.photograph import Entry
+from curvireg_torch.jobs import lists, photograph, runner
+from curvireg_torch.jobs.entry import Entry
+from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import table

@@ -1,0 +1,52 @@
+"""Folders of the user: viewpoints, where they are known."""
+
+from collections.abc import Sequence
+
+from ..data import PoseFolder
+from ..jobs.store import Row
+from .benchmark import Benchmark, Errors
+
+
+class PoseFolderBenchmark(Benchmark):
+    """Viewpoints in folders of the user. The method is given the box and the object's mesh, and no
+    camera.
+
+    Photographs of unknown pose are registered too. They count in ``n``, ``reliable`` and
+    ``mean_confidence``; accuracy and errors are those of the ``n_posed`` others.
+    """
+
+    name = "web"
+    label = "{category}/{object_index}"
+    columns = (
+        *(
+            "category",
+            "object_index",
+            "image_id",
+            "azimuth",
+            "elevation",
+            "theta",
+            "true_azimuth",
+            "true_elevation",
+        ),
+        *("true_theta", "error_deg", "score", "confidence", "reliable", "failed", "seconds"),
+    )
+    dataset: PoseFolder
+
+    def scores(self, rows: Sequence[Row], errors: Errors, chosen: list[int]) -> Row:
+        """Accuracy at 15 and 30 degrees and the median error where the pose is known; confidence of
+        all."""
+        posed = errors["error_deg"][chosen]
+        posed = posed[~posed.isnan()]
+        scores = (
+            self.rotation_scores(posed)
+            if len(posed)
+            else dict.fromkeys((*self.thresholds, "med_err_deg"))
+        )
+        confidences = [rows[i].get("confidence") or 0.0 for i in chosen]
+        return {
+            **scores,
+            "n": len(chosen),
+            "n_posed": len(posed),
+            "reliable": sum(bool(rows[i].get("reliable")) for i in chosen),
+            "mean_confidence": sum(confidences) / len(chosen) if chosen else None,
+        }

@@ -1,0 +1,146 @@
+"""One photograph with what is known about it, before it is registered."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from ..data import Photo, read_photo
+from ..data.frames import VideoFrame
+from ..data.masks import mask_file
+from ..data.pose_files import PoseFile
+from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..geometry import Camera, camera_matrix
+from ..geometry.cameras import camera_of_view
+from ..geometry.pose_prior import PosePrior
+from ..registration.inputs import ImageItem, image_items
+from ..utils.choices import UNITS
+from ..utils.files import file_digest, text_digest
+from .options import RegisterOptions, prior_from_limits
+from .views import View
+
+# standard deviation of the focal length of a given field of view, as a fraction of it
+VIEW_DEVIATION = 0.1
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One object in one photograph, to register."""
+
+    # of a list: the texts of the row by column
+    cells: Mapping[str, str] = field(default_factory=dict)
+    name: str = ""  # as the user calls the photograph
+    photo: Path = Path()
+    meshes: tuple[Path, ...] = ()  # of several the best is found
+    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
+    # "exif" insists on the file's; or a horizontal field of view in degrees
+    camera: Camera | str | float | None = None
+    mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
+    instances: int = 1  # without a box, see registration.detect
+    prior: PosePrior | None = None
+    start: PoseFile | None = None  # the pose that is refined; nothing is searched for
+    # other photographs, found together with this one, whose camera is their world
+    views: tuple[View, ...] = ()
+    # boxes refer to the pixels in the file; else the EXIF orientation is applied first
+    as_stored: bool = False
+    label: str = ""  # of a dataset's object: a name that no other object has
+    frame: VideoFrame | None = None  # of the video ``photo``
+    error: str = ""  # why the object cannot be registered
+
+    def request(self) -> list[Any]:
+        """All that the result depends on besides the content of files."""
+        prior = None if self.prior is None else self.prior.to_dict()
+        camera = self.camera.describe() if isinstance(self.camera, Camera) else self.camera
+        given = [self.name, self.box, camera, self.instances, prior]
+        views = [
+            (view.box, view.camera.describe(), view.T_cam_from_world.tolist())
+            for view in self.views
+        ]
+        mask = [] if self.mask is None else [str(self.mask), file_digest(mask_file(self.mask)[0])]
+        start = (
+            None
+            if self.start is None
+            else (self.start.T.tolist(), self.start.unit, self.start.confidence)
+        )
+        return [*given, start, views, self.as_stored, *mask]
+
+    def read(self) -> Photo:
+        """The photograph, or the frame; errors are those of :func:`read_photo`."""
+        if self.frame is not None:
+            return Photo(self.frame.read(), 1, None, ())
+        return read_photo(self.photo, as_stored=self.as_stored)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The photographs, meshes and mask that are read."""
+        masks = [mask_file(self.mask)[0]] if isinstance(self.mask, str | PathLike) else []
+        photos = [self.photo, *(view.photo for view in self.views)]
+        return (*photos, *self.meshes, *masks)
+
+    @property
+    def key(self) -> str:
+        """The label, or a digest of the request and the mesh files: equal rows of a list are
+        registered once."""
+        return self.label or text_digest(repr((self.request(), self.meshes)))
+
+
+def entry_of(photo: Path, options: RegisterOptions) -> Entry:
+    """A photograph with the box, camera, meshes and other inputs of the options."""
+    camera = options.guess if options.camera is None else options.camera
+    if isinstance(camera, Sequence) and camera != "exif":
+        camera = Camera(camera_matrix(*camera))
+    return Entry(
+        name=str(photo),
+        photo=photo,
+        meshes=options.meshes,
+        box=options.box_of(photo),
+        camera=camera,
+        mask=options.mask,
+        instances=options.instances,
+        prior=prior_from_limits(options.limits or {}),
+        start=options.read_start(),
+    )
+
+
+def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
+    """The photograph and what is known about it; refuses what cannot be used, as before meshes are
+    opened."""
+    if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
+        raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
+    boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
+    item = image_items(
+        [photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks
+    )[0]
+    if isinstance(item, CurviregError):
+        raise item.with_subject(entry.name)
+    return item
+
+
+def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
+    """The camera, or None if it is unknown, and its source; that of a calibration has a size or
+    distortion."""
+    given = entry.camera
+    if isinstance(given, Camera):
+        return given, "file" if given.size or given.distorts else "given"
+    if given not in (None, "exif"):
+        H, W = photo.image.shape[-2:]
+        return Camera(camera_of_view(float(given), (H, W)), focal_deviation=VIEW_DEVIATION), "fov"
+    # boxes of datasets come with what is to be known
+    camera = None if entry.as_stored else photo.camera()
+    if camera is not None:
+        return camera, "exif"
+    if given == "exif" or entry.start is not None:
+        is_insisted = given == "exif"
+        wanted = "no focal length in its EXIF" if is_insisted else "a start pose needs the camera"
+        message = f"{wanted}; give the camera"
+        raise InvalidInputError(message, subject=entry.name, kind="camera")
+    return None, None
+
+
+def start_in_unit(start: "PoseFile", unit: str | None) -> tuple[tuple[float, ...], ...]:
+    """(4, 4) of a pose, with the translation in the ``unit`` of a mesh."""
+    T = start.T.clone()
+    if start.unit is not None:
+        T[:3, 3] *= UNITS[start.unit] / UNITS[unit or "m"]
+    return tuple(map(tuple, T.tolist()))

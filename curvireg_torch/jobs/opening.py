@@ -1,0 +1,82 @@
+"""The registrar of some mesh files or banks, as options ask for it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import BankError
+from .options import RegisterOptions
+
+if TYPE_CHECKING:
+    from ..matching import ViewBank
+    from ..pipeline import Pipeline
+    from ..registration import Registrar
+
+
+def open_registrar(
+    options: RegisterOptions,
+    meshes: Sequence[Path],
+    *,
+    progress: Callable[[str, int, int], object] | None = None,
+) -> "Registrar":
+    """The registrar of mesh files or banks; ``progress`` is called while banks are built, instead
+    of showing a bar."""
+    from ..registration import Registrar
+
+    pipeline = options.open_pipeline()
+    banks = [_open_bank(options, mesh, pipeline, progress or options.progress) for mesh in meshes]
+    banks = [bank.to(options.device) for bank in banks]
+    if all(mesh.suffix == ".safetensors" for mesh in meshes):
+        if options.bank_decides:
+            pipeline = banks[0].pipeline
+        elif options.pose is None and options.pipeline is None:  # a preset does not fix the views
+            pipeline = replace(pipeline, views=banks[0].pipeline.views)
+    if not options.refine:
+        pipeline = replace(pipeline, contours=False, search=False)
+    if options.top is not None:
+        pipeline = replace(pipeline, hypotheses=options.top)
+    settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
+    return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
+
+
+def _open_bank(
+    options: RegisterOptions,
+    mesh: Path,
+    pipeline: "Pipeline",
+    progress: bool | Callable[[str, int, int], object],
+) -> "ViewBank":
+    from ..matching import ViewBank, cached_bank
+
+    if mesh.suffix != ".safetensors":
+        loaded = options.load_mesh(mesh)
+        return cached_bank(loaded, pipeline=pipeline, renderer=options.renderer, progress=progress)
+    bank = ViewBank.load(mesh)
+    check_bank(bank, mesh, unit=options.unit if options.unit_is_given else None, up=options.up)
+    if options.pose not in (None, bank.pipeline.views.pose):
+        built = (
+            "given views"
+            if bank.pipeline.views.pose == "given"
+            else f"--pose {bank.pipeline.views.pose}"
+        )
+        message = f"built for {built}, not for --pose {options.pose}; leave --pose out, or "
+        raise BankError(f"{message}build it again with 'curvireg bank'", subject=mesh)
+    return bank
+
+
+def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None) -> None:
+    """Refuse a unit or an axis that is not that of the bank's mesh; None is not given."""
+    from ..mesh.mesh import mesh_unit, mesh_up
+
+    built_unit = mesh_unit(bank.mesh)
+    built_up = mesh_up(bank.mesh)
+    again = "or build it again with 'curvireg bank'"
+    if unit not in (None, built_unit):
+        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
+        raise BankError(
+            f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path
+        )
+    if up not in (None, built_up):
+        raise BankError(
+            f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path
+        )
