@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..features.backbone import STRIDES, Backbone
+from ..filters.operations import resized
 from ..geometry.crops import box_iou, crop_transforms, non_maximum_suppression, square_boxes
 from ..geometry.pose_prior import PosePrior, check_distance
 from ..matching import ViewBank, ViewMatcher
@@ -23,7 +24,7 @@ from ..terms import QueryFeatures
 from ..utils.checks import check_photograph, check_pixels
 from .confidence import detection_probability
 from .focal import usual_camera
-from .inputs import ImageItem, check_crop, image_items, resized
+from .inputs import ImageItem, check_crop, image_items
 from .poses import projected_box
 from .result import Detection, FailedRegistration, Registration, corners, two_decimals
 from .tracker import boxes_at

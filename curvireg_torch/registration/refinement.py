@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError, LostObjectError
+from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
-from .edges import EdgeCrops
 from .focal import focal_covariance
 from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .poses import (

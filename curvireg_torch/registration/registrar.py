@@ -13,6 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ..errors import CurviregError, InvalidInputError
+from ..fitting.edges import EdgeCrops
+from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches, Landmarks
+from ..fitting.measured_fit import measure_contours
 from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import ViewSphere
 from ..matching import ViewBank, ViewDescriber, ViewMatcher, cached_bank
@@ -24,14 +27,11 @@ from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
-from .confidence import MIN_LANDMARKS, are_near
-from .contour_fit import measure_contours
+from .confidence import are_near
 from .detection import Detector, detect
-from .edges import EdgeCrops
 from .focal import FINISHED
 from .inputs import ImageItem, check_crop, image_items
 from .judging import Work, better_of, flat_mesh_warnings, judged
-from .landmarks import LandmarkMatches, Landmarks
 from .poses import (
     FINISHED_FITS,
     SCREENING_WEIGHT,

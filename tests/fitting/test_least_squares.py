@@ -8,13 +8,13 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
+from curvireg_torch.calibration import COVARIANCE_SCALE
+from curvireg_torch.fitting import least_squares as ls
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
-from curvireg_torch.registration import least_squares as ls
-from curvireg_torch.registration.confidence import COVARIANCE_SCALE
 from curvireg_torch.rendering.contours import ContourPoints
-from tests.registration.cube import K, fitted, pose, silhouette
+from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 
@@ -199,3 +199,30 @@ def test_long_steps_are_shortened_by_the_distance_in_any_unit(unit):
     centre = unit * torch.tensor([0.0, 0.0, 0.5]).double()
     step = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 3.5 * unit]], dtype=torch.float64)
     assert ls.step_fraction(step, T, centre).tolist() == [pytest.approx(ls.MAX_TRANSLATION)]
+
+
+@pytest.mark.parametrize(("radius", "expected"), [(1.0, 6), (6.0, 6), (8.0, 4)])
+def test_directions_are_known_where_errors_of_points_and_normals_tell_less(radius, expected):
+    """Against the definition: what 0.05 rad of a normal, and 0.05 radii along the line of sight,
+    change in the derivatives."""
+    points, T, centre, J = cloud(60)
+    W = torch.full((1, 60, 1), 0.5, dtype=torch.float64)
+    _, known = ls.pose_covariance(
+        ls.Measurements(J, W, W), points, T, K[None], centre, radius=radius
+    )
+    small = 1e-6
+    n = points.normals
+    turned = n + small * torch.stack([-n[..., 1], n[..., 0]], dim=-1)
+    _, by_normal = ls.project(points.model, turned, T, K[None], centre)
+    seen = (points.model @ T[:, :3, :3].mT + T[:, None, :3, 3])[0]
+    ray = F.normalize(seen, dim=-1)
+    arms = (points.model[0] - centre) @ T[0, :3, :3].T
+    by_rotation = torch.linalg.cross(arms + small * ray, J[0, :, 3:])
+    along_sight = (by_rotation - J[0, :, :3]) / small
+    E_normal = (by_normal - J)[0] / small
+    E_sight = F.pad(along_sight, (0, 3))
+    E = 0.05**2 * E_normal.T @ (0.5 * E_normal)
+    E = E + (0.05 * radius) ** 2 * E_sight.T @ (0.5 * E_sight)
+    A = J[0].T @ (0.5 * J[0])
+    share = torch.linalg.eigvals(torch.linalg.solve(A + E, A)).real
+    assert int(known) == int((share > 0.75).sum()) == expected

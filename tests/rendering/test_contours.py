@@ -1,0 +1,89 @@
+"""Contours of a mesh: the same in any unit, and nothing of what lies behind the camera."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.rendering.contours import MAX_OCCLUDING, ContourPoints, MeshContours
+
+K = torch.tensor([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]], dtype=torch.float64)
+
+
+def stairs(unit: float) -> trimesh.Trimesh:
+    """Two boxes of different heights that touch, and a flat sphere beside them."""
+    parts = [trimesh.creation.box((2.0, 1.2, height)) for height in (0.5, 0.9)]
+    parts[1].apply_translation((0.0, 1.2, 0.2))
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    ball.apply_translation((1.6, 0.0, 0.1))
+    mesh = trimesh.util.concatenate([*parts, ball])
+    mesh.apply_scale(unit)
+    return mesh
+
+
+@cache
+def poses() -> Tensor:
+    """(4, 4, 4) around the mesh in units, 5 to 8 away."""
+    T = []
+    for azimuth, elevation, distance in ((20, 25, 5), (110, 40, 6), (200, 10, 7), (290, 60, 8)):
+        R = rotation_from_viewpoint(float(azimuth), float(elevation), 10.0).double()
+        T.append(transform(R, torch.tensor([0.0, 0.0, float(distance)]).double()))
+    return torch.stack(T)
+
+
+@cache
+def contour_points(unit: float) -> ContourPoints:
+    T = poses().clone()
+    T[:, :3, 3] *= unit
+    return MeshContours(stairs(unit)).points(T, K[None], 128)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 80.0])
+def test_contours_do_not_depend_on_the_unit(unit):
+    one = contour_points(1.0)
+    same = contour_points(unit)
+    agree = (one.valid == same.valid) & (one.outline == same.outline)
+    assert float(agree.double().mean()) > 0.98
+    both = one.valid & same.valid
+    apart = (same.model / unit - one.model).norm(dim=-1)[both]
+    assert float((apart < 1e-3).double().mean()) > 0.95
+    turned = (same.normals * one.normals).sum(dim=-1).abs()[both]
+    assert float((turned > 0.99).double().mean()) > 0.95
+
+
+def test_every_view_has_creases_beside_its_occluding_contours():
+    points = contour_points(1.0)
+    creases = points.valid[:, MAX_OCCLUDING:].sum(dim=1)
+    assert int(creases.min()) > 10
+    assert not bool(points.outline[:, MAX_OCCLUDING:].any())
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 80.0])
+def test_edges_that_reach_behind_the_camera_have_no_points(unit):
+    """A long bar that passes the camera: only whole edges in front of it count."""
+    bar = trimesh.creation.box((0.4, 0.4, 10.0))
+    plate = trimesh.creation.box((1.0, 1.0, 0.1))
+    plate.apply_translation((0.0, 0.0, 6.0))
+    mesh = trimesh.util.concatenate([bar, plate])
+    mesh.apply_scale(unit)
+    T = transform(torch.eye(3).double(), unit * torch.tensor([0.5, 0.0, 0.0]).double())[None]
+    points = MeshContours(mesh).points(T, K[None], 128)
+    model = points.model[points.valid] / unit
+    assert len(model) > 20
+    depth = model[:, 2]
+    assert float(depth.min()) > 4.9, "the far end of the bar, and the plate"
+
+
+def test_normals_of_outlines_point_away_from_the_object():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    T = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 300.0]).double())[None]
+    points = MeshContours(ball).points(T, K[None], 128)
+    model = points.model[points.outline]
+    radial = model[:, :2] / model[:, :2].norm(dim=1, keepdim=True)
+    cosine = (points.normals[points.outline] * radial).sum(dim=1)
+    assert len(model) > 100
+    assert float(cosine.min()) > np.cos(np.radians(2.0)), "of the sphere, not of its facets"
