@@ -4,6 +4,7 @@ suppression of non-maxima."""
 import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -303,3 +304,20 @@ def is_directional_maximum(length: Tensor, x: Tensor, y: Tensor) -> Tensor:
         # Strict on one side only, so that a plateau two pixels wide yields exactly one point.
         result = result | (selected & (length > shifted(dx, dy)) & (length >= shifted(-dx, -dy)))
     return result
+
+
+def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> Tensor:
+    """(C, h, w) float32 in about [0, 1] of a photograph (C, H, W), floating in [0, 1] or uint8."""
+    if tuple(image.shape[-2:]) == size and image.is_floating_point():
+        return image.float()
+    options: dict[str, Any] = {
+        "size": size,
+        "mode": mode,
+        "antialias": True,
+        "align_corners": False,
+    }
+    # One channel at a time to save memory: photographs are large.
+    small = torch.cat(
+        [F.interpolate(channel[None, None].float(), **options)[0] for channel in image]
+    )
+    return small / 255.0 if image.dtype == torch.uint8 else small

@@ -1,9 +1,9 @@
 """From a ranking of views to poses: registration, refinement, following, and detection without a
 box."""
 
+from ..fitting.contour_fit import fit_contours as fit_contours
+from ..fitting.measured_fit import ContourFit as ContourFit
 from .confidence import RELIABLE as RELIABLE
-from .contour_fit import ContourFit as ContourFit
-from .contour_fit import fit_contours as fit_contours
 from .detection import Detector as Detector
 from .detection import Proposals as Proposals
 from .detection import detect as detect

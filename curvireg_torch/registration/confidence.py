@@ -6,32 +6,20 @@ detection, were fitted by scripts/calibration on generated photographs; docs/acc
 accuracy on others.
 """
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from ..calibration import CALIBRATION
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
-# For each model its ``weights`` and ``bias``; for "instance" and "category" also ``slope`` and
-# ``resolution``, see :func:`shares`
-CALIBRATION: dict[str, Any] = json.loads(
-    Path(__file__).with_name("calibration.json").read_text(encoding="utf-8")
-)
-# Factor of the least-squares covariance, which ignores edges that do not belong to the object: with
-# it, nine in ten true poses lie in the 90 % ellipsoid of a reliable result, on generated
-# photographs
-COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]
-# Landmarks that must agree on a pose, and the probability that the object is where they do, in a
-# whole photograph: on generated shelves 84 of 88. It is less where other objects have a similar
-# print
-MIN_LANDMARKS = 8
+# Probability that the object is where landmarks agree on a pose, in a whole photograph: on
+# generated shelves 84 of 88. It is less where other objects have a similar print
 LANDMARK_PROBABILITY = 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
 # the more, the better

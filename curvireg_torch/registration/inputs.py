@@ -418,23 +418,6 @@ def _pixels(image: Any) -> tuple[Tensor, Camera | None]:
     return image, None
 
 
-def resized(image: Tensor, size: tuple[int, int], *, mode: str = "bilinear") -> Tensor:
-    """(C, h, w) float32 in about [0, 1] of a photograph (C, H, W), floating in [0, 1] or uint8."""
-    if tuple(image.shape[-2:]) == size and image.is_floating_point():
-        return image.float()
-    options: dict[str, Any] = {
-        "size": size,
-        "mode": mode,
-        "antialias": True,
-        "align_corners": False,
-    }
-    # One channel at a time to save memory: photographs are large.
-    small = torch.cat(
-        [F.interpolate(channel[None, None].float(), **options)[0] for channel in image]
-    )
-    return small / 255.0 if image.dtype == torch.uint8 else small
-
-
 def check_crop(crop: Tensor) -> None:
     """Raise :class:`ImageError` for a (C, S, S) crop that shows nothing to register."""
     check_pixels(crop, "of the box")

@@ -8,6 +8,8 @@ import torch
 import trimesh
 from torch import Tensor
 
+from ..fitting.edges import EdgeCrops
+from ..fitting.landmarks import LandmarkMatches
 from ..matching import Ranking
 from ..mesh import has_colours, mesh_radius
 from ..terms import QueryFeatures
@@ -20,10 +22,8 @@ from .confidence import (
     probability_of_any,
     undetermined_axes,
 )
-from .edges import EdgeCrops
 from .framing import border_sides, outside_fraction, outside_warnings
 from .inputs import ImageItem
-from .landmarks import LandmarkMatches
 from .poses import SCORE_WEIGHTS, Poses, hypothesis_of, named_features, pose_scores
 from .priors import Limits
 from .result import FailedRegistration, Registration

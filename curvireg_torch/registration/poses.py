@@ -10,15 +10,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..fitting.contour_fit import fit_to_edges, quick_fit
+from ..fitting.contour_problem import ContourProblem
+from ..fitting.details import compare_details
+from ..fitting.edges import EdgeCrops
+from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.texture_fit import fit_texture, turned
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..terms import Appearance, QueryFeatures
 from .confidence import are_near
-from .contour_fit import ContourFit, ContourProblem, contour_support, fit_to_edges, quick_fit
-from .details import compare_details
-from .edges import EdgeCrops
 from .result import Hypothesis
-from .texture_fit import fit_texture, turned
 
 if TYPE_CHECKING:
     from .registrar import Registrar

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from .edges import EdgeCrops
+from ..fitting.edges import EdgeCrops
 from .judging import Work
 from .poses import CLOSE_RIVALS, Poses, close_rivals, distinct_poses, pose_scores, with_details
 

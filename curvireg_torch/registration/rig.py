@@ -11,6 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
+from ..fitting.contour_fit import FIRST_RADII, QUARTER_SIZE_RADII
+from ..fitting.contour_problem import ContourProblem, ContourState
+from ..fitting.details import compare_details
+from ..fitting.edges import CROP_SIZE, EdgeCrops
+from ..fitting.landmarks import LandmarkMatches
+from ..fitting.least_squares import Measurements, pose_covariance
+from ..fitting.measured_fit import FULL_SIZE_RADII
 from ..geometry import rotation_error
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
@@ -18,18 +25,7 @@ from ..geometry.crops import box_iou
 from ..rendering.contours import ContourPoints
 from ..terms import QueryFeatures, crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
-from .contour_fit import (
-    FIRST_RADII,
-    FULL_SIZE_RADII,
-    QUARTER_SIZE_RADII,
-    ContourProblem,
-    ContourState,
-)
-from .details import compare_details
-from .edges import CROP_SIZE, EdgeCrops
 from .inputs import ImageItem
-from .landmarks import LandmarkMatches
-from .least_squares import Measurements, pose_covariance
 from .poses import (
     POSE_FEATURES,
     RANK_ALONE,

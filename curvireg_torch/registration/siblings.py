@@ -9,12 +9,12 @@ import torch
 import trimesh
 from torch import Tensor
 
+from ..fitting.details import compare_details
+from ..fitting.edges import EdgeCrops
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
 from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from .confidence import RIVAL_ANGLE
-from .details import compare_details
-from .edges import EdgeCrops
 from .poses import POSE_FEATURES, Poses, placed, pose_scores, with_edge_support
 from .refits import best_inside
 

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from .edges import EdgeCrops
+from ..fitting.edges import EdgeCrops
+from ..fitting.focal_length import USUAL_DEVIATION
 from .focal import (
     FITTED,
     TRIED_VIEWS,
-    USUAL_DEVIATION,
     focal_covariance,
     off_axis_angle,
     possible_cameras,

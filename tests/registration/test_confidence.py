@@ -7,11 +7,11 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
+from curvireg_torch.fitting.edges import EdgeCrops
+from curvireg_torch.fitting.measured_fit import contour_support
 from curvireg_torch.mesh import mesh_symmetries
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.registration import confidence
-from curvireg_torch.registration.contour_fit import contour_support
-from curvireg_torch.registration.edges import EdgeCrops
 from curvireg_torch.registration.poses import RANK_ALONE, SCORE_WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import (

@@ -17,11 +17,12 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, contour_fit, refits
+from curvireg_torch.registration import FailedRegistration, Follower, refits
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module

@@ -12,29 +12,21 @@ import trimesh
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import ImageError, LostObjectError
+from curvireg_torch.fitting.edges import CROP_SIZE
+from curvireg_torch.fitting.flow import Frame, Keyframe, track_points
+from curvireg_torch.fitting.least_squares import fit_points, pixels
+from curvireg_torch.fitting.regions import HALF_RATE_COUNT, RegionModel, colour_bins, line_posterior
+from curvireg_torch.fitting.texture_fit import surface_corners
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.registration import tracker
-from curvireg_torch.registration.edges import CROP_SIZE
-from curvireg_torch.registration.least_squares import fit_points, pixels
-from curvireg_torch.registration.texture_fit import surface_corners
-from curvireg_torch.registration.tracker import (
-    FLOW_SCALES,
-    HALF_RATE_COUNT,
-    Frame,
-    Keyframe,
-    RegionModel,
-    Tracker,
-    colour_bins,
-    line_posterior,
-    track_points,
-)
+from curvireg_torch.registration.tracker import FLOW_SCALES, Tracker
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, sequence
-from tests.registration.cube import cube, pose
+from tests.fitting.cube import cube, pose
 
 K = camera_matrix(500.0, 500.0, 159.5, 119.5, dtype=torch.float64)
 SIZE = (240, 320)

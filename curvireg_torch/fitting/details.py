@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from ..rendering.contours import MeshContours
-from .contour_fit import ContourProblem
+from .contour_problem import ContourProblem
 from .edges import EdgeCrops
 from .least_squares import pixels
 

@@ -10,21 +10,18 @@ from torch import Tensor
 
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.fitting import contour_fit
+from curvireg_torch.fitting.contour_fit import fit_to_edges, quick_fit
+from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
+from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
+from curvireg_torch.fitting.least_squares import apply_twist, project
+from curvireg_torch.fitting.measured_fit import contour_support
 from curvireg_torch.mesh.mesh import mesh_centre
-from curvireg_torch.registration import ContourFit, contour_fit, fit_contours
-from curvireg_torch.registration.contour_fit import (
-    ContourProblem,
-    ContourState,
-    contour_support,
-    fit_to_edges,
-    quick_fit,
-)
-from curvireg_torch.registration.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
-from curvireg_torch.registration.least_squares import apply_twist, project
+from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from curvireg_torch.terms import crop_regions
-from tests.registration.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
+from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
 T = pose([0.3, -0.5, 0.2], [0.1, 0.2, 6.0])[None]

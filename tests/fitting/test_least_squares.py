@@ -8,13 +8,13 @@ import torch
 import torch.nn.functional as F
 import trimesh
 
+from curvireg_torch.calibration import COVARIANCE_SCALE
+from curvireg_torch.fitting import least_squares as ls
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import project_points, transform
 from curvireg_torch.mesh.mesh import mesh_centre
-from curvireg_torch.registration import least_squares as ls
-from curvireg_torch.registration.confidence import COVARIANCE_SCALE
 from curvireg_torch.rendering.contours import ContourPoints
-from tests.registration.cube import K, fitted, pose, silhouette
+from tests.fitting.cube import K, fitted, pose, silhouette
 
 ZERO = torch.zeros(3, dtype=torch.float64)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..rendering import DepthRenderer
 from ..rendering.contours import ContourPoints
-from .contour_fit import FULL_SIZE_RADII, ContourFit, ContourProblem
+from .contour_problem import ContourProblem
 from .least_squares import (
     MIN_MATCHES,
     Measurements,
@@ -23,6 +23,7 @@ from .least_squares import (
     fit_points,
     pose_covariance,
 )
+from .measured_fit import FULL_SIZE_RADII, ContourFit
 
 # Corners of a view: how many at most, how many px apart at least, and the least strength as a
 # fraction of the strongest one's

@@ -9,23 +9,19 @@ import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
+from curvireg_torch.fitting import landmarks as landmarks_module
+from curvireg_torch.fitting.landmarks import MIN_LANDMARKS, LandmarkMatches, Landmarks, _pose
+from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import box_iou, camera_matrix, projected_boxes, rotation_error
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.registration import landmarks as landmarks_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration.confidence import (
-    LANDMARK_PROBABILITY,
-    MIN_LANDMARKS,
-    detection_probability,
-)
+from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
-from curvireg_torch.registration.landmarks import LandmarkMatches, Landmarks, _pose
-from curvireg_torch.registration.least_squares import apply_twist
 from curvireg_torch.registration.poses import fit_poses, landmark_evidence, placed, pose_scores
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background

@@ -10,20 +10,15 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
+from curvireg_torch.fitting.contour_problem import ContourProblem
+from curvireg_torch.fitting.edges import EdgeCrops
+from curvireg_torch.fitting.least_squares import apply_twist
+from curvireg_torch.fitting.texture_fit import _TextureRounds, fit_texture, match_patches, turned
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected_boxes, transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint, up_rotation
 from curvireg_torch.mesh.mesh import extreme_points, mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
-from curvireg_torch.registration.contour_fit import ContourProblem
-from curvireg_torch.registration.edges import EdgeCrops
-from curvireg_torch.registration.least_squares import apply_twist
-from curvireg_torch.registration.texture_fit import (
-    _TextureRounds,
-    fit_texture,
-    match_patches,
-    turned,
-)
 from curvireg_torch.rendering import make_renderer, render_colour
 from curvireg_torch.rendering.contours import MeshContours
 from tests._support.cans import can, photograph

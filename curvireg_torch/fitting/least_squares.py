@@ -8,11 +8,11 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from ..calibration import COVARIANCE_SCALE
 from ..geometry import rotation_from_axis_angle
 from ..geometry.cameras import transform
 from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
-from .confidence import COVARIANCE_SCALE
 
 # Longest step: radians, and fraction of the object's distance
 MAX_ROTATION = 0.2

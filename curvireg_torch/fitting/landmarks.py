@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..filters.operations import resized
 from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.threads import map_on_threads
-from .confidence import MIN_LANDMARKS
-from .inputs import resized
 from .least_squares import nearest_rigid
 
+MIN_LANDMARKS = 8  # that must agree on a pose
 # Number of views that landmarks are taken from, and their side in px
 VIEWS = 48
 VIEW_SIZE = 192

@@ -1,0 +1,1 @@
+"""Solvers: poses and crops of photographs in, poses that fit them out; tensors only."""

@@ -1,0 +1,180 @@
+"""Focal lengths that are fitted together with poses, by least squares."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..geometry.cameras import rotation_towards, transform
+from .contour_problem import STEPS_PER_ROUND, ContourProblem, ContourState
+from .least_squares import (
+    Measurements,
+    apply_twist,
+    damped_solution,
+    project,
+    residual_variance,
+    summed_by_cells,
+)
+
+USUAL_FOCAL = 0.8
+USUAL_DEVIATION = 0.7
+"""Focal length of unknown cameras as a multiple of the photograph's longer side, and standard
+deviation of its logarithm: telephones have about 0.75, telephoto lenses 5."""
+
+FOCAL_LIMITS = (0.35, 8.0)
+"""Multiples of the longer side that an estimated focal length stays within: 110 and 7 degrees."""
+
+FITTED_DEVIATION = 0.5
+FITTED_REACH = 0.35
+"""Deviation of the prior while an unknown focal length is fitted, and difference of log f from
+which its pull does not grow: telephones are the rule, and what is far from them must not be pulled
+far."""
+
+FOCAL_SCALE = 16.0
+"""Factor of the least-squares variance of log f, chosen on generated photographs and on photographs
+with cameras."""
+
+MAX_FOCAL_STEP = 0.25  # Longest step of log f
+
+
+@dataclass(frozen=True)
+class FocalPrior:
+    """What is known of the focal lengths of N poses: log f is ``log_zoom`` (N,) more than that of
+    their cameras, with a standard ``deviation``, and stays within ``low`` and ``high`` (N,) of it.
+    Beyond ``reach``, its pull is constant."""
+
+    log_zoom: Tensor
+    deviation: float
+    low: Tensor
+    high: Tensor
+    reach: float = math.inf
+
+    @staticmethod
+    def usual(cameras: Tensor, size: tuple[int, int]) -> "FocalPrior":
+        """That of an unknown camera; ``cameras`` (N, 3, 3) are where fits begin."""
+        longer = float(max(size))
+        log = (cameras[:, 0, 0] / longer).log()
+        low, high = (math.log(limit) - log for limit in FOCAL_LIMITS)
+        return FocalPrior(math.log(USUAL_FOCAL) - log, FITTED_DEVIATION, low, high, FITTED_REACH)
+
+
+@dataclass(frozen=True)
+class FocalFit:
+    """N poses in a ``state``, with the cameras of a ``problem``, whose focal lengths grew by
+    ``log_zoom`` (N,)."""
+
+    problem: ContourProblem
+    state: ContourState
+    log_zoom: Tensor
+
+
+def fit_focal_length(
+    problem: ContourProblem, T: Tensor, prior: FocalPrior, radii: Sequence[float]
+) -> FocalFit:
+    """Poses ``T`` (N, 4, 4) and focal lengths whose contours lie on edges:
+    :meth:`ContourProblem.descend` with log f as a seventh unknown. While it changes, the object
+    moves so that its image keeps size and place."""
+    log_zoom = torch.zeros(len(T), dtype=torch.float64)
+    cameras = problem.K
+    state = problem.state(T)
+    for radius in radii:
+        information, _ = focal_information(problem, state, radius)
+        stiffness = information.scale / prior.deviation**2
+        for _ in range(STEPS_PER_ROUND):
+            uv, J = project(
+                state.points.model, state.points.normals, state.T, problem.K, problem.centre
+            )
+            J = torch.cat([J, _by_focal_length(problem, state, uv, J)[..., None]], dim=-1)
+            gap = prior.log_zoom - log_zoom
+            pull = stiffness * (prior.reach / gap.abs().clamp(min=1e-9)).clamp(max=1.0)
+            A = torch.zeros(len(T), 7, 7, dtype=torch.float64)
+            A[:, 6, 6] = pull
+            b = torch.zeros(len(T), 7, 1, dtype=torch.float64)
+            b[:, 6, 0] = pull * gap
+            step = problem.selected_step(state.points, uv, J, radius, [(A, b)])
+            fraction = problem.step_fraction(step[:, :6], state.T)
+            fraction = torch.minimum(fraction, MAX_FOCAL_STEP / step[:, 6].abs().clamp(min=1e-9))
+            step = step * fraction.clamp(max=1.0)[:, None]
+            new = (log_zoom + step[:, 6]).clamp(prior.low, prior.high)
+            moved = apply_twist(state.T, step[:, :6], problem.centre)
+            state = replace(state, T=_moved_away(moved, new - log_zoom, problem.centre))
+            log_zoom = new
+            problem = replace(problem, K=scaled_cameras(cameras, log_zoom))
+        state = problem.state(state.T)
+    return FocalFit(problem, state, log_zoom)
+
+
+def scaled_cameras(cameras: Tensor, log_zoom: Tensor) -> Tensor:
+    """(N, 3, 3) cameras whose focal lengths are longer by factors, given as logarithms (N,)."""
+    factor = torch.ones(len(cameras), 3, 1, dtype=cameras.dtype)
+    factor[:, :2, 0] = log_zoom.exp()[:, None]
+    scaled = cameras * factor
+    scaled[:, :2, 2] = cameras[:, :2, 2]
+    return scaled
+
+
+def _moved_away(T: Tensor, log_zoom: Tensor, centre: Tensor) -> Tensor:
+    """(N, 4, 4) poses whose images, by cameras with focal lengths longer by factors, have the same
+    size and place; the object turns with the ray through its centre."""
+    before = T[:, :3, :3] @ centre + T[:, :3, 3]
+    after = before.clone()
+    after[:, 2] *= log_zoom.exp()
+    R = rotation_towards(after) @ rotation_towards(before).mT @ T[:, :3, :3]
+    return transform(R, after - R @ centre)
+
+
+def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
+    """(N, 6) derivative of :func:`_moved_away`: rotation about the centre in rad, and its
+    translation."""
+    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    away = position * position.new_tensor([0.0, 0.0, 1.0])
+    turn = torch.linalg.cross(position, away) / position.square().sum(dim=1, keepdim=True)
+    return torch.cat([turn, away], dim=1)
+
+
+def _by_focal_length(problem: ContourProblem, state: ContourState, uv: Tensor, J: Tensor) -> Tensor:
+    """(N, P) derivative by log f of the shift of points at ``uv`` (N, P, 2) px along their normals,
+    with the motion of :func:`_moved_away`; ``J`` (N, P, 6) is that by the pose."""
+    zoom = ((uv - problem.K[:, None, :2, 2]) * state.points.normals).sum(dim=-1)
+    motion = _motion_with_focal_length(state.T, problem.centre)
+    return zoom + (J @ motion[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class FocalInformation:
+    """What edges tell of log f: the ``amount`` (N,) in the units of the normal equations, and the
+    ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance."""
+
+    amount: Tensor
+    scale: Tensor
+
+    @property
+    def variance(self) -> Tensor:
+        """(N,) of log f."""
+        return self.scale / self.amount.clamp(min=1e-12)
+
+
+def focal_information(
+    problem: ContourProblem, state: ContourState, radius: float
+) -> tuple[FocalInformation, Tensor]:
+    """What edges within ``radius`` px tell of log f beyond what motions of the object could
+    imitate, with errors as in :func:`pose_covariance`; and (N, 6), how the best pose moves with log
+    f."""
+    measured = problem.measured_edges(state, radius)
+    uv, J = project(state.points.model, state.points.normals, state.T, problem.K, problem.centre)
+    by_focal = _by_focal_length(problem, state, uv, J)[..., None]
+    W = measured.weight
+    imitation = damped_solution(J.mT @ (W * J), J.mT @ (W * by_focal), 1e-6)
+    own = by_focal - J @ imitation[..., None]
+    alone = Measurements(own, measured.distance, W)
+    amount = alone.equations()[0][:, 0, 0]
+    sums = summed_by_cells(uv, W * measured.distance * own)[..., 0]
+    spread = sums.square().sum(dim=1) + residual_variance(measured) * (W * own).square().sum(
+        dim=(1, 2)
+    )
+    scale = FOCAL_SCALE * spread / amount.clamp(min=1e-12)
+    return FocalInformation(amount, scale), _motion_with_focal_length(
+        state.T, problem.centre
+    ) - imitation

@@ -1,0 +1,107 @@
+"""Least squares over poses and focal lengths."""
+
+import pytest
+import torch
+
+from curvireg_torch import camera_matrix
+from curvireg_torch.fitting import focal_length
+from curvireg_torch.fitting.contour_problem import ContourProblem
+from curvireg_torch.fitting.edges import EdgeCrops
+from curvireg_torch.fitting.least_squares import apply_twist, project
+from curvireg_torch.fitting.measured_fit import FULL_SIZE_RADII
+from curvireg_torch.geometry import rotation_error
+from curvireg_torch.geometry.cameras import projected
+from curvireg_torch.synthetic import example_mesh, synthesize_photograph
+from tests._support.scenes import SIZE, scene, truck_registrar
+
+NEAR = camera_matrix(150.0, 150.0, 119.5, 89.5)  # a wide angle, from where perspective is strong
+
+
+def near_scene():
+    """image, box and true pose of the object of scene 0, at a distance of three radii."""
+    T = scene(0)[2].clone()
+    centre = truck_registrar().describer.centre
+    T[:3, 3] += torch.tensor([0.0, 0.0, 3.0 * truck_registrar().describer.radius]) - (
+        T[:3, :3] @ centre + T[:3, 3]
+    )
+    image, box = synthesize_photograph(
+        example_mesh(), T, NEAR, SIZE, torch.Generator().manual_seed(5)
+    )
+    return image, box, T
+
+
+def fitting_problem(image, box, K, factor=1):
+    describer = truck_registrar().describer
+    crops = EdgeCrops.cut([image], box[None], 0.1)
+    return ContourProblem.of(
+        describer.contours, crops, K[None], torch.zeros(1, dtype=torch.long), factor=factor
+    )
+
+
+def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
+    T = scene(0)[2][None].clone()
+    centre = truck_registrar().describer.centre
+    T[0, 0, 3] += 0.3  # off the axis
+    zoom = torch.tensor([0.01], dtype=torch.float64)
+    moved = focal_length._moved_away(T, zoom, centre)
+    longer = focal_length.scaled_cameras(NEAR[None], zoom)
+    assert longer[0].tolist() == [
+        [150.0 * zoom.exp().item(), 0, 119.5],
+        [0, 150.0 * zoom.exp().item(), 89.5],
+        [0, 0, 1],
+    ]
+    before, after = (
+        projected(centre[None], pose, K)[0] for pose, K in ((T, NEAR[None]), (moved, longer))
+    )
+    torch.testing.assert_close(before, after)
+    turn = focal_length._motion_with_focal_length(T, centre)[0, :3] * 0.01
+    assert float(rotation_error(moved[0, :3, :3], T[0, :3, :3])) == pytest.approx(
+        float(torch.rad2deg(turn.norm())), rel=0.02
+    )
+
+
+def test_derivative_by_the_focal_length():
+    image, box, T = near_scene()
+    problem = fitting_problem(image, box, NEAR)
+    T = apply_twist(
+        T[None], torch.tensor([[0.05, 0.1, 0.0, 0.02, 0.0, 0.0]]).double(), problem.centre
+    )
+    state = problem.state(T)
+    step = torch.tensor([1e-5], dtype=torch.float64)
+
+    def pixels(sign):
+        moved = focal_length._moved_away(T, sign * step, problem.centre)
+        K = focal_length.scaled_cameras(problem.K, sign * step)
+        return project(state.points.model, state.points.normals, moved, K, problem.centre)[0]
+
+    numeric = ((pixels(1.0) - pixels(-1.0)) / (2.0 * step) * state.points.normals).sum(dim=-1)
+    uv, J = project(state.points.model, state.points.normals, T, problem.K, problem.centre)
+    valid = state.points.valid
+    found = focal_length._by_focal_length(problem, state, uv, J)
+    torch.testing.assert_close(found[valid], numeric[valid], atol=1e-4, rtol=1e-4)
+    assert float(found[valid].abs().max()) > 1.0
+
+
+@pytest.mark.parametrize("wrong", [0.75, 1.35])
+def test_strong_perspective_shows_the_focal_length(wrong):
+    image, box, T = near_scene()
+    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([wrong]).double().log())[0]
+    problem = fitting_problem(image, box, guess)
+    start = focal_length._moved_away(T[None], torch.tensor([wrong]).double().log(), problem.centre)
+    fit = focal_length.fit_focal_length(
+        problem, start, focal_length.FocalPrior.usual(guess[None], SIZE), FULL_SIZE_RADII
+    )
+    assert wrong * float(fit.log_zoom.exp()) == pytest.approx(1.0, abs=0.06)
+    assert float(rotation_error(fit.state.T[0, :3, :3], T[:3, :3])) < 1.5
+    information, _ = focal_length.focal_information(fit.problem, fit.state, 2.0)
+    assert float(information.variance.sqrt()) < 0.2
+
+
+def test_a_narrow_prior_holds_the_focal_length():
+    image, box, T = near_scene()
+    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([1.35]).double().log())[0]
+    problem = fitting_problem(image, box, guess)
+    none = torch.zeros(1, dtype=torch.float64)
+    prior = focal_length.FocalPrior(none, 1e-4, none - 1.0, none + 1.0)
+    fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
+    assert float(fit.log_zoom) == pytest.approx(0.0, abs=1e-3)
