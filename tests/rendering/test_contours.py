@@ -78,8 +78,11 @@ def test_edges_that_reach_behind_the_camera_have_no_points(unit):
     assert float(depth.min()) > 4.9, "the far end of the bar, and the plate"
 
 
-def test_normals_of_outlines_point_away_from_the_object():
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_normals_of_outlines_point_away_from_the_object(inside_out):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    if inside_out:
+        ball.invert()
     T = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 300.0]).double())[None]
     points = MeshContours(ball).points(T, K[None], 128)
     model = points.model[points.outline]
