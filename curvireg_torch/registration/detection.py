@@ -73,25 +73,38 @@ def detect(
     Raises:
         InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
     """
+    items = image_items(images, None, camera_matrices, prior)
+    return detect_items(registrar, items, instances=instances)
+
+
+@torch.no_grad()
+def detect_items(
+    registrar: "Registrar", items: Sequence[ImageItem | CurviregError], *, instances: int = 1
+) -> list[Results]:
+    """:func:`detect` in photographs that :func:`.inputs.image_items` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
     _ = registrar.detector  # created once, before threads use it
-
-    def detect_in(item: ImageItem, index: int) -> Results:
-        registrar.report_progress("detection")
-        proposals = propose(registrar, item)
-        found = _with_proposals(
-            _register_candidates(registrar, item, proposals, instances), proposals
-        )
-        convincing = [
-            one
-            for one in found
-            if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
-        ]
-        return [*convincing] or [_lost(found, index)]
-
-    found = registrar.map_items(image_items(images, None, camera_matrices, prior), detect_in)
+    found = registrar.map_items(
+        items, lambda item, index: detect_item(registrar, item, index, instances=instances)
+    )
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
+
+
+def detect_item(
+    registrar: "Registrar", item: ImageItem, index: int, *, instances: int = 1
+) -> Results:
+    """:func:`detect` in one photograph, the ``index``-th one; its box does not matter."""
+    registrar.report_progress("detection")
+    proposals = propose(registrar, item)
+    candidates = _register_candidates(registrar, item, proposals, instances)
+    found = _with_proposals(candidates, proposals)
+    convincing = [
+        one
+        for one in found
+        if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
+    ]
+    return [*convincing] or [_lost(found, index)]
 
 
 def propose(registrar: "Registrar", item: ImageItem) -> "Proposals":

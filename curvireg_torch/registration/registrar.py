@@ -28,7 +28,7 @@ from ..utils.choices import MESH_KINDS
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .confidence import are_near
-from .detection import Detector, detect
+from .detection import Detector, detect_item
 from .focal import FINISHED
 from .inputs import ImageItem, check_crop, image_items
 from .judging import Work, better_of, flat_mesh_warnings, judged
@@ -232,17 +232,45 @@ class Registrar:
         Raises:
             InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
-        if boxes is None and masks is None:
-            results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
-        else:
-            items = image_items(images, boxes, camera_matrices, prior, masks)
-            results = self.map_items(items, lambda item, _: self.register_item(item))
-        for model, other in enumerate(self.others, 1):
-            rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
-            results = [
-                better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)
-            ]
+        items = image_items(images, boxes, camera_matrices, prior, masks)
+        return self.register_items(items, detects=boxes is None and masks is None)
+
+    @torch.no_grad()
+    @in_full_precision
+    def register_items(
+        self, items: Sequence[ImageItem | CurviregError], *, detects: bool = False
+    ) -> Results:
+        """Register photographs that :func:`.inputs.image_items` has prepared, each to the best of
+        the meshes; ``detects`` searches for the object in the whole photographs.
+
+        :meta private:
+        """
+        for other in self.others:
+            other.share()
+
+        def register(item: ImageItem, index: int) -> Registration | FailedRegistration:
+            best = self._result_of(item, index, detects=detects)
+            for model, other in enumerate(self.others, 1):
+                rival = other._result_of(item, index, detects=detects)
+                best = better_of(best, rival, model)
+            return best
+
+        if detects:
+            for registrar in (self, *self.others):
+                _ = registrar.detector  # created once, before threads use it
+        results: Results = self.map_items(items, register)
         return results
+
+    def _result_of(
+        self, item: ImageItem, index: int, *, detects: bool
+    ) -> Registration | FailedRegistration:
+        """The registration of a photograph to this mesh alone, or why there is none."""
+        try:
+            if detects:
+                return detect_item(self, item, index)[0]
+            return self.register_item(item)
+        except CurviregError as error:
+            return FailedRegistration(error.with_subject("").of_image(index))
 
     @in_full_precision
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
@@ -381,6 +409,14 @@ class Registrar:
         if callable(self.progress):
             self.progress(stage, 0, 1)
 
+    def share(self) -> None:
+        """Create what threads share once, before they use it.
+
+        :meta private:
+        """
+        _ = self.describer.contours, self.mesh_warnings
+        _ = self.is_exact and self.telling_symmetries
+
     def map_items(
         self, items: Sequence[ImageItem | CurviregError], function: Callable[[ImageItem, int], Any]
     ) -> list[Any]:
@@ -391,9 +427,7 @@ class Registrar:
         the same to the bit, whatever else is registered. Items are read on demand, so that few
         photographs are in memory.
         """
-        # create once what threads share, before they use it
-        _ = self.describer.contours, self.mesh_warnings
-        _ = self.is_exact and self.telling_symmetries
+        self.share()
 
         def run(index: int) -> Any:
             item = items[index]
