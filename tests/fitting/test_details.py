@@ -79,3 +79,24 @@ def test_what_lies_outside_the_photograph_does_not_count(monkeypatch):
     monkeypatch.setattr(EdgeField, "counts", lambda _, __, valid, ___: valid)
     everything, _ = compared(shift=-1.9)
     assert float((scores - everything).abs().max()) > 0.05
+
+
+def test_contours_that_are_not_there_count_against_their_pose():
+    """The photograph shows a plain box: the pose whose mark lies below is better."""
+    box_alone = trimesh.creation.box((200, 120, 80))
+    R = rotation_from_viewpoint(35.0, 30.0, 0.0).double()
+    T = transform(R, mesh_radius(marked_box()) * torch.tensor([0.0, 0.0, 5.0]).double())
+    background = torch.full((3, *SIZE), 0.5)
+    generator = torch.Generator().manual_seed(1)
+    image, box = synthesize_photograph(
+        box_alone, T, CAMERA, SIZE, generator, background=background, texture=0.0
+    )
+    crops = EdgeCrops.cut([image], box[None], 0.3)
+    below = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    index = torch.zeros(2, dtype=torch.long)
+    contours = MeshContours(marked_box())
+    scores, differ = details.compare_details(
+        contours, crops, CAMERA.expand(2, 3, 3), torch.stack([T, T @ below]), index
+    )
+    assert bool(differ[0, 1])
+    assert float(scores[0, 1]) < -0.5
