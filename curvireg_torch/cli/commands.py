@@ -293,9 +293,9 @@ def draw(arguments: argparse.Namespace) -> None:
         arguments.out, input_files(arguments, arguments.photo, arguments.mesh), mark=b"curvireg"
     )
     from ..data import read_photo
-    from ..jobs.entry import entry_of
+    from ..jobs.entry import entry_of, observe
     from ..jobs.opening import open_registrar
-    from ..jobs.photograph import register_entry
+    from ..jobs.photograph import register_observation
     from ..utils.threads import one_torch_thread
     from ..visualization import plots
 
@@ -303,7 +303,8 @@ def draw(arguments: argparse.Namespace) -> None:
     photo = read_photo(arguments.photo)
     with one_torch_thread():
         registrar = open_registrar(options, options.meshes)
-        found = register_entry(entry_of(arguments.photo, options), photo, registrar)
+        observation = observe(entry_of(arguments.photo, options), photo)
+        found = register_observation(observation, registrar)
         if arguments.kind == "viewpoints":
             figure = plots.viewpoints(registrar.bank, found)
         elif arguments.kind == "fields":
@@ -338,9 +339,9 @@ def demo(arguments: argparse.Namespace) -> None:
     out = arguments.out
     from ..data import read_photo
     from ..geometry import Camera, rotation_error
-    from ..jobs.entry import entry_of
+    from ..jobs.entry import entry_of, observe
     from ..jobs.outputs import output_folder
-    from ..jobs.photograph import register_entry
+    from ..jobs.photograph import register_observation
     from ..synthetic import demo_scene
     from ..utils.threads import one_torch_thread
     from ..visualization.encoding import png, to_uint8
@@ -357,7 +358,8 @@ def demo(arguments: argparse.Namespace) -> None:
         with opened_registrar(options) as (registrar, seconds):
             entry = entry_of(out / "photo.png", options)
             photo = read_photo(out / "photo.png")
-            found = register_entry(entry, photo, registrar, bank_seconds=seconds)
+            observation = observe(entry, photo)
+            found = register_observation(observation, registrar, bank_seconds=seconds)
         assert found.translation is not None
         R = scene.truth[:3, :3]
         t = scene.truth[:3, 3]

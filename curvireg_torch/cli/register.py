@@ -285,8 +285,8 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     """Register one photograph, write and print the result; returns whether it is reliable."""
     from ..data import read_photo
     from ..geometry import Camera
-    from ..jobs.entry import check_entry, entry_of
-    from ..jobs.photograph import register_entry
+    from ..jobs.entry import entry_of, observe
+    from ..jobs.photograph import register_observation
     from ..jobs.result_files import write_lost
     from ..registration.result import camera_in_words
 
@@ -294,7 +294,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     path = options.photos[0]
     photo = read_photo(path)
     entry = entry_of(path, options)
-    check_entry(entry, photo)
+    observation = observe(entry, photo)
     with _one_result(arguments, *entry.files):
         if options.progress and not (options.box or options.boxes or options.mask or options.start):
             print(
@@ -303,7 +303,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
             )
         with opened_registrar(options) as (registrar, seconds):
             try:
-                found = register_entry(entry, photo, registrar, bank_seconds=seconds)
+                found = register_observation(observation, registrar, bank_seconds=seconds)
             except LostObjectError as error:
                 if out is not None:
                     write_lost(out, str(error))

@@ -1,5 +1,6 @@
 """One photograph with what is known about it, before it is registered."""
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
@@ -103,18 +104,40 @@ def entry_of(photo: Path, options: RegisterOptions) -> Entry:
     )
 
 
-def check_entry(entry: Entry, photo: Photo, camera: Camera | None = None) -> ImageItem:
-    """The photograph and what is known about it; refuses what cannot be used, as before meshes are
+@dataclass(frozen=True)
+class Observation:
+    """A photograph of an entry, prepared once for all meshes.
+
+    Attributes:
+        entry: what is known about the photograph.
+        photo: as it was read.
+        camera: as given, with the distortion of its lens; None if it is unknown.
+        camera_source: where the camera is from.
+        item: the photograph and its box and mask without distortion.
+        seconds: that preparing it took.
+    """
+
+    entry: Entry
+    photo: Photo
+    camera: Camera | None
+    camera_source: str | None
+    item: ImageItem
+    seconds: float
+
+
+def observe(entry: Entry, photo: Photo) -> Observation:
+    """Prepare the photograph of an entry; refuses what cannot be used, as before meshes are
     opened."""
+    start = time.perf_counter()
     if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
+    camera, source = camera_of(entry, photo)
     boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
-    item = image_items(
-        [photo.image], boxes, camera or camera_of(entry, photo)[0], entry.prior, masks
-    )[0]
+    item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)
-    return item
+    seconds = time.perf_counter() - start
+    return Observation(entry, photo, camera, source, item, seconds)
 
 
 def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:

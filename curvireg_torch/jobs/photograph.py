@@ -22,13 +22,15 @@ from ..matching import ViewBank
 from ..mesh import load_mesh
 from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
-from ..registration import FailedRegistration, Registrar, Registration, detect, refine
+from ..registration import FailedRegistration, Registrar, Registration
+from ..registration.detection import detect_items
 from ..registration.inputs import image_item
 from ..registration.poses import projected_box
+from ..registration.refinement import refine_items
 from ..registration.result import detection_document, result_document
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
-from .entry import Entry, camera_of, check_entry, start_in_unit
+from .entry import Entry, Observation, observe, start_in_unit
 from .opening import check_bank
 from .outputs import output_folder
 from .result_files import write_result
@@ -175,11 +177,11 @@ def register(
     entry = Entry(
         name=name, photo=path, meshes=meshes, box=box, camera=camera, mask=mask, prior=prior
     )
-    return register_entry(entry, photo, registrar)
+    return register_observation(observe(entry, photo), registrar)
 
 
-def register_entry(
-    entry: Entry, photo: Photo, registrar: Registrar, *, bank_seconds: float = 0.0
+def register_observation(
+    observation: Observation, registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> RegisteredPhotograph:
     """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to
     open.
@@ -188,18 +190,20 @@ def register_entry(
     ``results.jsonl``.
     """
     start = time.perf_counter()
-    camera, source = camera_of(entry, photo)
-    item = check_entry(entry, photo, camera)
+    entry = observation.entry
+    camera = observation.camera
+    item = observation.item
     results: Sequence[Registration | FailedRegistration]
     if entry.start is not None:
         start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
         confidences = [entry.start.confidence]
-        results = refine(
-            registrar, [photo.image], camera, [start_pose], start_confidences=confidences
-        )
+        alone = replace(item, prior=None)
+        results = refine_items(registrar, [alone], [start_pose], start_confidences=confidences)
     elif entry.views:
         assert camera is not None  # of datasets with cameras only
-        first = View(entry.name, entry.photo, entry.box, camera, torch.eye(4, dtype=torch.float64))
+        world = torch.eye(4, dtype=torch.float64)
+        pixels = observation.photo.image
+        first = View(entry.name, entry.photo, entry.box, camera, world, pixels)
         together, _ = register_views([first, *entry.views], registrar, as_stored=entry.as_stored)
         best, *others = together.hypotheses
         best = replace(
@@ -207,12 +211,10 @@ def register_entry(
         )
         results = [replace(together, hypotheses=(best, *others))]
     elif entry.box is None and entry.mask is None and entry.instances > 1:
-        results = detect(
-            registrar, [photo.image], camera, instances=entry.instances, prior=entry.prior
-        )[0]
+        results = detect_items(registrar, [item], instances=entry.instances)[0]
     else:
-        boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
-        results = registrar([photo.image], boxes, camera, prior=entry.prior, masks=masks)
+        is_located = entry.box is not None or entry.mask is not None
+        results = registrar.register_items([item], detects=not is_located)
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
@@ -222,10 +224,9 @@ def register_entry(
         box = result.detection.box
     elif entry.box is None and entry.mask is None:
         box = projected_box(registrar.of_model(result.model).describer, result.projection)
+    seconds = observation.seconds + time.perf_counter() - start
     document = {
-        **result_document(
-            result, registrar, {"bank": bank_seconds, "register": time.perf_counter() - start}
-        ),
+        **result_document(result, registrar, {"bank": bank_seconds, "register": seconds}),
         "mesh": str(entry.meshes[result.model]) if entry.meshes else None,
         "inputs": {
             "photo": entry.name,
@@ -234,8 +235,8 @@ def register_entry(
             "camera": None
             if K is None
             else [float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))],
-            "camera_source": source,
-            "picture": photo.facts(),
+            "camera_source": observation.camera_source,
+            "picture": observation.photo.facts(),
         },
         **_camera_document(result.camera, camera and camera.at(item.size)),
     }

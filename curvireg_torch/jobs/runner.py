@@ -27,9 +27,9 @@ from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
 from ..visualization.sheet import thumbnail
-from .entry import Entry
+from .entry import Entry, observe
 from .options import with_advice
-from .photograph import register_entry
+from .photograph import register_observation
 from .store import ResultStore, Row, has_pose, workers
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
@@ -161,7 +161,8 @@ def _row(
     if isinstance(registrar, Exception):
         return failed_row(registrar, skipped="unreadable_mesh")
     try:
-        found = register_entry(entry, photo, registrar, bank_seconds=bank_seconds)
+        observation = observe(entry, photo)
+        found = register_observation(observation, registrar, bank_seconds=bank_seconds)
     except CurviregError as error:
         seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
         places: Row = {}

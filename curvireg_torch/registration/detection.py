@@ -69,23 +69,36 @@ def detect(
     Raises:
         InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
     """
+    items = image_items(images, None, camera_matrices, prior)
+    return detect_items(target, items, instances=instances)
+
+
+@torch.no_grad()
+def detect_items(
+    target: Target, items: Sequence[ImageItem | CurviregError], *, instances: int = 1
+) -> list[Results]:
+    """:func:`detect` in photographs that :func:`.inputs.image_items` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
     _ = target.detector  # created once, before threads use it
-
-    def detect_in(item: ImageItem, index: int) -> Results:
-        target.report_progress("detection")
-        proposals = propose(target, item)
-        found = _with_proposals(_register_candidates(target, item, proposals, instances), proposals)
-        convincing = [
-            one
-            for one in found
-            if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
-        ]
-        return [*convincing] or [_lost(found, index)]
-
-    found = map_items(target, image_items(images, None, camera_matrices, prior), detect_in)
+    found = map_items(
+        target, items, lambda item, index: detect_item(target, item, index, instances=instances)
+    )
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
+
+
+def detect_item(target: Target, item: ImageItem, index: int, *, instances: int = 1) -> Results:
+    """:func:`detect` in one photograph, the ``index``-th one; its box does not matter."""
+    target.report_progress("detection")
+    proposals = propose(target, item)
+    candidates = _register_candidates(target, item, proposals, instances)
+    found = _with_proposals(candidates, proposals)
+    convincing = [
+        one
+        for one in found
+        if (1.0 if one.confidence is None else one.confidence) >= FOUND_CONFIDENCE
+    ]
+    return [*convincing] or [_lost(found, index)]
 
 
 def propose(target: Target, item: ImageItem) -> "Proposals":

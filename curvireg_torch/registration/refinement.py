@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInputError, LostObjectError
+from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
@@ -77,6 +77,18 @@ def refine(
     """
     check_cameras(images, camera_matrices, "refine")
     items = image_items(images, None, camera_matrices)
+    return refine_items(target, items, poses, start_confidences=start_confidences)
+
+
+@torch.no_grad()
+def refine_items(
+    target: Target,
+    items: Sequence[ImageItem | CurviregError],
+    poses: Any,
+    *,
+    start_confidences: Sequence[float | None] | None = None,
+) -> list[Registration | FailedRegistration]:
+    """:func:`refine` in photographs that :func:`.inputs.image_items` has prepared without boxes."""
     starts = []
     for one in poses:
         T = as_numbers(one, "poses", dtype=torch.float64).cpu()

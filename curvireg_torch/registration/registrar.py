@@ -18,8 +18,8 @@ from ..utils.checks import check_device, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
-from .detection import detect
-from .inputs import image_items
+from .detection import detect_item
+from .inputs import ImageItem, image_items
 from .judging import better_of
 from .photograph import register_item
 from .refinement import refine
@@ -75,6 +75,8 @@ class Registrar(Target):
         (torch.Size([3, 3]), torch.Size([3]), 'estimated')
     """
 
+    others: Sequence["Registrar"]
+
     def __init__(
         self,
         bank_or_mesh: Any,
@@ -116,8 +118,7 @@ class Registrar(Target):
                 "symmetries": symmetries,
                 "device": device,
             }
-            build: Any = type(self)
-            self.others = [build(mesh, **same, progress=progress) for mesh in meshes[1:]]
+            self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
             bank_or_mesh = meshes[0]
         matcher: ViewMatcher = bank_or_mesh
         if isinstance(bank_or_mesh, ViewMatcher):
@@ -181,17 +182,49 @@ class Registrar(Target):
         Raises:
             InvalidInputError: not as many boxes, cameras, priors or masks as images.
         """
-        if boxes is None and masks is None:
-            results = [found[0] for found in detect(self, images, camera_matrices, prior=prior)]
-        else:
-            items = image_items(images, boxes, camera_matrices, prior, masks)
-            results = map_items(self, items, lambda item, _: register_item(self, item))
-        for model, other in enumerate(self.others, 1):
-            rivals = other(images, boxes, camera_matrices, prior=prior, masks=masks)
-            results = [
-                better_of(one, rival, model) for one, rival in zip(results, rivals, strict=True)
-            ]
+        items = image_items(images, boxes, camera_matrices, prior, masks)
+        return self.register_items(items, detects=boxes is None and masks is None)
+
+    @torch.no_grad()
+    @in_full_precision
+    def register_items(
+        self, items: Sequence[ImageItem | CurviregError], *, detects: bool = False
+    ) -> Results:
+        """Register photographs that :func:`.inputs.image_items` has prepared, each to the best of
+        the meshes; ``detects`` searches for the object in the whole photographs.
+
+        :meta private:
+        """
+        for other in self.others:
+            other.share()
+
+        def register(item: ImageItem, index: int) -> Registration | FailedRegistration:
+            best = self._result_of(item, index, detects=detects)
+            for model, other in enumerate(self.others, 1):
+                rival = other._result_of(item, index, detects=detects)
+                best = better_of(best, rival, model)
+            return best
+
+        if detects:
+            for target in (self, *self.others):
+                _ = target.detector  # created once, before threads use it
+        results: Results = map_items(self, items, register)
         return results
+
+    def _result_of(
+        self, item: ImageItem, index: int, *, detects: bool
+    ) -> Registration | FailedRegistration:
+        """The registration of a photograph to this mesh alone, or why there is none."""
+        try:
+            if detects:
+                return detect_item(self, item, index)[0]
+            return register_item(self, item)
+        except CurviregError as error:
+            return FailedRegistration(error.with_subject("").of_image(index))
+
+    def of_model(self, model: int) -> "Registrar":
+        """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
+        return self.others[model - 1] if model else self
 
     @in_full_precision
     def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:

@@ -38,7 +38,7 @@ class Target:
         others: further candidates for the object.
     """
 
-    others: Sequence[Self]
+    others: Sequence["Target"]
 
     def __init__(
         self,
@@ -152,9 +152,17 @@ class Target:
         other.pipeline = replace(self.pipeline, hypotheses=count)
         return other
 
-    def of_model(self, model: int) -> Self:
+    def of_model(self, model: int) -> "Target":
         """The target that is one of several meshes, by :attr:`Registration.model`."""
         return self.others[model - 1] if model else self
+
+    def share(self) -> None:
+        """Create what threads share once, before they use it.
+
+        :meta private:
+        """
+        _ = self.describer.contours, self.mesh_warnings
+        _ = self.is_exact and self.telling_symmetries
 
     def report_progress(self, stage: str) -> None:
         """Call the progress callback, if there is one."""

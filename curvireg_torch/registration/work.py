@@ -60,9 +60,7 @@ def map_items(
     the same to the bit, whatever else is registered. Items are read on demand, so that few
     photographs are in memory.
     """
-    # create once what threads share, before they use it
-    _ = target.describer.contours, target.mesh_warnings
-    _ = target.is_exact and target.telling_symmetries
+    target.share()
 
     def run(index: int) -> Any:
         item = items[index]

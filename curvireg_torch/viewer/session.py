@@ -26,10 +26,10 @@ from ..geometry import undistorted
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
 from ..geometry.pose_prior import object_frame
-from ..jobs.entry import entry_of
+from ..jobs.entry import entry_of, observe
 from ..jobs.opening import open_registrar
 from ..jobs.options import QUALIFIERS, WITHIN, RegisterOptions, check_camera
-from ..jobs.photograph import register_entry
+from ..jobs.photograph import register_observation
 from ..jobs.rigs import read_rig, register_rig
 from ..jobs.views import View
 from ..matching import ViewBank
@@ -440,7 +440,8 @@ class Session:
         entry = entry_of(request.photos[0], request)
         meshes = tuple(Path(self.name(path)) for path in entry.meshes)
         entry = replace(entry, name=self.name(entry.photo), meshes=meshes)
-        found = register_entry(entry, shot.photo, registrar, bank_seconds=seconds)
+        observation = observe(entry, shot.photo)
+        found = register_observation(observation, registrar, bank_seconds=seconds)
         if isinstance(camera, Camera):
             found.document["camera"] = camera.at(shot.size).describe()
             found.document["inputs"]["camera_source"] = "file"

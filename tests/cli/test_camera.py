@@ -11,6 +11,7 @@ import curvireg_torch as cr
 from curvireg_torch import Camera, camera_matrix
 from curvireg_torch.cli import main
 from curvireg_torch.cli.register import NONE_RELIABLE, SOME_FAILED
+from curvireg_torch.data import images
 from curvireg_torch.errors import InvalidInputError
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, check_pose, lines, written
@@ -158,6 +159,26 @@ def test_calibration_file_removes_the_distortion(folder, lens, tmp_path, capsys)
     assert document["inputs"]["box"] != [float(v) for v in box]
     assert np.array(document["T_cam_from_model"])[:3, 3].tolist() == document["translation"]
     assert "frame_id: camera_optical_frame" in (out / "pose.yaml").read_text()
+
+
+@pytest.mark.parametrize("located", [True, False], ids=["box", "detected"])
+@pytest.mark.parametrize("banks", [["truck"], ["truck", "truck"]], ids=["one mesh", "two meshes"])
+def test_a_photograph_is_decoded_and_undistorted_once(
+    banks, located, folder, lens, tmp_path, monkeypatch
+):
+    decoded = []
+    planes = []
+    decode = images._decode
+    remap = cv2.remap
+    monkeypatch.setattr(images, "_decode", lambda path: decoded.append(path) or decode(path))
+    monkeypatch.setattr(cv2, "remap", lambda x, *a, **k: planes.append(x) or remap(x, *a, **k))
+    meshes = [word for bank in banks for word in ("--mesh", str(folder / f"{bank}.safetensors"))]
+    words = ["--box", *lens[0]] if located else []
+    words += ["--no-refine", "--camera", str(folder / "cam.json"), "--quiet"]
+    photo = str(folder / "distorted.png")
+    assert main(["register", photo, *meshes, *words, "--out", str(tmp_path / "out")]) == 0
+    assert decoded == [folder / "distorted.png"]
+    assert len(planes) == 3  # red, green and blue
 
 
 def test_lists_take_calibration_files_and_masks(folder, lens, tmp_path):

@@ -1,5 +1,7 @@
 """Least squares over poses and focal lengths."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -105,3 +107,35 @@ def test_a_narrow_prior_holds_the_focal_length():
     prior = focal_length.FocalPrior(none, 1e-4, none - 1.0, none + 1.0)
     fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
     assert float(fit.log_zoom) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_the_focal_length_stays_within_its_limits():
+    image, box, T = near_scene()
+    guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([1.35]).double().log())[0]
+    problem = fitting_problem(image, box, guess)
+    none = torch.zeros(1, dtype=torch.float64)
+    prior = focal_length.FocalPrior(none, 0.5, none - 0.05, none + 0.05)
+    start = focal_length._moved_away(T[None], torch.tensor([1.35]).double().log(), problem.centre)
+    fit = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII)
+    assert float(fit.log_zoom) == pytest.approx(-0.05, abs=1e-9)
+
+
+def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():
+    """A prior far away pulls as far as one at its reach."""
+    image, box, T = near_scene()
+    problem = fitting_problem(image, box, NEAR)
+    gap = torch.tensor([2.0], dtype=torch.float64)
+    wide = gap + 5.0
+
+    def zoom(**changes):
+        prior = replace(focal_length.FocalPrior(gap, 0.2, -wide, wide, 0.05), **changes)
+        return float(
+            focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII).log_zoom
+        )
+
+    bounded = zoom()
+    assert 0.0 < bounded < 0.5 * zoom(reach=float("inf"))
+    # the pull is the same from anywhere; with twice the deviation, a quarter of it
+    assert zoom(log_zoom=3.0 * gap) == pytest.approx(bounded, abs=0.01)
+    none = zoom(deviation=1e6)
+    assert zoom(deviation=0.4) - none == pytest.approx(0.25 * (bounded - none), rel=0.35)

@@ -10,8 +10,8 @@ import torch
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.jobs import lists, photograph, runner
-from curvireg_torch.jobs.entry import Entry
+from curvireg_torch.jobs import lists, runner
+from curvireg_torch.jobs.entry import Entry, camera_of, observe
 from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
@@ -64,14 +64,11 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
     ]
     done = []
 
-    def register_entry(one, photo, registrar, **_):
+    def observe_in_box(one, photo):
         done.append(one)
-        return original(
-            replace(one, box=entry.box, instances=1), photo, registrar, bank_seconds=0.0
-        )
+        return observe(replace(one, box=entry.box, instances=1), photo)
 
-    original = runner.register_entry
-    monkeypatch.setattr(runner, "register_entry", register_entry)
+    monkeypatch.setattr(runner, "observe", observe_in_box)
     for settings in ({"top": 1}, {"top": 2}):
         done.clear()
         for _ in range(2):
@@ -131,14 +128,12 @@ FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 )
 def test_camera_of_names_its_source(entry, monkeypatch, camera, source):
     photo = read_photo(entry.photo)
-    assert photograph.camera_of(replace(entry, camera=None), photo) == (None, None), (
-        "without EXIF data"
-    )
+    assert camera_of(replace(entry, camera=None), photo) == (None, None), "without EXIF data"
     monkeypatch.setattr(type(photo), "guessed_camera_matrix", lambda _: CAMERA.matrix)
-    found, name = photograph.camera_of(replace(entry, camera=camera), photo)
+    found, name = camera_of(replace(entry, camera=camera), photo)
     assert (name, found.source) == (source, "exif" if source == "exif" else "given")
     stored = replace(entry, camera=None, as_stored=True)
-    assert photograph.camera_of(stored, photo) == (None, None), "of a dataset"
+    assert camera_of(stored, photo) == (None, None), "of a dataset"
 
 
 def test_the_camera_of_a_row_comes_before_the_guess_for_all(tmp_path):

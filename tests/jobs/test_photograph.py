@@ -91,10 +91,10 @@ def test_register_takes_the_camera_from_exif(folder):
 
 def test_a_box_that_was_replaced_is_that_of_the_result(folder, monkeypatch):
     fits = torch.tensor([1.0, 2.0, 30.0, 40.0]).double()
-    original = cr.Registrar.__call__
+    original = cr.Registrar.register_items
     monkeypatch.setattr(
         cr.Registrar,
-        "__call__",
+        "register_items",
         lambda *a, **k: [replace(original(*a, **k)[0], corrected_box=fits)],
     )
     found = cr.register(

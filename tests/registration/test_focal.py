@@ -5,12 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.registration import focal
 from curvireg_torch.registration.inputs import image_item
 from curvireg_torch.registration.poses import Poses
-from tests._support.scenes import learned_registrar, truck_registrar
+from tests._support.scenes import SIZE, learned_registrar, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
 
 
@@ -55,3 +56,39 @@ def test_fields_of_view_are_across_the_longer_side():
     assert [float(K[0, 0]) for K in wide] == [float(K[0, 0]) for K in tall]
     assert tall[0][:2, 2].tolist() == [239.5, 319.5]
     assert float(wide[2][0, 0]) == pytest.approx(320 / 0.41421356, rel=1e-6)
+
+
+def test_priors_by_source():
+    image, box, _ = near_scene()
+    item = image_item(image, box, NEAR)
+    cameras = focal_length.scaled_cameras(NEAR[None], torch.tensor([0.1]).double())
+    exif = focal.focal_prior(replace(item, focal_deviation=0.05, camera_source="exif"), cameras)
+    assert float(exif.log_zoom) == pytest.approx(-0.1)
+    assert (float(exif.low), float(exif.high)) == (pytest.approx(-0.3), pytest.approx(0.1))
+    assert (exif.deviation, exif.reach) == (0.05, float("inf"))
+    usual = focal.focal_prior(replace(item, camera_source="estimated"), NEAR[None])
+    assert float(usual.log_zoom.exp()) == pytest.approx(
+        focal_length.USUAL_FOCAL * max(SIZE) / 150.0
+    )
+    limits = [150.0 / max(SIZE) * float(limit.exp()) for limit in (usual.low, usual.high)]
+    assert limits == pytest.approx(list(focal_length.FOCAL_LIMITS))
+
+
+def test_the_deviation_joins_prior_and_photograph():
+    image, box, T = near_scene()
+    describer = truck_registrar().describer
+    crops = EdgeCrops.cut([image], box[None], 0.1)
+    one = torch.zeros(1, dtype=torch.long)
+    poses = Poses.at(
+        T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
+    )
+    poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
+    item = replace(image_item(image, box, NEAR), camera_source="exif")
+
+    def variance(prior):
+        known = replace(item, focal_deviation=prior)
+        return focal.focal_covariance(describer, crops, poses, known)[1] ** 2
+
+    photograph = variance(1e6)
+    for prior in (0.01, 0.1):
+        assert 1.0 / variance(prior) == pytest.approx(1.0 / photograph + 1.0 / prior**2, rel=1e-6)

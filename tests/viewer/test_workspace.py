@@ -516,3 +516,17 @@ def test_unpack_refuses_folders_that_are_nested_deeply(tmp_path):
     ):
         unpack(pack(tmp_path / "a.zip", {f"{deep}a/a.ply": mesh}), tmp_path / "more")
     assert not (tmp_path / "more").exists()
+
+
+def test_a_mesh_of_a_doubtful_size_asks_for_its_unit(workspace, tmp_path):
+    """Whatever the words of the warning are."""
+    trimesh.creation.box((300.0, 200.0, 100.0)).export(tmp_path / "large.stl")
+    trimesh.creation.box((0.3, 0.2, 0.1)).export(tmp_path / "small.stl")
+    assert not workspace.asks_for_unit
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = show_warning
+        asyncio.run(upload(workspace, tmp_path / "large.stl"))
+    assert workspace.asks_for_unit
+    asyncio.run(upload(workspace, tmp_path / "small.stl"))
+    assert not workspace.asks_for_unit
