@@ -4,9 +4,9 @@ box."""
 from ..fitting.contour_fit import fit_contours as fit_contours
 from ..fitting.measured_fit import ContourFit as ContourFit
 from .confidence import RELIABLE as RELIABLE
-from .detection import Detector as Detector
-from .detection import Proposals as Proposals
 from .detection import detect as detect
+from .detector import Detector as Detector
+from .detector import Proposals as Proposals
 from .following import Follower as Follower
 from .refinement import refine as refine
 from .registrar import Registrar as Registrar

@@ -16,9 +16,10 @@ from ..utils.threads import map_on_threads
 from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
 from .poses import Poses, hypothesis_of
-from .refinement import nearest_view, refine_item
+from .refinement import refine_item
 from .registrar import Registrar
 from .result import FailedRegistration, Registration
+from .target import nearest_view
 from .tracker import TrackedPose, Tracker
 
 # Confidence of a tracked pose from which it stands without a refinement, and after one that was no

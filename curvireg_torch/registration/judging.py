@@ -1,18 +1,11 @@
 """Judgement of the fitted poses of one photograph: their order, their probabilities, and what is
 questionable."""
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import torch
-import trimesh
 from torch import Tensor
 
-from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import LandmarkMatches
-from ..matching import Ranking
-from ..mesh import has_colours, mesh_radius
-from ..terms import QueryFeatures
 from .confidence import (
     are_near,
     concentration,
@@ -23,42 +16,18 @@ from .confidence import (
     undetermined_axes,
 )
 from .framing import border_sides, outside_fraction, outside_warnings
-from .inputs import ImageItem
 from .poses import SCORE_WEIGHTS, Poses, hypothesis_of, named_features, pose_scores
-from .priors import Limits
 from .result import FailedRegistration, Registration
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
+from .target import Target
+from .work import Work
 
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or
 edge support."""
 
-# Thickness of a mesh, as a fraction of its radius, below which it counts as flat
-FLAT_EXTENT = 1e-3
-
-
-@dataclass(frozen=True)
-class Work:
-    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's,
-    ``crops`` for contour fits, and ``landmarks`` in the box, if there are any; ``starts`` with
-    several cameras if the camera is unknown."""
-
-    item: ImageItem
-    query: QueryFeatures
-    ranking: Ranking
-    descriptor: Tensor
-    limits: Limits | None
-    exact: bool
-    symmetries: Tensor | None
-    crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
-    starts: Poses | None = None
-
 
 def judged(
-    registrar: "Registrar",
+    target: Target,
     work: Work,
     poses: Poses,
     features: Tensor,
@@ -68,7 +37,7 @@ def judged(
     """Hypotheses, best first, those that merged last, and their probabilities.
 
     Args:
-        registrar: of the mesh.
+        target: the object.
         work: the photograph.
         poses: H of them.
         features: (H, F) :data:`.POSE_FEATURES`.
@@ -80,11 +49,11 @@ def judged(
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]
     best = own[:1]
-    reported = own[: registrar.pipeline.hypotheses].tolist()
-    fraction = _outside_fraction(registrar, work, poses[best])
+    reported = own[: target.pipeline.hypotheses].tolist()
+    fraction = _outside_fraction(target, work, poses[best])
     # Poses that merged have no probability of their own.
     rivals = own[distinct[own]]
-    near = are_near(registrar.bank.rotations, poses.rotation[best[0]], work.symmetries)
+    near = are_near(target.bank.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
         features[rivals],
         scores[rivals],
@@ -100,7 +69,7 @@ def judged(
         share = measured["concentration"] or 1.0
         measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
     probabilities: tuple[float, ...] = ()
-    if is_calibrated(registrar.pipeline):
+    if is_calibrated(target.pipeline):
         any_right = probability_of_any(measured, exact=work.exact)
         every = hypothesis_probabilities(any_right, scores[rivals], exact=work.exact)
         probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
@@ -116,16 +85,16 @@ def judged(
         work.ranking,
         measured,
         prior=item.prior,
-        prior_contradiction=_contradiction(registrar, work, poses[best], gain),
-        warnings=item.warnings + registrar.mesh_warnings + outside_warnings(fraction),
-        notes=registrar.mesh_notes,
+        prior_contradiction=_contradiction(target, work, poses[best], gain),
+        warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
+        notes=target.mesh_notes,
         camera=item.camera,
     )
 
 
-def _outside_fraction(registrar: "Registrar", work: Work, best: Poses) -> float:
+def _outside_fraction(target: Target, work: Work, best: Poses) -> float:
     """Fraction of the object that lies outside the photograph at the ``best`` pose."""
-    return outside_fraction(registrar.describer.hull, best.T[0], best.cameras[0], work.item.size)
+    return outside_fraction(target.describer.hull, best.T[0], best.cameras[0], work.item.size)
 
 
 def _gain_outside(features: Tensor, best: Tensor, outside: Tensor) -> float | None:
@@ -137,28 +106,15 @@ def _gain_outside(features: Tensor, best: Tensor, outside: Tensor) -> float | No
     return float((features[outside, 1:] - features[best, 1:]) @ weights)
 
 
-def _contradiction(
-    registrar: "Registrar", work: Work, best: Poses, gain: float | None
-) -> str | None:
+def _contradiction(target: Target, work: Work, best: Poses, gain: float | None) -> str | None:
     """See :attr:`.Registration.prior_contradiction`."""
     if work.limits is None:
         return None
     K = work.item.camera_matrix
     placement = best.rotation, best.distance, best.view, best.rank
-    filling = Poses.in_box(registrar.describer, work.item.box, K, *placement)
+    filling = Poses.in_box(target.describer, work.item.box, K, *placement)
     better = gain is not None and gain > OUTSIDE_MARGIN
     return work.limits.contradiction(best, filling, better_outside=better)
-
-
-def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
-    """What makes every pose of a flat mesh questionable, in words."""
-    vertices = torch.from_numpy(mesh.vertices.copy()).double()
-    thickness = (
-        float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
-    )
-    if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
-        return ()
-    return ("the mesh is flat and has no colours: front and back look alike",)
 
 
 def better_of(

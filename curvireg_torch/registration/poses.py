@@ -4,7 +4,7 @@ judged."""
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -21,9 +21,7 @@ from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..terms import Appearance, QueryFeatures
 from .confidence import are_near
 from .result import Hypothesis
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
+from .target import Target
 
 __all__ = [
     "POSE_FEATURES",
@@ -257,7 +255,7 @@ def similarities(views: Tensor, descriptors: Tensor) -> Tensor:
 
 
 def compare_with_photograph(
-    registrar: "Registrar",
+    target: Target,
     query: QueryFeatures,
     descriptor: Tensor,
     ranking: Ranking,
@@ -269,10 +267,10 @@ def compare_with_photograph(
     ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that
     term."""
     if Appearance.name not in ranking.terms:
-        similarity = similarities(registrar.describer.descriptors(rotation, distance), descriptor)
+        similarity = similarities(target.describer.descriptors(rotation, distance), descriptor)
         return similarity, torch.zeros_like(similarity)
-    views, pictures = registrar.describer.described(rotation, distance)
-    return similarities(views, descriptor), registrar.matcher.appearance_score(
+    views, pictures = target.describer.described(rotation, distance)
+    return similarities(views, descriptor), target.matcher.appearance_score(
         query, ranking, pictures
     )
 

@@ -3,7 +3,7 @@ checks them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .focal import focal_covariance
 from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
+from .photograph import register
 from .poses import (
     Poses,
     distinct_poses,
@@ -28,10 +29,9 @@ from .poses import (
 )
 from .result import FailedRegistration, Registration
 from .starts import why_outside
+from .target import Target, nearest_view
 from .tracker import OUTSIDE, boxes_at
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
+from .work import map_items
 
 # Degrees by which given starts are rotated away, to fit from there too: they may be worse than
 # views of a bank
@@ -44,7 +44,7 @@ LOST_CONFIDENCE = 0.35
 
 @torch.no_grad()
 def refine(
-    registrar: "Registrar",
+    target: Target,
     images: Tensor | Sequence[Any],
     camera_matrices: Any,
     poses: Any,
@@ -60,7 +60,7 @@ def refine(
     registration gives the pose, and never more than that of the start.
 
     Args:
-        registrar: :class:`Registrar` of the mesh.
+        target: the object, a :class:`.Registrar`.
         images, camera_matrices: see :class:`Registrar`; the camera is needed, or EXIF data that
             have its focal length.
         poses: for each photograph a (4, 4) start ``T_cam_from_model``, or (S, 4, 4) of them.
@@ -77,12 +77,12 @@ def refine(
     """
     check_cameras(images, camera_matrices, "refine")
     items = image_items(images, None, camera_matrices)
-    return refine_items(registrar, items, poses, start_confidences=start_confidences)
+    return refine_items(target, items, poses, start_confidences=start_confidences)
 
 
 @torch.no_grad()
 def refine_items(
-    registrar: "Registrar",
+    target: Target,
     items: Sequence[ImageItem | CurviregError],
     poses: Any,
     *,
@@ -100,17 +100,17 @@ def refine_items(
         raise InvalidInputError(
             f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
         )
-    return registrar.map_items(
-        items, lambda item, i: refine_item(registrar, item, starts[i], limit=limits[i])
+    return map_items(
+        target, items, lambda item, i: refine_item(target, item, starts[i], limit=limits[i])
     )
 
 
 def refine_item(
-    registrar: "Registrar", item: ImageItem, T: Tensor, *, limit: float | None = None
+    target: Target, item: ImageItem, T: Tensor, *, limit: float | None = None
 ) -> Registration:
     """Refine (S, 4, 4) starts in one photograph, see :func:`refine`; the confidence is at most
     ``limit``. Raises :class:`LostObjectError` where the object is not near any start."""
-    describer = registrar.describer
+    describer = target.describer
     K = item.K
     boxes, visible = boxes_at(describer.hull, T, K, item.size)
     if not bool(visible.any()):
@@ -123,15 +123,15 @@ def refine_item(
         raise problem or LostObjectError(tiny)
     images = [item.image] * len(T)
     each = torch.arange(len(T))
-    query = registrar.matcher.query(images, boxes.float())
+    query = target.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
     poses = Poses.at(
         T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64)
     )
-    views = torch.tensor([nearest_view(registrar, R) for R in poses.rotation])
+    views = torch.tensor([nearest_view(target, R) for R in poses.rotation])
     poses = replace(poses, crop_index=each, view=views)
-    mask = registrar.object_mask(query, [item] * len(T))
+    mask = target.object_mask(query, [item] * len(T))
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
     poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
 
@@ -144,7 +144,7 @@ def refine_item(
         poses = poses.replaced(best, fitted)
     evidence = features_of(poses)
     scores = pose_scores(evidence, exact=True)
-    distinct = distinct_poses(poses, scores, registrar.symmetries_of(exact=True))
+    distinct = distinct_poses(poses, scores, target.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     if item.focal_deviation:
         first = torch.tensor(order[:1])
@@ -161,16 +161,16 @@ def refine_item(
             f"{features['similarity']:.2f}); give another start, or register it again"
         )
     probabilities: tuple[float, ...] = ()
-    if is_calibrated(registrar.pipeline):
+    if is_calibrated(target.pipeline):
         confidence = min(
-            confidence, _registered_probability(registrar, item, poses[torch.tensor(order[:1])])
+            confidence, _registered_probability(target, item, poses[torch.tensor(order[:1])])
         )
         probabilities = (
             confidence if limit is None else min(confidence, limit),
             *[0.0] * (len(hypotheses) - 1),
         )
-    warnings = item.warnings + registrar.mesh_warnings
-    notes = registrar.mesh_notes
+    warnings = item.warnings + target.mesh_warnings
+    notes = target.mesh_notes
     ranking = Ranking.none()
     return Registration(
         hypotheses,
@@ -183,18 +183,12 @@ def refine_item(
     )
 
 
-def _registered_probability(registrar: "Registrar", item: ImageItem, pose: Poses) -> float:
+def _registered_probability(target: Target, item: ImageItem, pose: Poses) -> float:
     """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of
     the box that it projects to, which its rotation does not influence."""
-    boxes, _ = boxes_at(registrar.describer.hull, pose.T, pose.cameras, item.size)
-    query = registrar.matcher.query([item.image], boxes.float())
-    found = registrar.with_hypotheses(COMPARED).register(replace(item, box=boxes[0].float()), query)
+    boxes, _ = boxes_at(target.describer.hull, pose.T, pose.cameras, item.size)
+    query = target.matcher.query([item.image], boxes.float())
+    found = register(target.with_hypotheses(COMPARED), replace(item, box=boxes[0].float()), query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
-    near = are_near(rotations, pose.rotation[0], registrar.symmetries_of(exact=registrar.is_exact))
+    near = are_near(rotations, pose.rotation[0], target.symmetries_of(exact=target.is_exact))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)
-
-
-def nearest_view(registrar: "Registrar", rotation: Tensor) -> int:
-    """The view of the bank that is most similar to an allocentric rotation (3, 3)."""
-    R = registrar.bank.rotations.cpu().double()
-    return int((R.flatten(1) @ rotation.flatten()).argmax())

@@ -7,7 +7,7 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar, overload
+from typing import Any, Generic, Self, TypeVar, overload
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -23,9 +23,7 @@ from ..mesh.mesh import mesh_unit
 from ..utils.choices import SIDE_NAMES
 from ..version import __version__
 from .confidence import RELIABLE
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
+from .target import Target
 
 Value = TypeVar("Value")
 
@@ -447,20 +445,20 @@ def ambiguity(rotations: Tensor) -> str | None:
 
 
 def result_document(
-    result: Registration, registrar: "Registrar", seconds: Mapping[str, float]
+    result: Registration, target: Target, seconds: Mapping[str, float]
 ) -> dict[str, Any]:
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank``
     and ``register``."""
-    registrar = registrar.of_model(result.model)
-    bank = registrar.bank
-    symmetries = registrar.symmetries_of(exact=registrar.is_exact)
+    target = target.of_model(result.model)
+    bank = target.bank
+    symmetries = target.symmetries_of(exact=target.is_exact)
     return {
         "schema": SCHEMA,
         "unit": mesh_unit(bank.mesh),
         "bank_views": len(bank),
         **result.to_dict(),
         "symmetries": 1 if symmetries is None else len(symmetries),
-        "pipeline": registrar.pipeline.describe(),
+        "pipeline": target.pipeline.describe(),
         "seconds": dict(seconds),
         "versions": {
             "curvireg_torch": __version__,

@@ -4,7 +4,6 @@ of them."""
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -33,12 +32,10 @@ from .poses import (
     compare_with_photograph,
     landmark_evidence,
 )
-from .refinement import LOST_CONFIDENCE, nearest_view
+from .refinement import LOST_CONFIDENCE
 from .result import Hypothesis, Registration
+from .target import Target, nearest_view
 from .tracker import boxes_at
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
 
 # World poses that are fitted in all photographs, those whose evidence is compared, and those fitted
 # at full size
@@ -138,17 +135,17 @@ class RigPhotograph:
 
     @staticmethod
     def of(
-        registrar: "Registrar", item: ImageItem, result: Registration, index: int, camera: Tensor
+        target: Target, item: ImageItem, result: Registration, index: int, camera: Tensor
     ) -> "RigPhotograph":
         box = item.box.double() if result.corrected_box is None else result.corrected_box
-        settings = registrar.bank.settings
+        settings = target.bank.settings
         boxes = box.float()[None]
         image = item.image.expand(3, -1, -1)
         crop = crop_regions(
             [image], boxes[:, None], size=settings.image_size, margin=settings.margin
         )[:, 0].float()
-        query = registrar.matcher.features(crop.to(registrar.bank.device))
-        mask = registrar.object_mask(query, [replace(item, box=boxes[0])])
+        query = target.matcher.features(crop.to(target.bank.device))
+        mask = target.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
             camera=camera,
@@ -157,8 +154,8 @@ class RigPhotograph:
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
-            descriptor=registrar.describer.descriptor(query.field),
-            landmarks=registrar.landmark_matches(item, box) if registrar.uses_landmarks else None,
+            descriptor=target.describer.descriptor(query.field),
+            landmarks=target.landmark_matches(item, box) if target.uses_landmarks else None,
             result=result,
         )
 
@@ -194,12 +191,12 @@ class Answer:
 class Rig:
     """Photographs of one object, whose poses are compared in all of them."""
 
-    def __init__(self, registrar: "Registrar", photographs: Sequence[RigPhotograph]) -> None:
-        self.registrar = registrar
-        self.describer = registrar.describer
+    def __init__(self, target: Target, photographs: Sequence[RigPhotograph]) -> None:
+        self.target = target
+        self.describer = target.describer
         self.photographs = photographs
-        self.exact = registrar.is_exact
-        symmetries = registrar.symmetries_of(exact=self.exact)
+        self.exact = target.is_exact
+        symmetries = target.symmetries_of(exact=self.exact)
         self.symmetries = (
             torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
         )
@@ -207,7 +204,7 @@ class Rig:
         self.eyes = -(self.cameras[:, :3, :3].mT @ self.cameras[:, :3, 3:])[..., 0]
 
     @staticmethod
-    def of(registrar: "Registrar", found: Found) -> "Rig":
+    def of(target: Target, found: Found) -> "Rig":
         """The photographs that were registered, if there are any, in the unit of the mesh."""
         usable = [one for _, one in sorted(found.items()) if isinstance(one, RigPhotograph)]
         if not usable:
@@ -217,7 +214,7 @@ class Rig:
                 if isinstance(one, CurviregError)
             ]
             raise InvalidInputError("no photograph can be registered", causes=causes)
-        rig = Rig(registrar, usable)
+        rig = Rig(target, usable)
         rig.check_unit()
         return rig
 
@@ -309,7 +306,7 @@ class Rig:
         """(V, M) log S of the best view of the bank near world poses, minus that of the best view
         of all."""
         ranks = []
-        views = self.registrar.bank.rotations.cpu().double()
+        views = self.target.bank.rotations.cpu().double()
         for photograph in self.photographs:
             scores = photograph.result.ranking.scores[0].cpu().double()
             log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
@@ -458,7 +455,7 @@ class Rig:
         for photograph in self.photographs:
             R, distance = self.allocentric(photograph, T)
             given = photograph.query, photograph.descriptor, photograph.result.ranking
-            similarity, appearance = compare_with_photograph(self.registrar, *given, R, distance)
+            similarity, appearance = compare_with_photograph(self.target, *given, R, distance)
             landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
@@ -522,7 +519,7 @@ class Rig:
             allocentric_rotation=R,
             distance=float(distance),
             projection=(first.camera @ T, first.K),
-            view=nearest_view(self.registrar, R),
+            view=nearest_view(self.target, R),
             edge_support=features["edge_support"],
             covariance=C.clone() if bool(C.isfinite().all()) else None,
         )

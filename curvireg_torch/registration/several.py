@@ -3,7 +3,7 @@ of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,12 +29,12 @@ from .inputs import (
     is_missing,
     rig_cameras,
 )
+from .photograph import register_item
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
+from .target import Target
 from .tracker import boxes_at
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
+from .work import map_items
 
 # Hypotheses of each photograph that are compared in all, even if fewer are reported
 JOINT_HYPOTHESES = 5
@@ -42,7 +42,7 @@ JOINT_HYPOTHESES = 5
 
 @torch.no_grad()
 def register_views(
-    registrar: "Registrar",
+    target: Target,
     images: Sequence[Any],
     boxes: Any,
     camera_matrices: Any,
@@ -58,7 +58,7 @@ def register_views(
     others decide again.
 
     Args:
-        registrar: :class:`Registrar` of the mesh.
+        target: the object, a :class:`.Registrar`.
         images: V photographs, see :class:`Registrar`.
         boxes: (V, 4), or a list with None where the poses of the others say where the object is.
             None: the object is searched for in each photograph.
@@ -88,8 +88,8 @@ def register_views(
         (torch.Size([4, 4]), 1)
     """
     check_cameras(images, camera_matrices, "register_views")
-    count = registrar.pipeline.hypotheses
-    registrar = registrar.with_hypotheses(JOINT_HYPOTHESES)
+    count = target.pipeline.hypotheses
+    target = target.with_hypotheses(JOINT_HYPOTHESES)
     items = image_items(images, boxes, camera_matrices)
     cameras = rig_cameras(T_cam_from_world, items)
     copies = copies_of(cameras, items)
@@ -100,9 +100,9 @@ def register_views(
     )
     found: Found = {}
     if given:
-        found = _registered(registrar, items, cameras, given)
+        found = _registered(target, items, cameras, given)
     else:
-        for i, (result,) in enumerate(detect(registrar, images, camera_matrices)):
+        for i, (result,) in enumerate(detect(target, images, camera_matrices)):
             if i in copies:
                 continue
             item = items[i]
@@ -110,7 +110,7 @@ def register_views(
                 found[i] = result.error
             elif isinstance(item, ImageItem) and result.detection is not None:
                 item = replace(item, box=result.detection.box.float())
-                found[i] = RigPhotograph.of(registrar, item, result, i, cameras[i])
+                found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
         # they tell where it is in the others
         if any(isinstance(one, RigPhotograph) for one in found.values()):
             found = {i: one for i, one in found.items() if not isinstance(one, LostObjectError)}
@@ -118,13 +118,13 @@ def register_views(
         i: InvalidInputError(f"a copy of image {j}, which counts once") for i, j in copies.items()
     }
     if missing := [i for i in range(len(items)) if i not in found]:
-        where = Rig.of(registrar, found).answer().T[:1]
-        found |= _registered(registrar, items, cameras, missing, where)
-    return _registration(registrar, found, cameras, count)
+        where = Rig.of(target, found).answer().T[:1]
+        found |= _registered(target, items, cameras, missing, where)
+    return _registration(target, found, cameras, count)
 
 
 def _registered(
-    registrar: "Registrar",
+    target: Target,
     items: Sequence[ImageItem | CurviregError],
     cameras: Tensor,
     chosen: Sequence[int],
@@ -136,31 +136,29 @@ def _registered(
     def register(item: ImageItem, k: int) -> RigPhotograph:
         camera = cameras[chosen[k]]
         if T is not None:
-            box, visible = boxes_at(registrar.describer.hull, camera @ T, item.K, item.size)
+            box, visible = boxes_at(target.describer.hull, camera @ T, item.K, item.size)
             if not bool(visible):
                 raise LostObjectError(ELSEWHERE)
             item = replace(item, box=box[0].float())
-        return RigPhotograph.of(registrar, item, registrar.register_item(item), chosen[k], camera)
+        return RigPhotograph.of(target, item, register_item(target, item), chosen[k], camera)
 
-    found = registrar.map_items(OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
+    found = map_items(target, OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
     return {
         i: r.error if isinstance(r, FailedRegistration) else r
         for i, r in zip(chosen, found, strict=True)
     }
 
 
-def _registration(
-    registrar: "Registrar", found: Found, cameras: Tensor, count: int
-) -> Registration:
+def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> Registration:
     """The joint result of photographs, without those that failed or do not show the best pose;
     ``count`` hypotheses."""
     reasons = {i: one.message for i, one in found.items() if isinstance(one, CurviregError)}
-    rig = every = Rig.of(registrar, found)
+    rig = every = Rig.of(target, found)
     answer = rig.answer()
     compared = dict(zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True))
     if lost := rig.lost(answer):
         reasons |= lost
-        rig = Rig(registrar, [p for p in rig.photographs if p.index not in lost])
+        rig = Rig(target, [p for p in rig.photographs if p.index not in lost])
         answer = rig.answer()
         compared |= dict(
             zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True)
@@ -174,7 +172,7 @@ def _registration(
     if len(total) == 1 and len(rig.photographs) > 1:
         features["margin"] = MAX_MARGIN
     probabilities = first.result.probabilities
-    if is_calibrated(registrar.pipeline) and len(rig.photographs) + len(lost) > 1:
+    if is_calibrated(target.pipeline) and len(rig.photographs) + len(lost) > 1:
         if len(rig.photographs) > 1:
             found_in = [p.result.detection for p in every.photographs]
             scores = [detection.score for detection in found_in if detection is not None] or [1.0]

@@ -3,27 +3,20 @@ features differ."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
-import trimesh
 from torch import Tensor
 
 from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
-from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 from .confidence import RIVAL_ANGLE
 from .poses import POSE_FEATURES, Poses, placed, pose_scores, with_edge_support
 from .refits import best_inside
+from .target import Target
+from .work import Work, features_of, fitted_poses, with_replaced
 
-if TYPE_CHECKING:
-    from .judging import Work
-    from .registrar import Registrar
-
-# Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
-MAX_SIBLINGS = 12
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
 
 
@@ -85,31 +78,9 @@ class Siblings:
         return self.poses[chosen], features
 
 
-def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
-    """(K, 4, 4) those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from
-    the identity, which is the first; at most ``MAX_SIBLINGS``, far from each other."""
-    chosen = spread(symmetries)
-    telling = feature_fractions(mesh, chosen) > FEATURE_FRACTION
-    telling[0] = True
-    return chosen[telling]
-
-
-def spread(symmetries: Tensor) -> Tensor:
-    """At most ``MAX_SIBLINGS`` of the symmetries (S, 4, 4), the identity first, far from each
-    other."""
-    R = symmetries[:, :3, :3].double()
-    chosen = [0]
-    nearest = rotation_error(R, R[0])
-    while len(chosen) < min(MAX_SIBLINGS, len(R)):
-        farthest = int(nearest.argmax())
-        chosen.append(farthest)
-        nearest = torch.minimum(nearest, rotation_error(R, R[farthest]))
-    return symmetries[torch.tensor(chosen)]
-
-
 def with_siblings(
-    registrar: "Registrar",
-    work: "Work",
+    target: Target,
+    work: Work,
     crops: EdgeCrops,
     poses: Poses,
     features: Tensor,
@@ -118,20 +89,20 @@ def with_siblings(
     """Replace the best pose by what a symmetry of the shape makes of it, if small features say so;
     and return its strongest rival among these, with its features, unless all of them look alike.
     Given symmetries are trusted."""
-    symmetries = registrar.telling_symmetries
+    symmetries = target.telling_symmetries
     if len(symmetries) == 1:
         return poses, features, None
     best = best_inside(features, outside)
 
     def measure(some: Poses) -> Tensor:
-        return registrar.features_of(work, with_edge_support(registrar.describer, crops, some))
+        return features_of(target, work, with_edge_support(target.describer, crops, some))
 
-    siblings = Siblings.of(poses[best], symmetries, registrar.describer, crops, measure)
+    siblings = Siblings.of(poses[best], symmetries, target.describer, crops, measure)
     kept = siblings.best()
     if kept:
-        fitted = registrar.fitted(work, crops, siblings.poses[torch.tensor([kept])], again=True)
-        new = registrar.features_of(work, fitted)
-        poses, features = registrar.replaced(work, poses, features, best, fitted, new)
+        fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], again=True)
+        new = features_of(target, work, fitted)
+        poses, features = with_replaced(work, poses, features, best, fitted, new)
     rival = siblings.rival(kept, features[best])
     if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
         rival = None

@@ -2,7 +2,6 @@
 mathematics."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,36 +20,33 @@ from .focal import (
     with_focal_length,
 )
 from .inputs import ImageItem
-from .judging import Work
 from .poses import Poses, best_views, pose_scores
 from .priors import Limits
-
-if TYPE_CHECKING:
-    from .registrar import Registrar
-
+from .target import Target
+from .work import Work, features_of, least_starts, poses_of_views, with_replaced
 
 SAME_SCORE = 0.2
 """Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge
 support."""
 
 
-def limits_of(registrar: "Registrar", item: ImageItem) -> Limits:
+def limits_of(target: Target, item: ImageItem) -> Limits:
     """The limits of a photograph that has any; an unknown camera counts as a usual one, and widens
     them."""
     assert item.prior is not None
     if item.camera_matrix is not None:
-        return Limits(item, registrar.bank)
-    if not registrar.is_exact:
+        return Limits(item, target.bank)
+    if not target.is_exact:
         if item.prior.distance is not None:
             raise InvalidInputError(
                 "distance: with a similar mesh, needs the camera of the photograph"
             )
-        return Limits(item, registrar.bank)
+        return Limits(item, target.bank)
     usual = replace(item, camera_matrix=usual_camera(item.size))
-    return Limits(usual, registrar.bank, off_centre=off_axis_angle(usual))
+    return Limits(usual, target.bank, off_centre=off_axis_angle(usual))
 
 
-def with_possible_cameras(registrar: "Registrar", work: Work) -> Work:
+def with_possible_cameras(target: Target, work: Work) -> Work:
     """A photograph whose camera is unknown, with starts of several cameras, the best of which it
     has."""
     item = replace(work.item, focal_deviation=USUAL_DEVIATION, camera_source="estimated")
@@ -58,25 +54,23 @@ def with_possible_cameras(registrar: "Registrar", work: Work) -> Work:
     K = usual_camera(item.size)
     if work.crops is not None:
         view, rank = best_views(
-            work.ranking, registrar.bank, count=TRIED_VIEWS, symmetries=work.symmetries
+            work.ranking, target.bank, count=TRIED_VIEWS, symmetries=work.symmetries
         )
         of_cameras = []
         for camera in possible_cameras(item.size):
             seen = replace(work, item=replace(item, camera_matrix=camera))
-            poses = registrar.poses_of_views(seen, view, rank)
+            poses = poses_of_views(target, seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(
-            registrar.describer, work.crops, of_cameras, registrar.least_starts
-        )
+        starts = starts_of_fields(target.describer, work.crops, of_cameras, least_starts(target))
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
-    limits = None if item.prior is None else Limits(item, registrar.bank)
-    landmarks = registrar.landmark_matches(item, item.box) if registrar.uses_landmarks else None
+    limits = None if item.prior is None else Limits(item, target.bank)
+    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
     return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
 
 
 def with_fitted_focal_lengths(
-    registrar: "Registrar",
+    target: Target,
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
@@ -90,15 +84,15 @@ def with_fitted_focal_lengths(
     count = FITTED if work.starts is not None else 1
     best = scores.topk(min(count, int((~outside).sum()))).indices
     for index in best.split(1):
-        fitted = with_focal_length(registrar.describer, crops, poses[index], work.item)
-        new = registrar.features_of(work, fitted)
+        fitted = with_focal_length(target.describer, crops, poses[index], work.item)
+        new = features_of(target, work, fitted)
         if bool(pose_scores(new, exact=True) >= scores[index] - SAME_SCORE):
-            poses, features = registrar.replaced(work, poses, features, index, fitted, new)
+            poses, features = with_replaced(work, poses, features, index, fitted, new)
     return poses, features
 
 
 def with_focal_deviation(
-    registrar: "Registrar",
+    target: Target,
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
@@ -108,7 +102,7 @@ def with_focal_deviation(
     """The photograph with the camera of the best pose and what is known of its focal length, and
     the poses with the covariance that follows; the others have none."""
     best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
-    covariance, deviation = focal_covariance(registrar.describer, crops, poses[best], work.item)
+    covariance, deviation = focal_covariance(target.describer, crops, poses[best], work.item)
     unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
     item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)
     return replace(work, item=item), replace(poses, covariance=unknown)

@@ -18,7 +18,8 @@ from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
 from curvireg_torch.pipeline import BankSettings
-from curvireg_torch.registration import registrar as registrar_module
+from curvireg_torch.registration import photograph as photograph_module
+from curvireg_torch.registration import work
 from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
@@ -209,8 +210,8 @@ def test_a_fit_that_leaves_the_landmarks_is_not_kept(monkeypatch):
             describer.centre,
         )
 
-    monkeypatch.setattr(registrar_module, "fit_poses", fit_elsewhere)
-    monkeypatch.setattr(registrar_module, "fit_texture_of", lambda *_: None)
+    monkeypatch.setattr(work, "fit_poses", fit_elsewhere)
+    monkeypatch.setattr(photograph_module, "fit_texture_of", lambda *_: None)
     result = registrar()([photograph(T)], box_of(T)[None], K)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
     assert result.edge_support > 0.0
@@ -276,7 +277,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmar
     )
     assert grey.landmark_matches(item) is None
     assert registrar().landmark_matches(replace(item, camera_matrix=None)) is None
-    poses, count = grey.landmark_poses(None)
+    poses, count = work.landmark_poses(grey, None)
     assert len(poses) == len(count) == 0
 
 

@@ -21,7 +21,8 @@ from curvireg_torch.geometry import (
 from curvireg_torch.matching import ViewDescriber, ViewMatcher
 from curvireg_torch.registration import Detector, Proposals, detect
 from curvireg_torch.registration import detection as detection_module
-from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views, _medoids
+from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views
+from curvireg_torch.registration.detector import _medoids
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.result import corners
 from curvireg_torch.synthetic import example_mesh, procedural_background

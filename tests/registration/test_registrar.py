@@ -22,7 +22,7 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, refits
+from curvireg_torch.registration import FailedRegistration, Follower, photograph, refits, work
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
@@ -114,19 +114,19 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
 
 
 def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
-    fit_poses = registrar_module.fit_poses
+    fit_poses = work.fit_poses
     counts = []
 
     def counted(describer, images, poses, **options):
         counts.append(len(poses))
         return fit_poses(describer, images, poses, **options)
 
-    monkeypatch.setattr(registrar_module, "fit_poses", counted)
+    monkeypatch.setattr(work, "fit_poses", counted)
     assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
     assert counts == [3, 1], "the best is fitted twice"
 
 
-@pytest.mark.parametrize("weight", [0.0, registrar_module.SCREENING_WEIGHT])
+@pytest.mark.parametrize("weight", [0.0, photograph.SCREENING_WEIGHT])
 def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight):
     registrar = truck_registrar()
     item = ImageItem(IMAGE, BOX, CAMERA)
@@ -139,9 +139,9 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
     lowered = replace(
         ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True)
     )
-    monkeypatch.setattr(registrar_module, "SCREENING_WEIGHT", weight)
+    monkeypatch.setattr(photograph, "SCREENING_WEIGHT", weight)
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
-    result = registrar.register(item, query)
+    result = photograph.register(registrar, item, query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == (weight > 0)
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
 
@@ -163,28 +163,28 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
     quick_fit = contour_fit.quick_fit
     fits = []
     described = []
-    features_of = type(registrar).features_of
+    compare = work.compare_with_photograph
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return quick_fit(contours, crops, K, T, *index)
 
-    def features(self, work, poses):
-        described.append(len(poses))
-        return features_of(self, work, poses)
+    def compared(*given):
+        described.append(len(given[-1]))
+        return compare(*given)
 
     for module in (contour_fit, poses_module):
         monkeypatch.setattr(module, "quick_fit", counted)
-    monkeypatch.setattr(type(registrar), "features_of", features)
+    monkeypatch.setattr(work, "compare_with_photograph", compared)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
-    assert fits == [registrar_module.SCREENED_VIEWS, 1]
+    assert fits == [photograph.SCREENED_VIEWS, 1]
     assert len(described) == calls
 
 
 @pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
 def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
-    fit_poses = registrar_module.fit_poses
+    fit_poses = work.fit_poses
 
     def pretended(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
@@ -193,7 +193,7 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
         )
         return other if options.get("again") else fitted
 
-    monkeypatch.setattr(registrar_module, "fit_poses", pretended)
+    monkeypatch.setattr(work, "fit_poses", pretended)
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 
@@ -208,14 +208,14 @@ def test_default_dtype_does_not_matter():
 
 
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
-    fit_poses = registrar_module.fit_poses
+    fit_poses = work.fit_poses
 
     def fail(describer, crops, poses, **options):
         if float(crops.crops.amax()) <= 0.25:
             raise CurviregError("no fit")
         return fit_poses(describer, crops, poses, **options)
 
-    monkeypatch.setattr(registrar_module, "fit_poses", fail)
+    monkeypatch.setattr(work, "fit_poses", fail)
     results = truck_registrar()([IMAGE, 0.25 * IMAGE, IMAGE], BOX.repeat(3, 1), CAMERA)
     assert [result.ok for result in results] == [True, False, True]
     assert str(results[1].error) == "image 1: no fit"
@@ -356,7 +356,7 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
         )
     )
     answers = iter([first, other])
-    monkeypatch.setattr(registrar, "_register_box", lambda _: next(answers))
+    monkeypatch.setattr(photograph, "_register_box", lambda *_: next(answers))
     result = registrar([IMAGE], WRONG[None], CAMERA)[0]
     assert (result is first) != better
     assert (result.corrected_box is None) != better

@@ -20,7 +20,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration import poses, registrar, search
+from curvireg_torch.registration import photograph, poses, search, work
 from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -167,15 +167,15 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     def refused(*_: Any, **__: Any) -> Any:
         raise AssertionError("not a stage of the paper")
 
-    for name in (
-        "fit_poses",
-        "with_quick_fit",
-        "with_edge_support",
-        "fit_texture_of",
-        "landmark_evidence",
+    for module, name in (
+        (work, "fit_poses"),
+        (photograph, "with_quick_fit"),
+        (photograph, "with_edge_support"),
+        (photograph, "fit_texture_of"),
+        (work, "landmark_evidence"),
+        (photograph, "EdgeCrops"),
     ):
-        monkeypatch.setattr(registrar, name, refused)
-    monkeypatch.setattr(registrar, "EdgeCrops", refused)
+        monkeypatch.setattr(module, name, refused)
     monkeypatch.setattr(poses, "fit_to_edges", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)

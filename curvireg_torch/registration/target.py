@@ -1,0 +1,187 @@
+"""The object that photographs are registered to."""
+
+import threading
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Self
+
+import torch
+import trimesh
+from torch import Tensor
+
+from ..fitting.landmarks import LandmarkMatches, Landmarks
+from ..matching import ViewDescriber, ViewMatcher
+from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
+from ..terms import QueryFeatures
+from ..utils.threads import map_on_threads
+from .detector import Detector
+from .inputs import ImageItem
+from .shape_symmetries import telling_symmetries
+
+# Thickness of a mesh, as a fraction of its radius, below which it counts as flat
+FLAT_EXTENT = 1e-3
+
+_SHAPE_LOCK = threading.Lock()
+
+
+class Target:
+    """What is known of an object that photographs are registered to.
+
+    Attributes:
+        matcher: compares photographs with the views of its ``bank``, by the settings of its
+            ``pipeline``.
+        mesh_is: "exact", "similar" or None, see :class:`.Registrar`.
+        symmetries: (S, 4, 4) that were given, or None.
+        progress: whether, or by what callback, progress is shown.
+        others: further candidates for the object.
+    """
+
+    others: Sequence["Target"]
+
+    def __init__(
+        self,
+        matcher: ViewMatcher,
+        *,
+        mesh_is: str | None = None,
+        symmetries: Tensor | None = None,
+        progress: bool | Callable[[str, int, int], object] = False,
+    ) -> None:
+        self.matcher = matcher
+        self.bank = matcher.bank
+        self.pipeline = matcher.pipeline
+        self.mesh_is = mesh_is
+        self.symmetries = symmetries
+        self.progress = progress
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the mesh counts as that of this very object."""
+        return self.mesh_is != "similar"
+
+    def symmetries_of(self, *, exact: bool) -> Tensor | None:
+        """(S, 4, 4) that were given, or those of the shape of an exact mesh; None if there are
+        none."""
+        if not exact or self.symmetries is not None:
+            return self.symmetries
+        with _SHAPE_LOCK:  # photographs share them
+            return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
+
+    @cached_property
+    def telling_symmetries(self) -> Tensor:
+        """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity
+        alone if they are given, and trusted."""
+        symmetries = self.symmetries_of(exact=True)
+        if self.symmetries is not None or symmetries is None:
+            return torch.eye(4, dtype=torch.float64)[None]
+        return telling_symmetries(self.bank.mesh, symmetries)
+
+    @property
+    def uses_landmarks(self) -> bool:
+        """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
+        return self.is_exact and self.pipeline.contours
+
+    def landmark_matches(
+        self, item: ImageItem, box: Tensor | None = None
+    ) -> LandmarkMatches | None:
+        """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
+        colours or a camera matrix.
+
+        :meta private:
+        """
+        if not self.describer.draws_colours or item.camera_matrix is None:
+            return None
+        with _SHAPE_LOCK:  # photographs share them
+            landmarks = self._landmarks
+        return landmarks.matches(item.image, item.camera_matrix, box)
+
+    @cached_property
+    def _landmarks(self) -> Landmarks:
+        return Landmarks(self.describer)
+
+    @cached_property
+    def mesh_warnings(self) -> tuple[str, ...]:
+        """What makes every pose of this mesh questionable, in words."""
+        return flat_mesh_warnings(self.bank.mesh)
+
+    @property
+    def mesh_notes(self) -> tuple[str, ...]:
+        """What the mesh lacks, in words: see :func:`curvireg_torch.mesh.mesh_warnings`."""
+        return tuple(warning.text for warning in mesh_warnings(self.bank.mesh))
+
+    @cached_property
+    def describer(self) -> ViewDescriber:
+        """Renderer, contours and descriptor of the mesh, on a grid twice as fine as the bank's."""
+        settings = self.bank.settings
+        return self.matcher.describer.with_settings(
+            replace(settings, grid=min(2 * settings.grid, settings.image_size))
+        )
+
+    @cached_property
+    def detector(self) -> Detector:
+        """Proposes boxes where none are given."""
+        # one thread: rounding is always the same
+        return map_on_threads(lambda _: Detector(self.matcher), [0])[0]
+
+    def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
+        """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted,
+        or None."""
+        settings = self.bank.settings
+        masks = [item.mask_crop(settings.image_size, settings.margin) for item in items]
+        if query.mask is not None:
+            pairs = zip(masks, query.mask.split(1), strict=True)
+            masks = [predicted if given is None else given for given, predicted in pairs]
+        known = next((mask for mask in masks if mask is not None), None)
+        if known is None:
+            return None
+        return torch.cat(
+            [torch.ones_like(known) if mask is None else mask.to(known) for mask in masks]
+        )
+
+    def with_hypotheses(self, count: int) -> Self:
+        """The same target with at least ``count`` hypotheses, of which a joint result needs more
+        than it reports.
+
+        :meta private:
+        """
+        if self.pipeline.hypotheses >= count:
+            return self
+        _ = self.describer  # shared
+        other = copy(self)
+        other.pipeline = replace(self.pipeline, hypotheses=count)
+        return other
+
+    def of_model(self, model: int) -> "Target":
+        """The target that is one of several meshes, by :attr:`Registration.model`."""
+        return self.others[model - 1] if model else self
+
+    def share(self) -> None:
+        """Create what threads share once, before they use it.
+
+        :meta private:
+        """
+        _ = self.describer.contours, self.mesh_warnings
+        _ = self.is_exact and self.telling_symmetries
+
+    def report_progress(self, stage: str) -> None:
+        """Call the progress callback, if there is one."""
+        if callable(self.progress):
+            self.progress(stage, 0, 1)
+
+
+def nearest_view(target: Target, rotation: Tensor) -> int:
+    """The view of the bank that is most similar to an allocentric rotation (3, 3)."""
+    R = target.bank.rotations.cpu().double()
+    return int((R.flatten(1) @ rotation.flatten()).argmax())
+
+
+def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:
+    """What makes every pose of a flat mesh questionable, in words."""
+    vertices = torch.from_numpy(mesh.vertices.copy()).double()
+    thickness = (
+        float(torch.linalg.svdvals(vertices - vertices.mean(dim=0))[-1]) / len(vertices) ** 0.5
+    )
+    if has_colours(mesh) or thickness > FLAT_EXTENT * mesh_radius(mesh):
+        return ()
+    return ("the mesh is flat and has no colours: front and back look alike",)

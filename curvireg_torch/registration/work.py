@@ -1,0 +1,153 @@
+"""One photograph under work: what is known of it, and how its poses are found, fitted and
+described."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError
+from ..fitting.edges import EdgeCrops
+from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches
+from ..fitting.measured_fit import measure_contours
+from ..matching import Ranking
+from ..terms import QueryFeatures
+from ..utils.threads import map_on_threads
+from .inputs import ImageItem
+from .poses import Poses, compare_with_photograph, fit_poses, landmark_evidence, pose_features
+from .priors import Limits
+from .result import FailedRegistration
+from .target import Target, nearest_view
+
+MIN_REFINED = 3
+"""Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on
+rivals. Of 15 photographs of another object, 14 were called reliable with one hypothesis, 2 with
+two, none with three or five."""
+
+# Fraction of the landmarks that agree with a start, which must agree with its fit as well
+KEPT_LANDMARKS = 0.5
+
+
+@dataclass(frozen=True)
+class Work:
+    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's,
+    ``crops`` for contour fits, and ``landmarks`` in the box, if there are any; ``starts`` with
+    several cameras if the camera is unknown."""
+
+    item: ImageItem
+    query: QueryFeatures
+    ranking: Ranking
+    descriptor: Tensor
+    limits: Limits | None
+    exact: bool
+    symmetries: Tensor | None
+    crops: EdgeCrops | None
+    landmarks: LandmarkMatches | None
+    starts: Poses | None = None
+
+
+def map_items(
+    target: Target,
+    items: Sequence[ImageItem | CurviregError],
+    function: Callable[[ImageItem, int], Any],
+) -> list[Any]:
+    """Results of ``function(item, index)`` for all items, a :class:`FailedRegistration` for
+    each error.
+
+    On a CPU each photograph has a thread, in which torch uses no further ones: its result is
+    the same to the bit, whatever else is registered. Items are read on demand, so that few
+    photographs are in memory.
+    """
+    target.share()
+
+    def run(index: int) -> Any:
+        item = items[index]
+        if not isinstance(item, ImageItem):
+            return FailedRegistration(item)
+        try:
+            return function(item, index)
+        except CurviregError as error:
+            return FailedRegistration(error.with_subject("").of_image(index))
+
+    return map_on_threads(run, range(len(items)), device=target.bank.device)
+
+
+def least_starts(target: Target) -> int:
+    return max(MIN_REFINED, target.pipeline.hypotheses)
+
+
+def poses_of_views(target: Target, work: Work, view: Tensor, rank: Tensor) -> Poses:
+    return poses_in_box(
+        target,
+        work,
+        target.bank.rotations.cpu()[view].double(),
+        target.bank.distances.cpu()[view],
+        view,
+        rank,
+    )
+
+
+def poses_in_box(target: Target, work: Work, *poses: Tensor) -> Poses:
+    return Poses.in_box(target.describer, work.item.box, work.item.camera_matrix, *poses)
+
+
+def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
+    """Poses on which landmarks agree, as promising as the best view, and how many, the largest
+    number first.
+
+    :meta private:
+    """
+    found = [] if matches is None else matches.poses()
+    T = (
+        torch.stack([pose.T for pose in found])
+        if found
+        else torch.zeros(0, 4, 4, dtype=torch.float64)
+    )
+    K = torch.eye(3, dtype=torch.float64) if matches is None else torch.from_numpy(matches.K)
+    none = torch.zeros(len(T))
+    poses = Poses.at(T, K.expand(len(T), 3, 3), target.describer.centre, none.long(), none.double())
+    views = torch.tensor([nearest_view(target, R) for R in poses.rotation], dtype=torch.long)
+    return replace(poses, view=views), torch.tensor([float(pose.count) for pose in found])
+
+
+def features_of(target: Target, work: Work, poses: Poses) -> Tensor:
+    """(H, F) :data:`POSE_FEATURES`."""
+    given = work.query, work.descriptor, work.ranking
+    similarity, appearance = compare_with_photograph(target, *given, poses.rotation, poses.distance)
+    landmarks = (
+        None
+        if work.landmarks is None
+        else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
+    )
+    return pose_features(poses, similarity, appearance, landmarks)
+
+
+def fitted_poses(
+    target: Target, work: Work, crops: EdgeCrops, starts: Poses, **options: Any
+) -> Poses:
+    """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that
+    agree with it."""
+    poses = fit_poses(target.describer, crops, starts, **options)
+    if work.landmarks is not None:
+        before = work.landmarks.agreeing(starts.T, starts.cameras)
+        after = work.landmarks.agreeing(poses.T, poses.cameras)
+        left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
+        if len(left):
+            kept = starts[left]
+            seen = measure_contours(
+                target.describer.contours, crops, kept.cameras, kept.T, kept.crop_index
+            )
+            poses = poses.replaced(left, kept.with_fit(seen, target.describer.centre))
+    return poses
+
+
+def with_replaced(
+    work: Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
+) -> tuple[Poses, Tensor]:
+    """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds
+    the limits."""
+    if work.limits is not None and not bool(work.limits.keeps(fitted)):
+        return poses, features
+    return poses.replaced(index, fitted), features.index_copy(0, index, new)
