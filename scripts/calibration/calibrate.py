@@ -427,6 +427,28 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
     }
 
 
+def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
+    """The model of ``constants`` with a scale and a level fitted to the rows: two numbers, which
+    few photographs determine. Slope and resolution of the shares stay."""
+    logit = np.array([row_logit(row, constants) for row in rows])
+    y = np.array([row["right"] for row in rows])
+
+    def loss(p: np.ndarray) -> float:
+        scaled = p[0] * logit + p[1]
+        return float(weight @ (np.logaddexp(0.0, scaled) - y * scaled))
+
+    scale, level = minimize(loss, np.array([1.0, 0.0])).x
+    weights = {name: round(scale * value, 4) for name, value in constants["weights"].items()}
+    bias = round(scale * constants["bias"] + level, 4)
+    return constants | {"weights": weights, "bias": bias, "n": len(y)}
+
+
+def row_logit(row: Row, constants: Row) -> float:
+    """Logit of the probability that any hypothesis of a row is right."""
+    weights = constants["weights"].items()
+    return float(constants["bias"] + sum(w * (row["features"][name] or 0.0) for name, w in weights))
+
+
 def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
     """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
     pose is right and some are not; without ``ties`` the resolution is 0."""
@@ -483,13 +505,15 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     return quality
 
 
-def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
+def fit_registrations(
+    rows: list[Row], *, exact: bool, present: Row | None = None
+) -> tuple[Row, Row]:
     """Constants of a model of registrations, and their quality on held-out folds, in all and by
-    set."""
+    set. With the ``present`` constants only their level is fitted, see :func:`fit_level`."""
     for row in rows:
-        present = row["set"] not in ABSENT
-        row["right"] = present and min(row["errors"]) < RIGHT
-        row["first"] = present and row["errors"][0] < RIGHT
+        is_present = row["set"] not in ABSENT
+        row["right"] = is_present and min(row["errors"]) < RIGHT
+        row["first"] = is_present and row["errors"][0] < RIGHT
     sets = np.array([row["set"] for row in rows])
     ordinary = float(sum(name not in SHARES for name in sets))
     factor = ordinary / (1.0 - sum(SHARES[name] for name in set(sets) if name in SHARES))
@@ -500,6 +524,8 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
 
     def fit(train: np.ndarray) -> Row:
         some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
+        if present is not None:
+            return fit_level(some, weight[train], present)
         return fit_logistic(some, weight[train], signs) | fit_shares(
             some, weight[train], ties=exact
         )
@@ -527,7 +553,13 @@ def fit_registrations(rows: list[Row], *, exact: bool) -> tuple[Row, Row]:
 
 
 def calibrate(
-    work: Path, jobs: int, limit: int | None, models: Sequence[str], meshes: Path | None
+    work: Path,
+    jobs: int,
+    limit: int | None,
+    models: Sequence[str],
+    meshes: Path | None,
+    *,
+    level: bool = False,
 ) -> tuple[Row, Row]:
     """Constants, those of other ``models`` as they were, and quality of the new ones on held-out
     kinds of objects."""
@@ -541,7 +573,9 @@ def calibrate(
         rows = [
             row for chosen in sets_of([name], meshes) for row in rows_of(work, chosen, jobs, limit)
         ]
-        constants[name], quality[name] = fit_registrations(rows, exact=name == "instance")
+        constants[name], quality[name] = fit_registrations(
+            rows, exact=name == "instance", present=constants[name] if level else None
+        )
         right = [row for row in rows if row["first"] and "distance2" in row]
         distances = [
             row["distance2"] for row in right if first_probability(row, constants[name]) >= RELIABLE
@@ -566,6 +600,9 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
     parser.add_argument("--limit", type=int, help="photographs to measure, fewer than there are")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--level", action="store_true", help="few photographs: fit scale and level alone"
+    )
     parser.add_argument("--render", action="store_true", help="render the sets only")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -573,7 +610,12 @@ def main() -> None:
     if options.render:
         return
     constants, quality = calibrate(
-        options.work, options.jobs, options.limit, options.models, options.meshes
+        options.work,
+        options.jobs,
+        options.limit,
+        options.models,
+        options.meshes,
+        level=options.level,
     )
     record = {"date": today(), "commit": commit(), "constants": constants, "held out": quality}
     print(json.dumps(record, indent=2))

@@ -99,3 +99,18 @@ def test_cut_puts_a_fraction_of_the_object_outside(fraction):
     pose[:3, :3], pose[:3, 3] = torch.from_numpy(R), torch.from_numpy(t)
     found = outside_fraction(torch.from_numpy(points), pose, torch.from_numpy(K), (480, 640))
     assert found == pytest.approx(fraction, abs=0.02)
+
+
+def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
+    generator = np.random.default_rng(0)
+    constants = {"weights": {"a": 2.0, "b": -1.0}, "bias": 0.5, "slope": 1.5, "resolution": 0.5}
+    rows = []
+    for a, b in generator.normal(size=(4000, 2)):
+        logit = 0.5 * (0.5 + 2.0 * a - b) - 1.0  # half as sure as the model says, and lower
+        right = bool(generator.random() < 1.0 / (1.0 + np.exp(-logit)))
+        rows.append({"features": {"a": a, "b": b}, "right": right})
+    fitted = calibrate.fit_level(rows, np.ones(len(rows)), constants)
+    assert fitted["weights"]["a"] == pytest.approx(1.0, abs=0.1)
+    assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.05)
+    assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.1)
+    assert (fitted["slope"], fitted["resolution"]) == (1.5, 0.5)
