@@ -188,8 +188,8 @@ def test_the_pose_of_the_sample_is_right(workspace, tmp_path, monkeypatch):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     asyncio.run(workspace.load_sample())
     result = workspace.session.register()
-    # The photograph hardly tells where the handle is: the best rival, turned by 72 degrees about the
-    # cup's axis, is 0.9 points behind; of 220 reliable answers none had a rival within 1.47.
+    # The photograph hardly tells where the handle is: the best rival, turned by 72 degrees about
+    # the cup's axis, is 0.9 points behind; of 220 reliable answers none had one within 1.47.
     assert result.verdict in ("reliable", "unsure")
     assert workspace.session.shot.found_box.tolist() == list(module.SAMPLE_BOX)
     T, K = workspace.session.shot.projection
