@@ -428,19 +428,21 @@ def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, fl
 
 
 def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
-    """The model of ``constants`` with a scale and a level fitted to the rows: two numbers, which
-    few photographs determine. Slope and resolution of the shares stay."""
+    """The model of ``constants`` with a scale and a level of its logit, so that the confidence of
+    the first hypothesis, its share included, is right: two numbers, which few photographs
+    determine. Slope and resolution of the shares stay."""
     logit = np.array([row_logit(row, constants) for row in rows])
-    y = np.array([row["right"] for row in rows])
+    share = np.array([first_share(row, constants) for row in rows])
+    first = np.array([row["first"] for row in rows])
 
     def loss(p: np.ndarray) -> float:
-        scaled = p[0] * logit + p[1]
-        return float(weight @ (np.logaddexp(0.0, scaled) - y * scaled))
+        confidence = np.clip(expit(p[0] * logit + p[1]) * share, 1e-9, 1.0 - 1e-9)
+        return float(-weight @ np.log(np.where(first, confidence, 1.0 - confidence)))
 
-    scale, level = minimize(loss, np.array([1.0, 0.0])).x
-    weights = {name: round(scale * value, 4) for name, value in constants["weights"].items()}
-    bias = round(scale * constants["bias"] + level, 4)
-    return constants | {"weights": weights, "bias": bias, "n": len(y)}
+    scale, level = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead").x
+    weights = {name: round(float(scale) * value, 4) for name, value in constants["weights"].items()}
+    bias = round(float(scale * constants["bias"] + level), 4)
+    return constants | {"weights": weights, "bias": bias, "n": len(rows)}
 
 
 def row_logit(row: Row, constants: Row) -> float:
@@ -480,9 +482,14 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
 def first_probability(row: Row, constants: Row) -> float:
     """Confidence of a row."""
     any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
+    return any_right * first_share(row, constants)
+
+
+def first_share(row: Row, constants: Row) -> float:
+    """Share of the first hypothesis in the probability that any is right."""
     scores = np.array(row["scores"])
     logits = -constants["slope"] * np.maximum(0.0, scores.max() - scores - constants["resolution"])
-    return float(any_right * np.exp(logits[0] - logsumexp(logits)))
+    return float(np.exp(logits[0] - logsumexp(logits)))
 
 
 def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:

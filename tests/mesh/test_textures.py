@@ -90,11 +90,10 @@ def test_only_the_formats_of_photographs_are_decoded(
 def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path: Path) -> None:
     (tmp_path / "a.eps").write_bytes(POSTSCRIPT)
     mesh = trimesh.creation.box()
-    mesh.visual = trimesh.visual.TextureVisuals(
-        uv=mesh.vertices[:, :2], image=Image.open(tmp_path / "a.eps")
-    )
-    with pytest.warns(UserWarning, match="the format EPS is not read"):
-        assert surface_colours(mesh) is None or not has_colours(mesh)
+    with Image.open(tmp_path / "a.eps") as picture:
+        mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], image=picture)
+        with pytest.warns(UserWarning, match="the format EPS is not read"):
+            assert surface_colours(mesh) is None or not has_colours(mesh)
 
 
 def test_pixels_of_all_textures_together_are_bounded(

@@ -107,10 +107,11 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
     rows = []
     for a, b in generator.normal(size=(4000, 2)):
         logit = 0.5 * (0.5 + 2.0 * a - b) - 1.0  # half as sure as the model says, and lower
-        right = bool(generator.random() < 1.0 / (1.0 + np.exp(-logit)))
-        rows.append({"features": {"a": a, "b": b}, "right": right})
+        share = 1.0 / (1.0 + np.exp(-1.5 * (1.0 - 0.5)))  # of two scores, a point apart
+        first = bool(generator.random() < share / (1.0 + np.exp(-logit)))
+        rows.append({"features": {"a": a, "b": b}, "scores": [3.0, 2.0], "first": first})
     fitted = calibrate.fit_level(rows, np.ones(len(rows)), constants)
-    assert fitted["weights"]["a"] == pytest.approx(1.0, abs=0.1)
-    assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.05)
-    assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.1)
+    assert fitted["weights"]["a"] == pytest.approx(1.0, abs=0.15)
+    assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.08)
+    assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.15)
     assert (fitted["slope"], fitted["resolution"]) == (1.5, 0.5)

@@ -47,9 +47,10 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
         >>> file = Path(tempfile.mkdtemp(), "cameras.txt")
         >>> _ = file.write_text("1 SIMPLE_RADIAL 640 480 500 320 240 -0.1")
         >>> camera = load_camera(f"{file}:1")
-        >>> camera.matrix.tolist(), camera.distortion, camera.size
-        ([[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]], (-0.1, 0.0, 0.0, 0.0), (480,
-        640))
+        >>> camera.matrix.tolist()
+        [[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]
+        >>> camera.distortion, camera.size
+        ((-0.1, 0.0, 0.0, 0.0), (480, 640))
     """
     return Calibrations().load(path)
 
