@@ -29,6 +29,7 @@ from ..mesh.step import step_file
 # Commands that are not run here, and the reason
 SKIPPED = {
     r"git |(\S*/)?pip |apt-get |python datasets/download|python -m zipfile|python scripts/benchmark/meshes": "download",  # noqa: E501
+    r"(\S*/)?curvireg inspect": "a minute",  # tests/inspection runs it
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser_use.py opens it
     r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",  # noqa: E501
     r"python (scripts/results_table|docs/command_reference)": "writes into the project",
