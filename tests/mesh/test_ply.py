@@ -1,6 +1,5 @@
 """PLY files as scanners write them."""
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from PIL import Image
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
 from curvireg_torch.mesh import has_colours, surface_colours
+from tests._support.doubling import check_linear
 
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 POINTS = [(0, 0, 0), (4, 0, 0), (4, 2, 0), (0, 2, 0)]
@@ -183,12 +183,9 @@ HOSTILE = {
 
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_time_grows_with_the_size(tmp_path: Path, load: Load, kind: str) -> None:
-    def seconds(n: int) -> float:
-        (tmp_path / "a.ply").write_text(HOSTILE[kind](n))
-        start = time.process_time()
-        load(tmp_path / "a.ply")
-        return time.process_time() - start
+    def written(n: int) -> Path:
+        path = tmp_path / "a.ply"
+        path.write_text(HOSTILE[kind](n))
+        return path
 
-    seconds(100)
-    small = min(seconds(5_000) for _ in range(2))
-    assert seconds(20_000) < max(9.0 * small, 0.3)
+    check_linear(load, written, 5_000)

@@ -1,7 +1,6 @@
 """STL files as people have them."""
 
 import struct
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import trimesh
 
 import curvireg_torch as cr
 from curvireg_torch.errors import MeshError
+from tests._support.doubling import check_linear
 
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
 BOX = trimesh.creation.box((3.0, 2.0, 1.0))
@@ -144,13 +144,11 @@ HOSTILE = {
 
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_time_grows_with_the_size(tmp_path: Path, kind: str) -> None:
-    def seconds(n: int) -> float:
-        (tmp_path / "a.stl").write_text(HOSTILE[kind](n))
-        start = time.process_time()
-        with pytest.raises(MeshError):
-            cr.load_mesh(tmp_path / "a.stl")
-        return time.process_time() - start
+    def written(n: int) -> Path:
+        path = tmp_path / "a.stl"
+        path.write_text(HOSTILE[kind](n))
+        return path
 
-    seconds(100)
-    small = min(seconds(5_000) for _ in range(2))
-    assert seconds(20_000) < max(9.0 * small, 0.3)
+    with pytest.raises(MeshError):
+        cr.load_mesh(written(100))
+    check_linear(cr.load_mesh, written, 5_000)
