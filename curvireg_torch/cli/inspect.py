@@ -61,12 +61,9 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from ..inspection import inspect
-    from ..inspection.facts import mesh_facts
     from ..inspection.page import report_lines, report_page
     from ..jobs.lists import find_photographs
     from ..jobs.outputs import output_folder
-    from ..matching import cached_bank
-    from ..registration import Registrar
 
     backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
     options = register_options(arguments)
@@ -82,28 +79,21 @@ def run_inspect(arguments: argparse.Namespace) -> int:
             bar.total = total
             bar.update(done - bar.n)
 
-        registrar = None
-        if not mesh_facts(mesh).is_hopeless:
-            bank = cached_bank(
-                mesh,
-                pipeline=pipeline,
-                renderer=options.renderer,
-                device=options.device,
-                progress=report_progress,
-            )
-            registrar = Registrar(bank, mesh_is="exact", renderer=options.renderer)
         report = inspect(
-            mesh if registrar is None else registrar,
+            mesh,
             n=arguments.n,
             seed=arguments.seed,
             with_camera=arguments.with_camera,
+            pipeline=pipeline,
+            renderer=options.renderer,
+            device=options.device,
             backgrounds=backgrounds,
             progress=report_progress,
         )
         bar.close()
         content = json.dumps(report.to_dict(), indent=2) + "\n"
         write_file(arguments.out / "inspect.json", content.encode())
-        page = report_page(report, registrar, title=arguments.mesh.name)
+        page = report_page(report, report.registrar, title=arguments.mesh.name)
         write_file(arguments.out / "inspect.html", page.encode(errors="backslashreplace"))
     print(
         "\n".join(

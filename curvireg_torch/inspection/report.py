@@ -40,6 +40,8 @@ class Inspection:
             asked for.
         seed: of the photographs.
         with_camera: whether the camera was known.
+        registrar: of the mesh, which draws the pictures of the report; None for a mesh without
+            hope.
     """
 
     facts: MeshFacts
@@ -47,6 +49,7 @@ class Inspection:
     trial: Trial | None
     seed: int
     with_camera: bool
+    registrar: Registrar | None = None
 
     @property
     def alike(self) -> tuple[LookAlike, ...]:
@@ -122,6 +125,8 @@ def inspect(
     with_camera: bool = True,
     compare: bool = True,
     pipeline: Pipeline | None = None,
+    renderer: str = "auto",
+    device: torch.device | str = "cpu",
     backgrounds: Sequence[Any] = (),
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Inspection:
@@ -135,6 +140,7 @@ def inspect(
         compare: also register a quarter of the photographs under other conditions.
         pipeline: settings; ``Pipeline().with_pose_prior("upright")`` for objects that stand as in
             their file.
+        renderer, device: of the views, see :class:`Registrar`.
         backgrounds: (3, H, W) pictures or paths, instead of generated ones.
         progress: called with ("bank" or "photographs", done, total); to cancel, it may raise.
 
@@ -157,14 +163,20 @@ def inspect(
         return Inspection(facts, (), None, seed, with_camera)
     with one_torch_thread():
         if registrar is None:
-            bank = cached_bank(clean, pipeline=pipeline, progress=progress or False)
-            registrar = Registrar(bank, mesh_is="exact")
+            bank = cached_bank(
+                clean,
+                pipeline=pipeline,
+                renderer=renderer,
+                device=device,
+                progress=progress or False,
+            )
+            registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
         upright = registrar.pipeline.views.pose == "upright"
         symmetries = None if has_colours(clean) else registrar.symmetries_of(exact=True)
         elevations = UPRIGHT if upright else (-90.0, 90.0)
         pairs = look_alikes(registrar.bank, registrar.describer, symmetries, elevations=elevations)
         if n == 0:
-            return Inspection(facts, pairs, None, seed, with_camera)
+            return Inspection(facts, pairs, None, seed, with_camera, registrar)
         pictures = [_background(picture) for picture in backgrounds]
         photographs = generate_photographs(
             clean, n, seed=seed, upright=upright, backgrounds=pictures
@@ -173,7 +185,7 @@ def inspect(
         trial = run_trial(
             registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report
         )
-    return Inspection(facts, pairs, trial, seed, with_camera)
+    return Inspection(facts, pairs, trial, seed, with_camera, registrar)
 
 
 def _background(picture: Any) -> Tensor:
