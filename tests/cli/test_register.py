@@ -266,7 +266,7 @@ def test_starts_of_other_tools_have_their_convention_and_unit(
 
 
 def test_a_command_with_another_unit_renders_no_views_again(
-    folder, tmp_path, register_one, document, monkeypatch
+    tmp_path, register_one, document, monkeypatch
 ):
     monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
     views = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
