@@ -1,6 +1,7 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -87,12 +88,13 @@ def test_points_of_the_true_view_are_repeated_most(root):
 
 
 def test_tables_rank_by_the_terms_of_the_paper_alone():
-    for pipeline, whitening in zip(
-        measure.variants("upright").values(), ("paper", "none"), strict=True
-    ):
+    variants = measure.variants("upright")
+    assert tuple(variants) == tables.VARIANTS == tuple(tables.NAMES)
+    for pipeline, whitening in zip(variants.values(), ("paper", "paper", "none"), strict=True):
         assert [term.name for term in pipeline.terms] == ["hog", "repeatability"]
         assert pipeline.terms[0].whitening == whitening
         assert (pipeline.box_jitter, pipeline.search, pipeline.contours) == (0.0, True, False)
+    assert variants["printed"].with_term("hog", whitening="none") == variants["corrected"]
     assert measure.variants("any")["literal"] == PRESETS["paper"]
     assert measure.variants("any")["corrected"].views == ViewPolicy("any")
 
@@ -163,6 +165,58 @@ def test_printed_numbers_are_the_means_of_the_papers_rows():
     assert printed.IP["MFC"] == pytest.approx(0.46)
     assert printed.WEB_IP["PCI"] == pytest.approx(0.449)
     assert printed.HAUSDORFF["FUZZY"] == pytest.approx(98.5)
+    assert printed.WEB_HAUSDORFF["MFC"] == pytest.approx(23.8)
+
+
+def numbers_printed_in(text, label):
+    """The rows of numbers of the table with a label in the paper's source."""
+    end = text.index(f"\\label{{{label}}}")
+    start = text.rindex("\\begin{table}", 0, end)
+    rows = []
+    for line in text[start:end].splitlines():
+        cells = re.sub(r"\\cellcolor\{[^}]*\}|[{}\s$]|\^o|\\\\|\\hline", "", line).split("&")[1:]
+        row = [float(cell) for cell in cells if re.fullmatch(r"[\d.]+", cell)]
+        rows += [row] if len(row) > 6 else []
+    return rows
+
+
+ERRORS = [[float(x.rstrip("°cm")) for x in row] for row in printed.POSE_ERRORS.values()]
+
+
+@pytest.mark.parametrize(
+    ("label", "found"),
+    [
+        ("DTLSampleIP", printed._rows(printed._WEB_IP, 1)),
+        ("IPPASCAL3D", printed._rows(printed._IP, 1)),
+        ("DTLSampleHD", printed._rows(printed._WEB_HAUSDORFF, 1)),
+        ("HDPASCAL3D", printed._rows(printed._HAUSDORFF, 1)),
+        ("HDPASCAL3D2", printed._rows(printed._PRECISION, 1)),
+        ("AErrorAngles", ERRORS),
+    ],
+)
+def test_printed_numbers_are_those_of_the_paper(label, found):
+    source = Path(__file__).parents[3] / "shared" / "paper"
+    files = list(source.glob("*.tex"))
+    if not files:
+        pytest.skip("needs the paper's source in ../shared/paper")
+    text = files[0].read_text(encoding="utf-8")
+    assert numbers_printed_in(text, label) == found
+
+
+def test_classes_stand_beside_the_papers():
+    pairs = {pair: {"top": [10.0 if pair == "CS/MFC" else 90.0]} for pair in tables.PAIRS}
+    known = dict.fromkeys(tables.VARIANTS, pairs)
+    record = {"cad": "a", "category": "boat", **known}
+    (table,) = [
+        each
+        for each in tables.precision_tables(tables.Records([record], "one"))
+        if each.name == "precision_classes"
+    ]
+    rows = {row[0]: row for row in table.rows}
+    assert table.columns[:3] == ["class", "N", "CS/MFC"]
+    assert rows["boat"][1:4] == ["1", "1.00 / 1.00 / 1.00 / 0.78", "0.00 / 0.00 / 0.00 / 0.71"]
+    assert rows["sofa"][1:3] == ["0", "- / - / - / 0.85"]
+    assert "literal / corrected, S_hog as printed / corrected / the paper" in table.definition
 
 
 def run(monkeypatch, *words):
