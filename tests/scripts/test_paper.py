@@ -14,6 +14,8 @@ import pytest
 import torch
 
 from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import (
     camera_matrix,
     projected_boxes,
@@ -273,3 +275,49 @@ def test_the_staircase_shows_what_is_known():
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
     assert "| 13. contour fit of five hypotheses: the default | - |" in text
+
+
+def climb(monkeypatch, out, *words):
+    monkeypatch.setattr(sys, "argv", ["staircase.py", *map(str, words), "--out", str(out)])
+    return staircase.main()
+
+
+@pytest.mark.slow
+def test_steps_have_the_results_of_an_evaluation(pascal, tmp_path, monkeypatch, capsys):
+    steps = [0, 8]
+    words = [f"mini={pascal.root}", "--quiet", "--steps", *steps]
+    assert climb(monkeypatch, tmp_path / "stairs", *words) == 0
+    benchmark = staircase.benchmark_of(pascal.root, 1)
+    pipelines = list(staircase.pipelines("upright"))
+    assert "mini: 2 objects left out" in capsys.readouterr().err
+    rows = staircase.read(tmp_path / "stairs")
+    assert [row["step"] for row in rows] == ["0", "8"]
+    for k, row in zip(steps, rows, strict=True):
+        found = evaluate(benchmark, tmp_path / str(k), pipeline=pipelines[k][1], progress=False)
+        assert float(row["median"]) == pytest.approx(found["med_err_deg"], abs=1e-4)
+        assert float(row["right"]) == pytest.approx(found["acc_pi_6"])
+        assert int(row["n"]) == found["n"]
+
+
+def test_the_staircase_goes_on_where_it_was(pascal, tmp_path, monkeypatch):
+    words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
+    assert climb(monkeypatch, tmp_path, *words, "--partial") == 0
+    assert staircase.read(tmp_path) == []
+    assert climb(monkeypatch, tmp_path, *words) == 0
+    (row,) = staircase.read(tmp_path)
+    monkeypatch.setattr(staircase, "measure", Mock(side_effect=AssertionError("measured again")))
+    assert climb(monkeypatch, tmp_path, *words) == 0
+    assert staircase.read(tmp_path) == [row]
+    with pytest.raises(AssertionError, match="measured again"):
+        climb(monkeypatch, tmp_path, *words[:-1], "1")
+    assert climb(monkeypatch, tmp_path, "nothing") == 2
+
+
+def test_objects_without_a_pose_count_as_wrong(pascal, monkeypatch):
+    benchmark = staircase.benchmark_of(pascal.root, 1)
+    (chosen,) = staircase.chosen_objects(benchmark, 1)
+    climber = staircase.Climber(benchmark, chosen)
+    monkeypatch.setattr(
+        staircase, "register_observation", Mock(side_effect=InvalidInputError("no"))
+    )
+    assert climber.errors(PRESETS["paper"]) == [180.0]
