@@ -1,5 +1,6 @@
 """Pairs of views that the shape of a mesh does not tell apart."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,9 @@ from torch import Tensor
 
 from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
 from ..geometry.conversions import rotation_from_axis_angle
+from ..geometry.viewpoint import up_rotation
 from ..matching import ViewBank, ViewDescriber
+from ..mesh import mesh_up
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
 RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
@@ -69,6 +72,7 @@ def look_alikes(
     symmetries: Tensor | None,
     *,
     elevations: tuple[float, float] = (-90, 90),
+    report_progress: Callable[[int, int], object] | None = None,
 ) -> tuple[LookAlike, ...]:
     """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the
     sphere.
@@ -81,10 +85,12 @@ def look_alikes(
         bank: views of the mesh, among which candidates are looked for.
         describer: of the mesh, with the descriptor of fitted poses.
         symmetries: (S, 4, 4) rotations that do not count; None for none.
-        elevations: degrees between which the mesh is looked at.
+        elevations: degrees between which the mesh is looked at, with its own up axis.
+        report_progress: called with directions done and in all.
     """
     directions = uniform_views(LOOKED_AT).rotations.double()
-    elevation = viewpoint_from_rotation(directions)[1]
+    up = up_rotation(mesh_up(bank.mesh)).double()
+    elevation = viewpoint_from_rotation(directions @ up.mT)[1]
     directions = directions[(elevation >= elevations[0]) & (elevation <= elevations[1])]
     distance = bank.distances.median().double().cpu()
     descriptors = _described(describer, directions, distance)
@@ -100,6 +106,8 @@ def look_alikes(
     similarity = (F.normalize(matched, dim=1) @ coarse.T).cpu()
     pairs = []
     for row, direction in enumerate(directions):
+        if report_progress is not None:
+            report_progress(row, len(directions))
         angle = _angle(views, direction, group)
         scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + STEPS[0], -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
@@ -114,6 +122,8 @@ def look_alikes(
                 direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]
             )
         )
+    if report_progress is not None:
+        report_progress(len(directions), len(directions))
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
 
 

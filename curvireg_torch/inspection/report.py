@@ -1,6 +1,6 @@
 """``curvireg inspect``: one report of a mesh, before anyone takes a photograph."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,11 +19,11 @@ from ..utils.checks import check_integer
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, look_alikes
-from .trial import SIZE, Trial, generate_photographs, run_trial
+from .photographs import SIZE, UPRIGHT, PhotographGenerator
+from .trial import Report, Trial, report_nothing, run_trial
 
 ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.01)  # Borders of the ranges of the report, degrees
 PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, 1e4)
-UPRIGHT = (-10.0, 60.0)  # Elevations of an upright object, degrees
 MIN_RIGHT = 0.5  # Expected share of right answers below which a warning says so
 MANY_ALIKE = 0.1  # Share of directions with a look-alike from which a warning says so
 
@@ -128,7 +128,8 @@ def inspect(
     renderer: str = "auto",
     device: torch.device | str = "cpu",
     backgrounds: Sequence[Any] = (),
-    progress: Callable[[str, int, int], object] | None = None,
+    clutter: bool = False,
+    progress: Report | None = None,
 ) -> Inspection:
     """Examine a mesh, look for views that are alike, and register generated photographs of it.
 
@@ -142,7 +143,9 @@ def inspect(
             their file.
         renderer, device: of the views, see :class:`Registrar`.
         backgrounds: (3, H, W) pictures or paths, instead of generated ones.
-        progress: called with ("bank" or "photographs", done, total); to cancel, it may raise.
+        clutter: other objects stand around the object, and at times in front of it.
+        progress: called with the stage ("mesh", "bank", "look-alikes" or "photographs"), done and
+            total, perhaps in another thread; to cancel, it may raise.
 
     Returns:
         the report; ``to_dict()`` is the content of ``inspect.json``.
@@ -156,9 +159,12 @@ def inspect(
         (True, 3)
     """
     check_integer(n, "n", least=0)
+    report = progress or report_nothing
     registrar = mesh if isinstance(mesh, Registrar) else None
+    report("mesh", 0, 1)
     clean: trimesh.Trimesh = as_mesh(mesh) if registrar is None else registrar.bank.mesh
     facts = mesh_facts(clean)
+    report("mesh", 1, 1)
     if facts.is_hopeless:
         return Inspection(facts, (), None, seed, with_camera)
     with one_torch_thread():
@@ -168,22 +174,29 @@ def inspect(
                 pipeline=pipeline,
                 renderer=renderer,
                 device=device,
-                progress=progress or False,
+                progress=report,
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
         upright = registrar.pipeline.views.pose == "upright"
         symmetries = None if has_colours(clean) else registrar.symmetries_of(exact=True)
-        elevations = UPRIGHT if upright else (-90.0, 90.0)
-        pairs = look_alikes(registrar.bank, registrar.describer, symmetries, elevations=elevations)
+        pairs = look_alikes(
+            registrar.bank,
+            registrar.describer,
+            symmetries,
+            elevations=UPRIGHT if upright else (-90.0, 90.0),
+            report_progress=partial(report, "look-alikes"),
+        )
         if n == 0:
             return Inspection(facts, pairs, None, seed, with_camera, registrar)
         pictures = [_background(picture) for picture in backgrounds]
-        photographs = generate_photographs(
-            clean, n, seed=seed, upright=upright, backgrounds=pictures
-        )
-        report = None if progress is None else partial(progress, "photographs")
+        generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
         trial = run_trial(
-            registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report
+            registrar,
+            generate,
+            n,
+            with_camera=with_camera,
+            compare=compare,
+            report=report,
         )
     return Inspection(facts, pairs, trial, seed, with_camera, registrar)
 

@@ -1,36 +1,51 @@
 """From the letter of the paper to the default pipeline, one change at a time.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
-    [--limit N] [--page PAGE]
+    [--limit N] [--jobs N] [--page PAGE]
 
 Each set is NAME=ROOT: ROOT is a PASCAL3D+ release if it has a folder ``CAD``, else a BOP set. Steps
-are cumulative, each is evaluated as ``curvireg evaluate`` does, and a second call does only what is
-missing: DIR/NAME/STEP holds the results, DIR/staircase.csv one row for each set and step that is
-done. --page writes the table into a page of the documentation, between its markers.
+are cumulative, each has the results of ``curvireg evaluate``, and a second call does only what is
+missing: DIR/NAME holds one file for each mesh, DIR/staircase.csv one row for each set and step. All
+steps of a mesh are measured together, so that it is opened once. --page writes the table into a
+page of the documentation, between its markers.
 """
 
 import argparse
 import csv
 import json
+import statistics
 import sys
+import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-import torch
-
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation.benchmark import true_rotations
+from curvireg_torch.jobs.entry import Observation, observe
+from curvireg_torch.jobs.photograph import register_observation
+from curvireg_torch.jobs.runner import results_digest
+from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
+from curvireg_torch.registration import Registrar
+from curvireg_torch.registration.result import line_document
 from curvireg_torch.terms import Appearance, BoxShape
-from curvireg_torch.utils.files import write_csv
+from curvireg_torch.utils.files import file_digest, text_digest, write_csv
+from curvireg_torch.utils.threads import map_on_threads
 from scripts._shared import commit, table_lines, update_page
-from scripts.paper.measures import Estimate, bootstrap
+from scripts.paper.measures import bootstrap
+from scripts.paper.parts import Part, complete
+from scripts.paper.parts import read as read_part
 
 RIGHT_DEG = 30.0
 COLUMNS = ("set", "step", "change", "n", "right", "low", "high", "median", "commit")
@@ -80,7 +95,7 @@ def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
         yield step.name, pipeline
 
 
-def benchmark_of(root: Path, pixel_origin: int) -> Pascal3DBenchmark | BOPBenchmark:
+def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
     if (root / "CAD").is_dir():
         return Pascal3DBenchmark(
@@ -89,38 +104,132 @@ def benchmark_of(root: Path, pixel_origin: int) -> Pascal3DBenchmark | BOPBenchm
     return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
 
 
-def measure(benchmark: Pascal3DBenchmark | BOPBenchmark, folder: Path) -> tuple[Estimate, float]:
-    """Share of the objects within 30 degrees with its interval by CAD, and the median error, of
-    stored results."""
-    with (folder / "results.jsonl").open(encoding="utf-8") as file:
-        known = {row["key"]: row for row in map(json.loads, file)}
-    found = [i for i, entry in enumerate(benchmark.entries) if entry.key in known]
-    samples = [benchmark.samples[i] for i in found]
-    rows = [known[benchmark.entries[i].key] for i in found]
-    errors = next(iter(benchmark.errors(samples, rows).values()))
-    cads = [str(sample[benchmark.mesh]) for sample in samples]
-    right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
-    return right, float(errors.nan_to_num(torch.inf).quantile(0.5))
+def chosen_objects(benchmark: Benchmark, limit: int | None) -> list[list[int]]:
+    """Indices of ``limit`` objects of known pose, spread evenly, those of one mesh together."""
+    known = true_rotations(benchmark.samples).isfinite().flatten(1).all(dim=1)
+    groups = defaultdict[Any, list[int]](list)
+    for i in benchmark.selection(limit):
+        if known[i] and not benchmark.entries[i].error:
+            groups[benchmark.entries[i].meshes].append(i)
+    return list(groups.values())
+
+
+class Climber:
+    """One mesh on the staircase, with those of its photographs that can be read.
+
+    What steps have in common is computed once: mesh, contours, and the views, which :data:`STEPS`
+    change five times only.
+    """
+
+    def __init__(self, benchmark: Benchmark, chosen: list[int]) -> None:
+        self.benchmark = benchmark
+        self.mesh = load_mesh(benchmark.entries[chosen[0]].meshes[0], unit=benchmark.unit)
+        self.samples = []
+        self.photographs = []
+        for i in chosen:
+            entry = benchmark.entries[i]
+            with suppress(CurviregError, OSError):  # a photograph that cannot be read
+                self.photographs.append(observe(entry, entry.read()))
+                self.samples.append(benchmark.samples[i])
+        self.bank: ViewBank | None = None
+        self.describer: ViewDescriber | None = None
+
+    def errors(self, pipeline: Pipeline) -> list[float]:
+        """Rotation errors of a pipeline in degrees; 180 where it finds no pose."""
+        registrar = self._registrar(pipeline)
+
+        def row(observation: Observation) -> dict[str, Any]:
+            try:
+                return line_document(register_observation(observation, registrar).document)
+            except CurviregError:
+                return {}
+
+        rows = map_on_threads(row, self.photographs)
+        errors = next(iter(self.benchmark.errors(self.samples, rows).values()))
+        return errors.clamp(max=180.0).tolist()
+
+    def _registrar(self, pipeline: Pipeline) -> Registrar:
+        bank = self._bank(pipeline)
+        matcher = map_on_threads(lambda bank: ViewMatcher(bank, pipeline=pipeline), [bank])[0]
+        if self.describer is None:
+            self.describer = matcher.describer
+            _ = self.describer.contours
+        matcher.describer = self.describer.with_settings(bank.settings)
+        # as in :func:`curvireg_torch.evaluation.evaluate`
+        mesh_is = "exact" if self.benchmark.gives_camera else "similar"
+        return Registrar(matcher, mesh_is=mesh_is)
+
+    def _bank(self, pipeline: Pipeline) -> ViewBank:
+        """The views of the step before, if a pipeline has the same."""
+        views = pipeline.views, pipeline.bank
+        if self.bank is None or (self.bank.pipeline.views, self.bank.pipeline.bank) != views:
+            # with what the last step that shares the views needs
+            steps = [step for _, step in pipelines(self.benchmark.protocol.pose)]
+            last = [step for step in steps if (step.views, step.bank) == views][-1]
+            self.bank = ViewBank.build(self.mesh, pipeline=last, progress=False)
+            # as files of the cache have them
+            self.bank.descriptors = self.bank.descriptors.half().float()
+        return self.bank
+
+
+def measure(root: Path, pixel_origin: int, chosen: list[int], steps: list[int]) -> dict[str, Any]:
+    """Errors of some objects of one mesh after each of some steps."""
+    benchmark = benchmark_of(root, pixel_origin)
+    start = time.process_time()
+    errors: dict[str, list[float]] = {str(k): [] for k in steps}
+    seconds: dict[str, float] = {}
+    result = {"errors": errors, "seconds": seconds, "commit": commit()}
+    try:
+        climber = Climber(benchmark, chosen)
+    except (CurviregError, OSError):
+        return {**result, "cads": [], "unreadable": len(chosen)}
+    for k, (_, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
+        if k in steps:
+            errors[str(k)] = climber.errors(pipeline)
+            seconds[str(k)] = time.process_time() - start
+            start = time.process_time()
+    cads = [str(sample[benchmark.mesh]) for sample in climber.samples]
+    return {**result, "cads": cads, "unreadable": len(chosen) - len(cads)}
 
 
 def climb(name: str, root: Path, options: argparse.Namespace) -> None:
-    """Evaluate the steps of one set, and record each when it is known."""
-    out = options.out
+    """Measure the steps of one set, and record them when all of its meshes are done."""
     benchmark = benchmark_of(root, options.pixel_origin)
-    for k, (change, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
-        if k not in options.steps:
-            continue
-        folder = out / name / f"{k:02d}"
-        evaluate(
-            benchmark, folder, pipeline=pipeline, limit=options.limit, progress=not options.quiet
-        )
-        right, median = measure(benchmark, folder)
-        row = [name, k, change, right.n, right.mean, right.low, right.high, median, commit()]
-        kept = [old for old in read(out) if (old["set"], old["step"]) != (name, str(k))]
-        ordered = sorted(
-            [*(list(old.values()) for old in kept), row], key=lambda r: (str(r[0]), int(r[1]))
-        )
-        write_csv(out / "staircase.csv", [COLUMNS, *ordered])
+    groups = chosen_objects(benchmark, options.limit)
+    settings = [pipeline.describe() for _, pipeline in pipelines(benchmark.protocol.pose)]
+    code = [results_digest(), file_digest(Path(__file__))]
+    parts = []
+    for group in groups:
+        entries = [benchmark.entries[i] for i in group]
+        files = [entries[0].meshes[0], *(entry.photo for entry in entries)]
+        requests = [repr(entry.request()) for entry in entries]
+        digests = [file_digest(path) for path in files]
+        request = json.dumps([code, settings, requests, digests, options.steps])
+        path = options.out / name / f"{text_digest(request)}.json"
+        parts.append(Part(path, (root, options.pixel_origin, group, options.steps), len(group)))
+    if options.partial:
+        parts = [part for part in parts if part.path.exists()]
+    complete(parts, measure, label=name, jobs=options.jobs, quiet=options.quiet)
+    record(name, [read_part(part) for part in parts], options)
+
+
+def record(name: str, records: list[dict[str, Any]], options: argparse.Namespace) -> None:
+    """Write the rows of a set from the records of its meshes."""
+    cads = [cad for one in records for cad in one["cads"]]
+    commits = " ".join(sorted({one["commit"] for one in records}))
+    if unreadable := sum(one["unreadable"] for one in records):
+        message = "objects left out, whose photograph or mesh cannot be read"
+        print(f"staircase: {name}: {unreadable} {message}", file=sys.stderr)
+    rows = []
+    for k in options.steps if cads else ():
+        errors = [error for one in records for error in one["errors"][str(k)]]
+        right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
+        numbers = [right.n, right.mean, right.low, right.high, statistics.median(errors)]
+        rows.append([name, k, STEPS[k].name, *numbers, commits])
+    measured = {(name, str(row[1])) for row in rows}
+    kept = [row for row in read(options.out) if (row["set"], row["step"]) not in measured]
+    every = sorted([*(list(row.values()) for row in kept), *rows], key=lambda r: (r[0], int(r[1])))
+    write_csv(options.out / "staircase.csv", [COLUMNS, *every])
 
 
 def read(out: Path) -> list[dict[str, str]]:
@@ -166,6 +275,10 @@ def main() -> int:
     )
     parser.add_argument(
         "--steps", type=int, nargs="+", default=list(range(len(STEPS))), help="default: all"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    parser.add_argument(
+        "--partial", action="store_true", help="rows of what is measured so far; measures nothing"
     )
     parser.add_argument(
         "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
