@@ -158,7 +158,7 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
     colour = by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
     if colour is not None:
         arrays[key + "colour"] = colour.reshape(-1, 3)
-    materials = []
+    materials: list[dict[str, Any]] = []
     of_face = np.zeros(len(counts), np.int64)
     prim = mesh.GetPrim()
     bound = [(prim, None), *((g.GetPrim(), g) for g in UsdGeom.Subset.GetAllGeomSubsets(mesh))]
