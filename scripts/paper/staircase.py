@@ -48,7 +48,8 @@ from scripts.paper.parts import Part, complete
 from scripts.paper.parts import read as read_part
 
 RIGHT_DEG = 30.0
-COLUMNS = ("set", "step", "change", "n", "right", "low", "high", "median", "commit")
+FEWEST_CADS = 3  # for an interval
+COLUMNS = ("set", "step", "change", "n", "cads", "right", "low", "high", "median", "commit")
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,8 @@ class Climber:
         self.describer: ViewDescriber | None = None
 
     def errors(self, pipeline: Pipeline) -> list[float]:
-        """Rotation errors of a pipeline in degrees; 180 where it finds no pose."""
+        """Rotation errors of a pipeline in degrees, up to symmetries where they are known; 180
+        where it finds no pose."""
         registrar = self._registrar(pipeline)
 
         def row(observation: Observation) -> dict[str, Any]:
@@ -145,7 +147,7 @@ class Climber:
                 return {}
 
         rows = map_on_threads(row, self.photographs)
-        errors = next(iter(self.benchmark.errors(self.samples, rows).values()))
+        errors = self.benchmark.errors(self.samples, rows)[self.benchmark.page_error]
         return errors.clamp(max=180.0).tolist()
 
     def _registrar(self, pipeline: Pipeline) -> Registrar:
@@ -224,7 +226,14 @@ def record(name: str, records: list[dict[str, Any]], options: argparse.Namespace
     for k in options.steps if cads else ():
         errors = [error for one in records for error in one["errors"][str(k)]]
         right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
-        numbers = [right.n, right.mean, right.low, right.high, statistics.median(errors)]
+        numbers = [
+            right.n,
+            len(set(cads)),
+            right.mean,
+            right.low,
+            right.high,
+            statistics.median(errors),
+        ]
         rows.append([name, k, STEPS[k].name, *numbers, commits])
     measured = {(name, str(row[1])) for row in rows}
     kept = [row for row in read(options.out) if (row["set"], row["step"]) not in measured]
@@ -252,16 +261,22 @@ def table(rows: list[dict[str, str]]) -> str:
         line = [f"{k}. {step.name}"]
         for name in names:
             row = known.get((name, k))
-            line.append(
-                "-" if row is None else f"{float(row['right']):.2f}, {float(row['median']):.0f}°"
-            )
+            line.append("-" if row is None else cell_of(row))
         cells.append(line)
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     text = (
-        "Share of the rotations within 30° and median error; each line adds one change to the "
-        "line above."
+        "Share of the rotations within 30° with its 95 % interval by bootstrap of the CADs, and "
+        "median error, up to symmetries where they are known; each line adds one change to the "
+        "line above. A set with one or two meshes has no interval."
     )
     return "\n".join([f"{text} Commit {commits}.", "", *table_lines(cells), ""])
+
+
+def cell_of(row: dict[str, str]) -> str:
+    """Share, interval and median; intervals of fewer than ``FEWEST_CADS`` mean nothing."""
+    right, low, high = (float(row[name]) for name in ("right", "low", "high"))
+    interval = f" ({low:.2f} to {high:.2f})" if int(row["cads"]) >= FEWEST_CADS else ""
+    return f"{right:.2f}{interval}, {float(row['median']):.0f}°"
 
 
 def main() -> int:

@@ -324,10 +324,12 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
 
 
 def test_the_staircase_shows_what_is_known():
-    row = {"set": "lm", "step": "2", "n": "8", "right": "0.625", "median": "12.3", "commit": "abc"}
-    text = staircase.table([row, {**row, "step": "0", "right": "0"}])
+    row = {"set": "lm", "step": "2", "n": "8", "cads": "2", "right": "0.625", "low": "0.5"}
+    row |= {"high": "0.75", "median": "12.3", "commit": "abc"}
+    text = staircase.table([row, {**row, "step": "0", "right": "0", "cads": "3"}])
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
+    assert "| 0. the paper to the letter | 0.00 (0.50 to 0.75), 12° |" in text
     assert "| 13. contour fit of five hypotheses: the default | - |" in text
 
 
@@ -375,3 +377,6 @@ def test_objects_without_a_pose_count_as_wrong(pascal, monkeypatch):
         staircase, "register_observation", Mock(side_effect=InvalidInputError("no"))
     )
     assert climber.errors(PRESETS["paper"]) == [180.0]
+    errors = {"error_deg": torch.tensor([90.0]), "symmetric_error_deg": torch.tensor([5.0])}
+    monkeypatch.setattr(benchmark, "errors", lambda *_: errors)
+    assert climber.errors(PRESETS["paper"]) == [5.0], "up to symmetries"
