@@ -260,7 +260,7 @@ class _File:
         plain = SurfaceColours.plain(len(faces))
         material = self._tree["materials"][_natural(part["material"])] if "material" in part else {}
         factor, info = _base_colour(material)
-        tint = np.broadcast_to(_srgb(factor), (len(faces), 3, 3))
+        tint = np.broadcast_to(srgb(factor), (len(faces), 3, 3))
         if "COLOR_0" in attributes:
             colours = self._accessor(attributes["COLOR_0"], normalized=True)[:, :3]
             if colours.shape != (count, 3):
@@ -441,7 +441,8 @@ def _base_colour(material: dict[str, Any]) -> tuple[NDArray[np.float64], dict[st
     return as_plain_numbers(factor, 4, (1.0,) * 4)[:3], info
 
 
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear colours as the values in [0, 1] that pictures store."""
     x = np.clip(np.nan_to_num(linear), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 

@@ -44,6 +44,10 @@ MESHES = (
     ".igs",
     ".dae",
     ".urdf",
+    ".usd",
+    ".usda",
+    ".usdc",
+    ".usdz",
 )
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 

@@ -11,7 +11,7 @@ TABLE is one of
 - repeatability: {CS, ASG, HFN} x {MFC, MCS, IG}
 - curve: repeatability in 40 views around the right one
 - sensitivity: intersection percentage by radius and share of points
-- precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected
+- precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected, also with S_hog as printed
 - ranks: precision at rank 1, 3, 5, 10, 20
 - angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the
   closest retrieved view
@@ -61,16 +61,9 @@ OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
     "grids": paper.grid_tables,
 }
 TABLES = (*OF_POINTS, *OF_VIEWS)
-ON_PAGE = (
-    "detectors",
-    "repeatability",
-    "curve",
-    "precision",
-    "ranks_literal",
-    "ranks_corrected",
-    "angles_literal",
-)
-ON_PAGE += ("angles_corrected", "grids", "sensitivity")
+ON_PAGE = ("detectors", "ip_classes", "hausdorff_classes", "repeatability", "curve", "precision")
+ON_PAGE += ("precision_classes", *(f"ranks_{variant}" for variant in paper.VARIANTS))
+ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "grids", "sensitivity")
 PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
 
 
