@@ -1,6 +1,7 @@
 """Pairs of views that the shape of a mesh does not tell apart."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
-from ..geometry.conversions import rotation_from_axis_angle
+from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
 from ..geometry.viewpoint import up_rotation
 from ..matching import ViewBank, ViewDescriber
 from ..mesh import mesh_up
@@ -25,6 +26,11 @@ RESOLUTION = 3.0
 HALF_TURNS = torch.stack(
     [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
 )
+# Degrees from which a rotation between two views is half a turn, and cosines of the angle between
+# its axis and the upward one that make it one about that axis, or about a level one
+HALF_TURN = 150.0
+ALONG = 0.9
+ACROSS = 0.4
 STEPS = (6.0, 2.0)  # Degrees by which a candidate is turned to come nearer
 
 
@@ -125,6 +131,21 @@ def look_alikes(
     if report_progress is not None:
         report_progress(len(directions), len(directions))
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
+
+
+def confused_sides(pairs: Sequence[LookAlike], up: str) -> str:
+    """Which sides most of the pairs confuse, in words: half a turn about the axis that points
+    ``up`` is front and back, one about a level axis is top and bottom."""
+    axis = up_rotation(up).double()[2]
+    kinds = Counter[str]()
+    for pair in pairs:
+        turn = axis_angle_from_rotation(pair.rotation.mT @ pair.rival)
+        steepness = abs(float(F.normalize(turn, dim=0) @ axis))
+        half = float(torch.rad2deg(turn.norm())) > HALF_TURN
+        upright = half and steepness > ALONG
+        level = half and steepness < ACROSS
+        kinds["front and back" if upright else "top and bottom" if level else "several sides"] += 1
+    return kinds.most_common(1)[0][0]
 
 
 def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:

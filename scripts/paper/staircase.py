@@ -1,4 +1,5 @@
-"""From the letter of the paper to the default pipeline, one change at a time.
+"""From the letter of the paper to the default pipeline, one change at a time; and what each part of
+the default is worth.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
     [--limit N] [--jobs N] [--page PAGE]
@@ -8,6 +9,9 @@ are cumulative, each has the results of ``curvireg evaluate``, and a second call
 missing: DIR/NAME holds one file for each mesh, DIR/staircase.csv one row for each set and step. All
 steps of a mesh are measured together, so that it is opened once. --page writes the table into a
 page of the documentation, between its markers.
+
+``--table parts`` measures the default without each of its parts instead, and the other presets, as
+DIR/parts.csv.
 """
 
 import argparse
@@ -17,7 +21,7 @@ import statistics
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,7 +52,8 @@ from scripts.paper.parts import Part, complete
 from scripts.paper.parts import read as read_part
 
 RIGHT_DEG = 30.0
-COLUMNS = ("set", "step", "change", "n", "right", "low", "high", "median", "commit")
+FEWEST_CADS = 3  # for an interval
+COLUMNS = ("set", "step", "change", "n", "cads", "right", "low", "high", "median", "commit")
 
 
 @dataclass(frozen=True)
@@ -90,9 +95,30 @@ STEPS = (
 def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
     """The name of each step and its pipeline, for a dataset of which ``pose`` is known."""
     pipeline = PRESETS["paper"]
-    for step in STEPS:
+    for k, step in enumerate(STEPS):
         pipeline = step.change(pipeline, pose)
-        yield step.name, pipeline
+        yield f"{k}. {step.name}", pipeline
+
+
+def parts(pose: str) -> Iterator[tuple[str, Pipeline]]:
+    """The default, the same without each of its parts, and other presets."""
+    default = Pipeline().with_pose_prior(pose)
+    classical = PRESETS["classical"].with_pose_prior(pose)
+    yield "learned: the default", default
+    yield "without the contour fit", replace(default, hypotheses=1, contours=False)
+    yield "without the appearance term", default.with_term("appearance", weight=0)
+    yield "without repeatability", default.with_term("repeatability", weight=0)
+    yield "without the box's shape", default.with_term("box", weight=0)
+    yield "without box jitter", replace(default, box_jitter=0.0)
+    yield "fast", PRESETS["fast"].with_pose_prior(pose)
+    yield "classical", classical
+    yield "gradient instead of focus curves", replace(classical, field="gradient")
+    yield "paper", PRESETS["paper"]
+
+
+LADDERS = {"staircase": pipelines, "parts": parts}
+HEADERS = {"staircase": "change", "parts": "pipeline"}
+TEXTS = {"staircase": "; each line adds one change to the line above", "parts": ""}
 
 
 def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
@@ -121,8 +147,12 @@ class Climber:
     change five times only.
     """
 
-    def __init__(self, benchmark: Benchmark, chosen: list[int]) -> None:
+    def __init__(
+        self, benchmark: Benchmark, chosen: list[int], every: Sequence[Pipeline] = ()
+    ) -> None:
+        """``every`` pipeline that is measured: views hold what any of them needs."""
         self.benchmark = benchmark
+        self.every = every
         self.mesh = load_mesh(benchmark.entries[chosen[0]].meshes[0], unit=benchmark.unit)
         self.samples = []
         self.photographs = []
@@ -135,7 +165,8 @@ class Climber:
         self.describer: ViewDescriber | None = None
 
     def errors(self, pipeline: Pipeline) -> list[float]:
-        """Rotation errors of a pipeline in degrees; 180 where it finds no pose."""
+        """Rotation errors of a pipeline in degrees, up to symmetries where they are known; 180
+        where it finds no pose."""
         registrar = self._registrar(pipeline)
 
         def row(observation: Observation) -> dict[str, Any]:
@@ -145,7 +176,7 @@ class Climber:
                 return {}
 
         rows = map_on_threads(row, self.photographs)
-        errors = next(iter(self.benchmark.errors(self.samples, rows).values()))
+        errors = self.benchmark.errors(self.samples, rows)[self.benchmark.page_error]
         return errors.clamp(max=180.0).tolist()
 
     def _registrar(self, pipeline: Pipeline) -> Registrar:
@@ -163,31 +194,33 @@ class Climber:
         """The views of the step before, if a pipeline has the same."""
         views = pipeline.views, pipeline.bank
         if self.bank is None or (self.bank.pipeline.views, self.bank.pipeline.bank) != views:
-            # with what the last step that shares the views needs
-            steps = [step for _, step in pipelines(self.benchmark.protocol.pose)]
-            last = [step for step in steps if (step.views, step.bank) == views][-1]
-            self.bank = ViewBank.build(self.mesh, pipeline=last, progress=False)
+            same = [one for one in self.every if (one.views, one.bank) == views]
+            needy = [one for one in same if one.stored_appearance(1) is not None]
+            built = next(iter(needy), pipeline)
+            self.bank = ViewBank.build(self.mesh, pipeline=built, progress=False)
             # as files of the cache have them
             self.bank.descriptors = self.bank.descriptors.half().float()
         return self.bank
 
 
-def measure(root: Path, pixel_origin: int, chosen: list[int], steps: list[int]) -> dict[str, Any]:
+def measure(
+    ladder: str, root: Path, pixel_origin: int, chosen: list[int], steps: list[int]
+) -> dict[str, Any]:
     """Errors of some objects of one mesh after each of some steps."""
     benchmark = benchmark_of(root, pixel_origin)
+    every = [pipeline for _, pipeline in LADDERS[ladder](benchmark.protocol.pose)]
     start = time.process_time()
     errors: dict[str, list[float]] = {str(k): [] for k in steps}
     seconds: dict[str, float] = {}
     result = {"errors": errors, "seconds": seconds, "commit": commit()}
     try:
-        climber = Climber(benchmark, chosen)
+        climber = Climber(benchmark, chosen, every)
     except (CurviregError, OSError):
         return {**result, "cads": [], "unreadable": len(chosen)}
-    for k, (_, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
-        if k in steps:
-            errors[str(k)] = climber.errors(pipeline)
-            seconds[str(k)] = time.process_time() - start
-            start = time.process_time()
+    for k in steps:
+        errors[str(k)] = climber.errors(every[k])
+        seconds[str(k)] = time.process_time() - start
+        start = time.process_time()
     cads = [str(sample[benchmark.mesh]) for sample in climber.samples]
     return {**result, "cads": cads, "unreadable": len(chosen) - len(cads)}
 
@@ -196,24 +229,28 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> None:
     """Measure the steps of one set, and record them when all of its meshes are done."""
     benchmark = benchmark_of(root, options.pixel_origin)
     groups = chosen_objects(benchmark, options.limit)
-    settings = [pipeline.describe() for _, pipeline in pipelines(benchmark.protocol.pose)]
+    steps = dict(enumerate(LADDERS[options.table](benchmark.protocol.pose)))
+    chosen = [k for k in options.steps or steps if k in steps]
+    settings = [steps[k][1].describe() for k in chosen]
     code = [results_digest(), file_digest(Path(__file__))]
-    parts = []
+    jobs = []
     for group in groups:
         entries = [benchmark.entries[i] for i in group]
         files = [entries[0].meshes[0], *(entry.photo for entry in entries)]
         requests = [repr(entry.request()) for entry in entries]
         digests = [file_digest(path) for path in files]
-        request = json.dumps([code, settings, requests, digests, options.steps])
+        request = json.dumps([code, settings, requests, digests])
         path = options.out / name / f"{text_digest(request)}.json"
-        parts.append(Part(path, (root, options.pixel_origin, group, options.steps), len(group)))
+        given = (options.table, root, options.pixel_origin, group, chosen)
+        jobs.append(Part(path, given, len(group)))
     if options.partial:
-        parts = [part for part in parts if part.path.exists()]
-    complete(parts, measure, label=name, jobs=options.jobs, quiet=options.quiet)
-    record(name, [read_part(part) for part in parts], options)
+        jobs = [job for job in jobs if job.path.exists()]
+    complete(jobs, measure, label=name, jobs=options.jobs, quiet=options.quiet)
+    names = {k: steps[k][0] for k in chosen}
+    record(name, names, [read_part(job) for job in jobs], options.out / f"{options.table}.csv")
 
 
-def record(name: str, records: list[dict[str, Any]], options: argparse.Namespace) -> None:
+def record(name: str, steps: dict[int, str], records: list[dict[str, Any]], path: Path) -> None:
     """Write the rows of a set from the records of its meshes."""
     cads = [cad for one in records for cad in one["cads"]]
     commits = " ".join(sorted({one["commit"] for one in records}))
@@ -221,47 +258,55 @@ def record(name: str, records: list[dict[str, Any]], options: argparse.Namespace
         message = "objects left out, whose photograph or mesh cannot be read"
         print(f"staircase: {name}: {unreadable} {message}", file=sys.stderr)
     rows = []
-    for k in options.steps if cads else ():
+    for k, step in steps.items() if cads else ():
         errors = [error for one in records for error in one["errors"][str(k)]]
         right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
-        numbers = [right.n, right.mean, right.low, right.high, statistics.median(errors)]
-        rows.append([name, k, STEPS[k].name, *numbers, commits])
+        numbers = [
+            right.n,
+            len(set(cads)),
+            right.mean,
+            right.low,
+            right.high,
+            statistics.median(errors),
+        ]
+        rows.append([name, k, step, *numbers, commits])
     measured = {(name, str(row[1])) for row in rows}
-    kept = [row for row in read(options.out) if (row["set"], row["step"]) not in measured]
+    kept = [row for row in read(path) if (row["set"], row["step"]) not in measured]
     every = sorted([*(list(row.values()) for row in kept), *rows], key=lambda r: (r[0], int(r[1])))
-    write_csv(options.out / "staircase.csv", [COLUMNS, *every])
+    write_csv(path, [COLUMNS, *every])
 
 
-def read(out: Path) -> list[dict[str, str]]:
+def read(path: Path) -> list[dict[str, str]]:
     """The rows that are known."""
-    path = out / "staircase.csv"
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def table(rows: list[dict[str, str]]) -> str:
+def table(rows: list[dict[str, str]], ladder: str = "staircase") -> str:
     """Markdown: one line for each step, one column for each set; share within 30 degrees and median
     error."""
     names = list(dict.fromkeys(row["set"] for row in rows))
     known = {(row["set"], int(row["step"])): row for row in rows}
     counts = {name: max(int(row["n"]) for row in rows if row["set"] == name) for name in names}
-    cells = [["change", *(f"`{name}`, N {counts[name]}" for name in names)]]
-    for k, step in enumerate(STEPS):
-        line = [f"{k}. {step.name}"]
-        for name in names:
-            row = known.get((name, k))
-            line.append(
-                "-" if row is None else f"{float(row['right']):.2f}, {float(row['median']):.0f}°"
-            )
-        cells.append(line)
+    cells = [[HEADERS[ladder], *(f"`{name}`, N {counts[name]}" for name in names)]]
+    for k, (step, _) in enumerate(LADDERS[ladder]("any")):
+        found = [known.get((name, k)) for name in names]
+        cells.append([step, *("-" if row is None else cell_of(row) for row in found)])
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     text = (
-        "Share of the rotations within 30° and median error; each line adds one change to the "
-        "line above."
+        "Share of the rotations within 30° with its 95 % interval by bootstrap of the CADs (none "
+        "for one or two of them), and median error, up to symmetries where they are known"
     )
-    return "\n".join([f"{text} Commit {commits}.", "", *table_lines(cells), ""])
+    return "\n".join([f"{text}{TEXTS[ladder]}. Commit {commits}.", "", *table_lines(cells), ""])
+
+
+def cell_of(row: dict[str, str]) -> str:
+    """Share, interval and median; intervals of fewer than ``FEWEST_CADS`` mean nothing."""
+    right, low, high = (float(row[name]) for name in ("right", "low", "high"))
+    interval = f" ({low:.2f} to {high:.2f})" if int(row["cads"]) >= FEWEST_CADS else ""
+    return f"{right:.2f}{interval}, {float(row['median']):.0f}°"
 
 
 def main() -> int:
@@ -274,8 +319,9 @@ def main() -> int:
         "--limit", type=int, metavar="N", help="N objects of each set, spread evenly"
     )
     parser.add_argument(
-        "--steps", type=int, nargs="+", default=list(range(len(STEPS))), help="default: all"
+        "--table", choices=LADDERS, default="staircase", help="what is measured (staircase)"
     )
+    parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     parser.add_argument(
         "--partial", action="store_true", help="rows of what is measured so far; measures nothing"
@@ -295,9 +341,9 @@ def main() -> int:
     except CurviregError as error:
         print(f"staircase: error: {error}", file=sys.stderr)
         return 2
-    print(text := table(read(options.out)))
+    print(text := table(read(options.out / f"{options.table}.csv"), options.table))
     if options.page is not None:
-        update_page(options.page, "staircase", text)
+        update_page(options.page, options.table, text)
     return 0
 
 

@@ -324,11 +324,50 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
 
 
 def test_the_staircase_shows_what_is_known():
-    row = {"set": "lm", "step": "2", "n": "8", "right": "0.625", "median": "12.3", "commit": "abc"}
-    text = staircase.table([row, {**row, "step": "0", "right": "0"}])
+    row = {"set": "lm", "step": "2", "n": "8", "cads": "2", "right": "0.625", "low": "0.5"}
+    row |= {"high": "0.75", "median": "12.3", "commit": "abc"}
+    text = staircase.table([row, {**row, "step": "0", "right": "0", "cads": "3"}])
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
+    assert "| 0. the paper to the letter | 0.00 (0.50 to 0.75), 12° |" in text
     assert "| 13. contour fit of five hypotheses: the default | - |" in text
+
+
+def test_parts_are_left_out_one_at_a_time():
+    default = Pipeline().with_pose_prior("upright")
+    found = dict(staircase.parts("upright"))
+    changed = {}
+    for name, pipeline in found.items():
+        names = ("views", "bank", "field", "box_jitter", "search", "hypotheses", "contours")
+        changed[name] = [n for n in names if getattr(pipeline, n) != getattr(default, n)]
+        mine = {term.name: term.weight for term in pipeline.terms}
+        theirs = {term.name: term.weight for term in default.terms}
+        changed[name] += [n for n in theirs if mine.get(n) != theirs[n]]
+    assert found["learned: the default"] == default
+    assert changed["without the contour fit"] == ["hypotheses", "contours"]
+    assert changed["without the appearance term"] == ["appearance"]
+    assert changed["without repeatability"] == ["repeatability"]
+    assert changed["without the box's shape"] == ["box"]
+    assert changed["without box jitter"] == ["box_jitter"]
+    assert changed["classical"] == ["field", "appearance"]
+    assert found["gradient instead of focus curves"].field == "gradient"
+    assert found["paper"] == PRESETS["paper"]
+    assert "| without repeatability | - |" in staircase.table(
+        [
+            {
+                "set": "lm",
+                "step": "0",
+                "n": "8",
+                "cads": "2",
+                "right": "0.6",
+                "low": "0",
+                "high": "1",
+                "median": "3",
+                "commit": "",
+            }
+        ],
+        "parts",
+    )
 
 
 def climb(monkeypatch, out, *words):
@@ -344,7 +383,7 @@ def test_steps_have_the_results_of_an_evaluation(pascal, tmp_path, monkeypatch, 
     benchmark = staircase.benchmark_of(pascal.root, 1)
     pipelines = list(staircase.pipelines("upright"))
     assert "mini: 2 objects left out" in capsys.readouterr().err
-    rows = staircase.read(tmp_path / "stairs")
+    rows = staircase.read(tmp_path / "stairs" / "staircase.csv")
     assert [row["step"] for row in rows] == ["0", "8"]
     for k, row in zip(steps, rows, strict=True):
         found = evaluate(benchmark, tmp_path / str(k), pipeline=pipelines[k][1], progress=False)
@@ -356,12 +395,12 @@ def test_steps_have_the_results_of_an_evaluation(pascal, tmp_path, monkeypatch, 
 def test_the_staircase_goes_on_where_it_was(pascal, tmp_path, monkeypatch):
     words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
     assert climb(monkeypatch, tmp_path, *words, "--partial") == 0
-    assert staircase.read(tmp_path) == []
+    assert staircase.read(tmp_path / "staircase.csv") == []
     assert climb(monkeypatch, tmp_path, *words) == 0
-    (row,) = staircase.read(tmp_path)
+    (row,) = staircase.read(tmp_path / "staircase.csv")
     monkeypatch.setattr(staircase, "measure", Mock(side_effect=AssertionError("measured again")))
     assert climb(monkeypatch, tmp_path, *words) == 0
-    assert staircase.read(tmp_path) == [row]
+    assert staircase.read(tmp_path / "staircase.csv") == [row]
     with pytest.raises(AssertionError, match="measured again"):
         climb(monkeypatch, tmp_path, *words[:-1], "1")
     assert climb(monkeypatch, tmp_path, "nothing") == 2
@@ -375,3 +414,6 @@ def test_objects_without_a_pose_count_as_wrong(pascal, monkeypatch):
         staircase, "register_observation", Mock(side_effect=InvalidInputError("no"))
     )
     assert climber.errors(PRESETS["paper"]) == [180.0]
+    errors = {"error_deg": torch.tensor([90.0]), "symmetric_error_deg": torch.tensor([5.0])}
+    monkeypatch.setattr(benchmark, "errors", lambda *_: errors)
+    assert climber.errors(PRESETS["paper"]) == [5.0], "up to symmetries"
