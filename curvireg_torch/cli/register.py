@@ -367,9 +367,10 @@ def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None
     from ..jobs.ros import write_ros
 
     if arguments.format:
+        mesh = Path(document.get("mesh") or arguments.meshes[0])
         chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
         given = {name: value for name, value in chosen.items() if value is not None}
-        write_ros(arguments.out, document, child=Path(document["inputs"]["mesh"]).stem, **given)
+        write_ros(arguments.out, document, child=mesh.stem, **given)
 
 
 def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
