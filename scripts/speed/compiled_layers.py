@@ -16,7 +16,6 @@ import time
 from typing import Any
 
 import torch
-import torch._inductor.config
 from torch import nn
 
 import curvireg_torch as cr
@@ -87,7 +86,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=list(LAYERS), help="names of layers")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    torch._inductor.config.compile_threads = 1
+    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # read at the first compilation
     record = json.loads(OUT.read_text()) if OUT.is_file() else {"machines": {}, "layers": {}}
     where = f"torch {torch.__version__}, {_shared.processor()}, {_shared.today()}"
     for name in options.only:
