@@ -6,7 +6,7 @@ some landmarks. They need colours, and the camera of the photograph.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from ..filters.operations import resized
 from ..geometry.cameras import transform
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
+from ..utils.rows import Rows
 from ..utils.threads import map_on_threads
 from .least_squares import nearest_rigid
 
@@ -60,7 +61,7 @@ FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmark
 
 
 @dataclass(frozen=True)
-class _Features:
+class _Features(Rows):
     """F features of a picture: ``uv`` (F, 2) in px, ``size`` (F,) in px, ``angle`` (F,) in rad, and
     unit ``vectors`` (F, 128)."""
 
@@ -95,9 +96,6 @@ class _Features:
         return _Features(
             values[:, :2] - UPSCALING_SHIFT, values[:, 2], values[:, 3], vectors.astype(np.float32)
         )
-
-    def __getitem__(self, index: np.ndarray) -> "_Features":
-        return _Features(*(getattr(self, f.name)[index] for f in fields(_Features)))
 
 
 @dataclass(frozen=True)
@@ -201,9 +199,7 @@ class Landmarks:
             return found[z > 0], ((rays - T[k, :3, 3].numpy()) @ T[k, :3, :3].numpy())[z > 0]
 
         found = map_on_threads(features, range(VIEWS))
-        self._features = _Features(
-            *(np.concatenate([getattr(one, f.name) for one, _ in found]) for f in fields(_Features))
-        )
+        self._features = _Features.cat([features for features, _ in found])
         self._points = np.concatenate([points for _, points in found])
         # Of a feature of size 1 that is upright: the way to the object's centre, and the object's
         # radius, both in px.

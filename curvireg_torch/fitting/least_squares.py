@@ -3,7 +3,7 @@ on a pose."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from ..geometry import rotation_from_axis_angle
 from ..geometry.cameras import transform
 from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
+from ..utils.rows import Rows
 
 # Longest step: radians, and fraction of the object's distance
 MAX_ROTATION = 0.2
@@ -24,7 +25,7 @@ POINT_DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
-class Measurements:
+class Measurements(Rows):
     """What N poses are fitted to: derivatives ``J`` (N, P, 6) of distances in px by rotation about
     the object's centre (rad) and translation, these distances and their weights, (N, P, 1)."""
 
@@ -40,13 +41,6 @@ class Measurements:
     def scaled(self, factor: float) -> "Measurements":
         """The same with weights times ``factor``."""
         return Measurements(self.J, self.distance, factor * self.weight)
-
-    @staticmethod
-    def cat(parts: Sequence["Measurements"]) -> "Measurements":
-        """All measurements of the same poses together."""
-        return Measurements(
-            *(torch.cat([getattr(p, f.name) for p in parts], dim=1) for f in fields(Measurements))
-        )
 
 
 @dataclass(frozen=True)

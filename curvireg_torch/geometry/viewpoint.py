@@ -27,6 +27,7 @@ from ..utils.checks import (
     check_rotation,
 )
 from ..utils.choices import UP_AXES
+from ..utils.rows import Rows
 
 
 def rotation_from_viewpoint(
@@ -139,7 +140,7 @@ DEFAULT_DISTANCE = 5.0
 
 
 @dataclass(frozen=True)
-class ViewSphere:
+class ViewSphere(Rows):
     """N viewpoints in PASCAL3D+ angles.
 
     Attributes:
@@ -163,14 +164,6 @@ class ViewSphere:
             raise InvalidInputError(
                 "ViewSphere: expected distances > 1 object radius (the camera outside the object)"
             )
-
-    def __len__(self) -> int:
-        return self.azimuth.numel()
-
-    def __getitem__(self, index: Tensor | slice) -> "ViewSphere":
-        return ViewSphere(
-            self.azimuth[index], self.elevation[index], self.theta[index], self.distance[index]
-        )
 
     @property
     def rotations(self) -> Tensor:

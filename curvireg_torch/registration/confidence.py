@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
+from ..evidence import Evidence
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
@@ -172,7 +173,7 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
 
 
 def confidence_features(
-    evidence: Tensor,
+    evidence: Evidence,
     scores: Tensor,
     share: float | None,
     *,
@@ -187,7 +188,7 @@ def confidence_features(
     of its rivals, clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
+        evidence: of the H hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
@@ -196,23 +197,22 @@ def confidence_features(
         focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count
             as 1.
     """
-    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
+    best = evidence.named(0)
     rivals = scores[1:]
     margin = (
         min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
     )
-    values = (
-        similarity,
-        margin,
-        edge_support,
-        share,
-        landmarks,
-        undetermined,
-        outside,
-        border,
-        min(focal, 1.0),
-    )
-    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
+    return {
+        "similarity": best["similarity"],
+        "margin": margin,
+        "edge_support": best["edge_support"],
+        "concentration": share,
+        "landmarks": best["landmarks"],
+        "undetermined": undetermined,
+        "outside": outside,
+        "border": border,
+        "focal": min(focal, 1.0),
+    }
 
 
 def resolution(*, exact: bool) -> float:
