@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..filters.operations import resized
-from ..geometry.cameras import transform
+from ..geometry.cameras import pose_around
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
 from ..utils.rows import Rows
@@ -143,13 +143,9 @@ class LandmarkMatches:
             )
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
-                R = pose.T[:3, :3]
-                position = pose.T[:3, 3]
-                poses.append(
-                    LandmarkPose(
-                        transform(R, position - R @ torch.from_numpy(self.centre)), pose.count
-                    )
-                )
+                centre = torch.from_numpy(self.centre)
+                T = pose_around(pose.T[:3, :3], pose.T[:3, 3], centre)
+                poses.append(LandmarkPose(T, pose.count))
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
@@ -175,7 +171,7 @@ class Landmarks:
         self._radius = describer.radius
         R = uniform_views(VIEWS).rotations.double()
         position = torch.tensor([0.0, 0.0, VIEW_DISTANCE * self._radius], dtype=torch.float64)
-        T = transform(R, position - R @ describer.centre)
+        T = pose_around(R, position, describer.centre)
         # the bounding sphere fills the picture
         focal = 0.5 * VIEW_SIZE * math.sqrt(VIEW_DISTANCE**2 - 1.0)
         middle = 0.5 * (VIEW_SIZE - 1)

@@ -17,7 +17,7 @@ from ..errors import CurviregError
 from ..evaluation.metrics import symmetric_rotation_error
 from ..filters import gaussian_smooth
 from ..geometry import PosePrior, camera_matrix, rotation_from_axis_angle, viewpoint_from_rotation
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.viewpoint import up_rotation
 from ..mesh import has_colours, mesh_up
 from ..registration import Registrar, Registration
@@ -251,13 +251,8 @@ def _register_pair(registrar: Registrar, photograph: Photograph, symmetries: Ten
     turn = rotation_from_axis_angle(
         torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
     )
-    centre = (
-        photograph.truth[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
-        + photograph.truth[:3, 3]
-    )
-    move = torch.eye(4, dtype=torch.float64)
-    move[:3, :3] = turn
-    move[:3, 3] = centre - turn @ centre
+    centre = point_in_cameras(photograph.truth, torch.from_numpy(mesh.bounds.mean(axis=0)))
+    move = pose_around(turn, centre, centre)
     image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
     cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
     try:
@@ -280,7 +275,7 @@ def _outcome(
         return Outcome(photograph, None, 180.0, elevation)
     rotation = result.rotation
     if result.translation is None:
-        centre = truth @ registrar.describer.centre + photograph.truth[:3, 3]
+        centre = point_in_cameras(photograph.truth, registrar.describer.centre)
         truth = rotation_towards(centre).mT @ truth
         rotation = result.allocentric_rotation
     error = float(symmetric_rotation_error(rotation.double(), truth, symmetries))
@@ -302,17 +297,14 @@ def _random_truth(
     elevations = (-10.0, 60.0) if upright else (-90.0, 90.0)
     T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)
     centre = torch.from_numpy(np.asarray(mesh.bounds.mean(axis=0)))
-    position = T[:3, :3] @ centre + T[:3, 3]
+    position = point_in_cameras(T, centre)
     R = T[:3, :3]
     if not upright:
         quaternion = torch.randn(4, generator=generator, dtype=torch.float64)
         R = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
     elif mesh_up(mesh) != "z":
         R = R @ up_rotation(mesh_up(mesh)).double()
-    truth = torch.eye(4, dtype=torch.float64)
-    truth[:3, :3] = R
-    truth[:3, 3] = position - R @ centre
-    return truth
+    return pose_around(R, position, centre)
 
 
 def _azimuth(mesh: trimesh.Trimesh, truth: Tensor) -> float:

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
 from ..evidence import Evidence
+from ..geometry.viewpoint import angles_between
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
@@ -30,6 +30,7 @@ CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
 RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals
+ROUNDING = 5e-4  # of these degrees: many views of a bank are 30 degrees apart
 
 Features = Mapping[str, float | None]  # by name; None where there is no rival view to compare with
 
@@ -133,10 +134,8 @@ def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = No
 
     ``symmetries`` are (K, 4, 4) or (K, 3, 3).
     """
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = rotation.to(rotations) @ group.to(rotations)
-    traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
-    return traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
+    angles = angles_between(rotation[None].to(rotations), rotations, symmetries)[0]
+    return angles <= RIVAL_ANGLE + ROUNDING
 
 
 def concentration(scores: Tensor, near: Tensor) -> float | None:

@@ -15,7 +15,7 @@ from ..fitting.contour_problem import ContourProblem
 from ..fitting.edges import EdgeCrops
 from ..fitting.measured_fit import ContourFit, contour_support
 from ..fitting.texture_fit import fit_texture, turned
-from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
+from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..utils.rows import Rows
 from .confidence import are_near
@@ -137,7 +137,7 @@ class Poses(Rows):
 
 def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
     """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match."""
-    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    position = point_in_cameras(T, centre)
     rotation = rotation_towards(position).mT @ T[:, :3, :3]
     return replace(
         poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1)

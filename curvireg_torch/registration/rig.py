@@ -18,9 +18,10 @@ from ..fitting.edges import CROP_SIZE, EdgeCrops
 from ..fitting.least_squares import Measurements, pose_covariance
 from ..fitting.measured_fit import FULL_SIZE_RADII
 from ..geometry import rotation_error
-from ..geometry.cameras import rotation_towards, transform
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
+from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
 from ..terms import crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
@@ -83,7 +84,7 @@ class RigProblem(ContourProblem):
         """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of
         these."""
         turn = axis_angle_from_rotation(self.alone[:, :3, :3] @ T[:, :3, :3].mT)
-        shift = (self.alone - T)[:, :3, :3] @ self.centre + (self.alone - T)[:, :3, 3]
+        shift = point_in_cameras(self.alone - T, self.centre)
         return self.root @ torch.cat([turn, shift], dim=1)[..., None]
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
@@ -238,8 +239,7 @@ class Rig:
 
     def centres(self, T: Tensor) -> Tensor:
         """(N, 3) the object's centres of poses (N, 4, 4)."""
-        centres: Tensor = T[:, :3, :3] @ self.describer.centre + T[:, :3, 3]
-        return centres
+        return point_in_cameras(T, self.describer.centre)
 
     @cached_property
     def places(self) -> tuple[Tensor, Tensor]:
@@ -275,8 +275,8 @@ class Rig:
         agree = agree.scatter(1, source[:, None], False)[:, :, None, None].double()
         A = own + (agree * theirs).sum(dim=1)
         b = own @ place[..., None] + (agree * (theirs @ others[..., None])).sum(dim=1)
-        R = T[:, :3, :3]
-        T = transform(R, torch.linalg.solve(A, b)[..., 0] - R @ self.describer.centre)
+        agreed = torch.linalg.solve(A, b)[..., 0]
+        T = pose_around(T[:, :3, :3], agreed, self.describer.centre)
         return T[self.distinct(T, _bounded(self.ranks(T)).sum(dim=0))[:FITTED_CANDIDATES]]
 
     def distinct(self, T: Tensor, score: Tensor) -> Tensor:
@@ -294,10 +294,7 @@ class Rig:
     def angles(self, R: Tensor, others: Tensor) -> Tensor:
         """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to
         symmetries."""
-        R = R[:, :3, :3]
-        others = others[:, :3, :3]
-        traces = ((R[:, None] @ self.symmetries).flatten(2) @ others.flatten(1).T).amax(dim=1)
-        return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
+        return angles_between(R[:, :3, :3], others[:, :3, :3], self.symmetries)
 
     def ranks(self, T: Tensor) -> Tensor:
         """(V, M) log S of the best view of the bank near world poses, minus that of the best view
