@@ -1,6 +1,7 @@
 """Pairs of views that the shape of a mesh does not tell apart."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
-from ..geometry.conversions import rotation_from_axis_angle
-from ..geometry.viewpoint import up_rotation
+from ..geometry import uniform_views, viewpoint_from_rotation
+from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
+from ..geometry.viewpoint import angles_between, up_rotation
 from ..matching import ViewBank, ViewDescriber
 from ..mesh import mesh_up
 
@@ -25,6 +26,11 @@ RESOLUTION = 3.0
 HALF_TURNS = torch.stack(
     [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
 )
+# Degrees from which a rotation between two views is half a turn, and cosines of the angle between
+# its axis and the upward one that make it one about that axis, or about a level one
+HALF_TURN = 150.0
+ALONG = 0.9
+ACROSS = 0.4
 STEPS = (6.0, 2.0)  # Degrees by which a candidate is turned to come nearer
 
 
@@ -127,9 +133,24 @@ def look_alikes(
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
 
 
+def confused_sides(pairs: Sequence[LookAlike], up: str) -> str:
+    """Which sides most of the pairs confuse, in words: half a turn about the axis that points
+    ``up`` is front and back, one about a level axis is top and bottom."""
+    axis = up_rotation(up).double()[2]
+    kinds = Counter[str]()
+    for pair in pairs:
+        turn = axis_angle_from_rotation(pair.rotation.mT @ pair.rival)
+        steepness = abs(float(F.normalize(turn, dim=0) @ axis))
+        half = float(torch.rad2deg(turn.norm())) > HALF_TURN
+        upright = half and steepness > ALONG
+        level = half and steepness < ACROSS
+        kinds["front and back" if upright else "top and bottom" if level else "several sides"] += 1
+    return kinds.most_common(1)[0][0]
+
+
 def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to a group (S, 3, 3)."""
-    return rotation_error(rotations[:, None], (rotation @ group)[None]).amin(dim=1)
+    return angles_between(rotations, rotation[None], group)[:, 0]
 
 
 def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:

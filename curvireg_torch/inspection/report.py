@@ -1,6 +1,6 @@
 """``curvireg inspect``: one report of a mesh, before anyone takes a photograph."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,7 +18,7 @@ from ..registration import Registrar
 from ..utils.checks import check_integer
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
-from .look_alikes import LookAlike, look_alikes
+from .look_alikes import LookAlike, confused_sides, look_alikes
 from .photographs import SIZE, UPRIGHT, PhotographGenerator
 from .trial import Report, Trial, report_nothing, run_trial
 
@@ -45,10 +45,10 @@ class Inspection:
     """
 
     facts: MeshFacts
-    pairs: tuple[LookAlike, ...]
-    trial: Trial | None
-    seed: int
-    with_camera: bool
+    pairs: tuple[LookAlike, ...] = ()
+    trial: Trial | None = None
+    seed: int = 0
+    with_camera: bool = True
     registrar: Registrar | None = None
 
     @property
@@ -60,16 +60,8 @@ class Inspection:
     def warnings(self) -> tuple[str, ...]:
         """What to know before taking photographs, in words."""
         warnings = list(self.facts.warnings)
-        share = len(self.alike) / max(len(self.pairs), 1)
-        if share >= MANY_ALIKE:
-            remedy = (
-                "give a pose prior (--azimuth, --side)"
-                if self.facts.is_coloured
-                else "give a texture or a pose prior"
-            )
-            warnings.append(
-                f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}"
-            )
+        if self.alike_share >= MANY_ALIKE:
+            warnings.append(self._alike_in_words())
         if self.trial is not None and self.trial.expected.right < MIN_RIGHT:
             right = 100 * self.trial.expected.right
             warnings.append(
@@ -77,6 +69,32 @@ class Inspection:
                 f"answers"
             )
         return tuple(warnings)
+
+    @property
+    def alike_share(self) -> float:
+        """Share of the directions from which a photograph does not tell another side from it."""
+        return len(self.alike) / max(len(self.pairs), 1)
+
+    @property
+    def in_brief(self) -> str:
+        """One sentence: what the mesh is, what looks alike, and what would help.
+
+        Example:
+            >>> Inspection(mesh_facts(trimesh.creation.icosphere(3))).in_brief
+            'grey mesh: a sphere: it looks the same from everywhere, so its rotation cannot be seen'
+        """
+        kind = "coloured mesh" if self.facts.is_coloured else "grey mesh"
+        if self.is_hopeless:
+            return f"{kind}: {self.facts.verdicts[-1]}"
+        if self.alike_share >= MANY_ALIKE:
+            return f"{kind}: {self._alike_in_words()}"
+        return "; ".join([f"{kind}: its sides differ in shape", *self.facts.verdicts])
+
+    def _alike_in_words(self) -> str:
+        sides = confused_sides(self.alike, self.facts.up)
+        remedy = "a pose prior" if self.facts.is_coloured else "a texture or a pose prior"
+        share = 100.0 * self.alike_share
+        return f"{sides} look alike from {share:.0f} % of the views; give {remedy}"
 
     @property
     def is_hopeless(self) -> bool:
@@ -166,7 +184,7 @@ def inspect(
     facts = mesh_facts(clean)
     report("mesh", 1, 1)
     if facts.is_hopeless:
-        return Inspection(facts, (), None, seed, with_camera)
+        return Inspection(facts, seed=seed, with_camera=with_camera)
     with one_torch_thread():
         if registrar is None:
             bank = cached_bank(
@@ -177,18 +195,11 @@ def inspect(
                 progress=report,
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
-        upright = registrar.pipeline.views.pose == "upright"
-        symmetries = None if has_colours(clean) else registrar.symmetries_of(exact=True)
-        pairs = look_alikes(
-            registrar.bank,
-            registrar.describer,
-            symmetries,
-            elevations=UPRIGHT if upright else (-90.0, 90.0),
-            report_progress=partial(report, "look-alikes"),
-        )
+        pairs = look_alikes_of(registrar, partial(report, "look-alikes"))
         if n == 0:
             return Inspection(facts, pairs, None, seed, with_camera, registrar)
         pictures = [_background(picture) for picture in backgrounds]
+        upright = registrar.pipeline.views.pose == "upright"
         generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
         trial = run_trial(
             registrar,
@@ -199,6 +210,21 @@ def inspect(
             report=report,
         )
     return Inspection(facts, pairs, trial, seed, with_camera, registrar)
+
+
+def look_alikes_of(
+    registrar: Registrar, report_progress: Callable[[int, int], object] | None = None
+) -> tuple[LookAlike, ...]:
+    """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at."""
+    mesh = registrar.bank.mesh
+    upright = registrar.pipeline.views.pose == "upright"
+    return look_alikes(
+        registrar.bank,
+        registrar.describer,
+        None if has_colours(mesh) else registrar.symmetries_of(exact=True),
+        elevations=UPRIGHT if upright else (-90.0, 90.0),
+        report_progress=report_progress,
+    )
 
 
 def _background(picture: Any) -> Tensor:
