@@ -268,7 +268,7 @@ def _poses(
             yield name, None, FailedRegistration(image), time.perf_counter() - begun
             continue
         try:
-            box = _box(options, name, image, is_first=is_first)
+            box: Any = _box(options, name, image, is_first=is_first)
             is_first = False
             if isinstance(options.camera, Camera):
                 seen = undistorted(
