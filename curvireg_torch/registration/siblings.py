@@ -2,7 +2,7 @@
 features differ."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -18,6 +18,22 @@ from .target import Target
 from .work import Work, features_of, fitted_poses, with_replaced
 
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
+
+
+@dataclass(frozen=True)
+class Rival:
+    """The strongest rival of the best pose among its siblings.
+
+    Attributes:
+        poses: of it, one; none if it is the same pose of a symmetric mesh.
+        features: (1, F) :data:`.POSE_FEATURES`, or (0, F).
+        feature_is_hidden: whether a small feature of the mesh tells the siblings apart, and the
+            photograph does not show it.
+    """
+
+    poses: Poses
+    features: Tensor
+    feature_is_hidden: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,18 +80,23 @@ class Siblings:
         best = int(gain.argmax())
         return best if float(gain[best]) > BETTER else 0
 
-    def rival(self, best: int, fitted: Tensor) -> tuple[Poses, Tensor] | None:
-        """The sibling with the highest score among those that look different from the ``best`` one,
-        and its features (1, F): those of the best one as it was ``fitted`` (1, F), plus their
-        difference without a fit. None if all look alike: they are one pose of a symmetric mesh."""
+    def rival(self, best: int, fitted: Tensor, *, notable: bool) -> Rival:
+        """The sibling with the highest score among those that differ from the ``best`` one in the
+        photograph, or in a ``notable`` feature of the mesh that it does not show.
+
+        Its features are those of the best one as it was ``fitted`` (1, F), plus their difference
+        without a fit.
+        """
         angle = rotation_error(self.poses.T[:, :3, :3], self.poses.T[best, :3, :3])
-        other = self.look_different[best] & (angle > RIVAL_ANGLE)
-        if not bool(other.any()):
-            return None
-        chosen = torch.where(other, self.gain(best), -torch.inf).argmax()[None]
+        far = angle > RIVAL_ANGLE
+        different = far & self.look_different[best]
+        alike = far & ~self.look_different[best]
+        counted = far if notable else different
+        some = counted.nonzero()[:, 0]
+        chosen = some[self.gain(best)[some].argsort(descending=True)[:1]]
         features = fitted + self.features[chosen] - self.features[best]
         features[:, POSE_FEATURES.index("details")] += self.details[chosen, best]
-        return self.poses[chosen], features
+        return Rival(self.poses[chosen], features, bool(alike.any()))
 
 
 def with_siblings(
@@ -85,25 +106,25 @@ def with_siblings(
     poses: Poses,
     features: Tensor,
     outside: Tensor,
-) -> tuple[Poses, Tensor, tuple[Poses, Tensor] | None]:
+) -> tuple[Poses, Tensor, Rival]:
     """Replace the best pose by what a symmetry of the shape makes of it, if small features say so;
-    and return its strongest rival among these, with its features, unless all of them look alike.
-    Given symmetries are trusted."""
+    and return its strongest rival among these. Given symmetries are trusted."""
     symmetries = target.telling_symmetries
     if len(symmetries) == 1:
-        return poses, features, None
+        return poses, features, Rival(poses[:0], features[:0])
     best = best_inside(features, outside)
 
     def measure(some: Poses) -> Tensor:
         return features_of(target, work, with_edge_support(target.describer, crops, some))
 
-    siblings = Siblings.of(poses[best], symmetries, target.describer, crops, measure)
+    siblings = Siblings.of(poses[best], symmetries.transforms, target.describer, crops, measure)
     kept = siblings.best()
     if kept:
         fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], again=True)
         new = features_of(target, work, fitted)
         poses, features = with_replaced(work, poses, features, best, fitted, new)
-    rival = siblings.rival(kept, features[best])
-    if rival is not None and work.limits is not None and not bool(work.limits.keeps(rival[0])):
-        rival = None
+    rival = siblings.rival(kept, features[best], notable=symmetries.notable)
+    if work.limits is not None:
+        kept_rival = work.limits.keeps(rival.poses)
+        rival = replace(rival, poses=rival.poses[kept_rival], features=rival.features[kept_rival])
     return poses, features, rival
