@@ -18,7 +18,7 @@ import trimesh
 
 from ..errors import BankError, OutputError
 from ..geometry.viewpoint import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_unit, mesh_up
+from ..mesh.mesh import as_mesh, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, text_digest
@@ -65,8 +65,8 @@ def bank_key(
     pipeline: Pipeline | None = None,
     renderer: str = "auto",
 ) -> str:
-    """32 hexadecimal digits: digest of mesh (with colours, unit and up axis), views, settings,
-    renderer and code."""
+    """32 hexadecimal digits: digest of mesh (with colours and up axis), views, settings, renderer
+    and code. Views look the same in every unit of length, so the unit is no part of it."""
     pipeline = pipeline or Pipeline()
     settings = {
         **asdict(pipeline.bank),
@@ -82,7 +82,7 @@ def bank_key(
     tensors |= {
         f"views.{field.name}": getattr(views, field.name).double() for field in fields(ViewSphere)
     }
-    facts = [FORMAT_VERSION, settings, mesh_unit(mesh), mesh_up(mesh), renderer]
+    facts = [FORMAT_VERSION, settings, mesh_up(mesh), renderer]
     digests = [import_digest(_BUILDER), tensor_digest(tensors, size=16)]
     return text_digest(json.dumps([facts, digests], sort_keys=True), size=16)
 
@@ -137,6 +137,7 @@ def cached_bank(
         if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) == key:
             with suppress(OSError):  # a read-only cache
                 os.utime(path)
+            bank.mesh.units = mesh.units  # the file may have been stored in another one
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
             bank.described_views_file = (
                 _described_views_file(path) if bank.device.type == "cpu" else None

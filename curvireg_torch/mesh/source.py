@@ -23,7 +23,7 @@ class MeshWarning:
     ``mesh.metadata["warnings"]``.
 
     Attributes:
-        kind: "texture", "material", "stray", "skin", "precision", "cut" or "link".
+        kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
         text: one sentence, without the name of the file.
     """
 

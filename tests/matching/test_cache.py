@@ -15,7 +15,7 @@ from PIL import Image
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cached_bank, list_cache
 from curvireg_torch.matching.cache import clear_cache
-from curvireg_torch.mesh.mesh import as_mesh
+from curvireg_torch.mesh.mesh import as_mesh, mesh_unit
 from curvireg_torch.pipeline import BankSettings, Pipeline
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))
@@ -48,13 +48,11 @@ def standing(up: str = "y") -> trimesh.Trimesh:
 
 def test_bank_key_depends_on_everything(monkeypatch):
     mesh = trimesh.creation.box()
-    millimetres, metres, moved, flipped, painted = (mesh.copy() for _ in range(5))
-    millimetres.units = "mm"
-    metres.units = "m"
+    moved, flipped, painted = (mesh.copy() for _ in range(3))
     moved.vertices[0] += 1e-9
     flipped.faces = flipped.faces[::-1]
     painted.visual.vertex_colors[0] = (9, 8, 7, 255)
-    meshes = [mesh, millimetres, metres, moved, flipped, painted, standing()]
+    meshes = [mesh, moved, flipped, painted, standing()]
     meshes += [textured(), textured(uv=1e-4), textured(level=1), textured(side=8), textured(side=2)]
     keys = [key(m) for m in meshes]
     keys += [key(mesh, VIEWS[:3]), key(mesh, renderer="embree")]
@@ -63,6 +61,20 @@ def test_bank_key_depends_on_everything(monkeypatch):
     monkeypatch.setattr(cache, "import_digest", lambda _: "another version")
     keys.append(key(mesh))
     assert len(set(keys)) == len(keys)
+
+
+def test_bank_of_another_unit_is_not_rendered_again(tmp_path, monkeypatch):
+    options = {"pipeline": PIPELINE, "folder": tmp_path, "progress": False}
+    mesh = trimesh.creation.box()
+    assert mesh_unit(cached_bank(mesh, VIEWS, **options).mesh) is None
+    monkeypatch.setattr(ViewBank, "build", None)  # would fail
+    for unit in ("mm", "m"):
+        mesh.units = unit
+        bank = cached_bank(mesh, VIEWS, **options)
+        assert mesh_unit(bank.mesh) == unit
+    mesh = trimesh.creation.box()
+    assert mesh_unit(cached_bank(mesh, VIEWS, **options).mesh) is None
+    assert len(list_cache(tmp_path)) == 1
 
 
 def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):
