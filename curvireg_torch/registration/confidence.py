@@ -23,7 +23,14 @@ from ..pipeline import BankSettings, Pipeline
 LANDMARK_PROBABILITY = 0.95
 RELIABLE = 0.9  # Confidence from which a registration is called reliable
 # the more, the better
-EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
+EVIDENCE_FEATURES = (
+    "similarity",
+    "margin",
+    "edge_support",
+    "contours",
+    "concentration",
+    "landmarks",
+)
 DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
@@ -183,8 +190,8 @@ def confidence_features(
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest
-    of its rivals, clamped to +-5; None without rivals.
+    similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
+    the largest of its rivals, clamped to +-5; None without rivals.
 
     Args:
         evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
@@ -196,7 +203,7 @@ def confidence_features(
         focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count
             as 1.
     """
-    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
+    _, similarity, edge_support, _, landmarks, _, contours = evidence[0].tolist()
     rivals = scores[1:]
     margin = (
         min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
@@ -205,6 +212,7 @@ def confidence_features(
         similarity,
         margin,
         edge_support,
+        contours,
         share,
         landmarks,
         undetermined,

@@ -14,7 +14,7 @@ from ..fitting.contour_fit import fit_to_edges, quick_fit
 from ..fitting.contour_problem import ContourProblem
 from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit, contour_evidence, contour_support
 from ..fitting.texture_fit import fit_texture, turned
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
@@ -32,6 +32,7 @@ __all__ = [
     "close_rivals",
     "common_score",
     "compare_with_photograph",
+    "contours_of",
     "distinct_poses",
     "fit_poses",
     "fit_texture_of",
@@ -63,24 +64,34 @@ CLOSE_RIVALS = 2
 """Score by which rivals may be behind to be compared with the best pose in detail, and how many of
 them are fitted as thoroughly."""
 
-POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks", "details")
+POSE_FEATURES = (
+    "rank",
+    "similarity",
+    "edge_support",
+    "appearance",
+    "landmarks",
+    "details",
+    "contours",
+)
 """Features of a pose: log S of the view it started from, minus that of the best view; normalised
 correlation of the pose's view with the photograph; edge support (0 without the contour fit); log
 appearance score of the pose (0 without that term); log (1 + n) with the number n of landmarks that
 agree with it, beyond ``CHANCE_LANDMARKS`` (0 without colours, camera or contour fit, with a similar
 mesh, and where a given pose is refined); by how much the contours that only this pose or only the
 best one predicts speak for it, see :func:`.compare_details` (0 for poses that score far less than
-the best)."""
+the best); how far the edges under its contours exceed chance, see :func:`.contour_evidence` (0
+without the contour fit)."""
 
 CHANCE_LANDMARKS = 2
 """Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses
 have no more."""
 
-SCORE_WEIGHTS = (0.0, 10.0, 10.0, 2.5, 6.0, 1.0)
-RANK_ALONE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SCORE_WEIGHTS = (0.0, 10.0, 0.0, 2.5, 6.0, 1.0, 10.0)
+RANK_ALONE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Weights of the features in the score of a pose, with an exact mesh and with a similar one
 (docs/experiments.md). The rank does not count where poses are fitted: how near a view of the bank
-was to one is a matter of sampling."""
+was to one is a matter of sampling; nor does the edge support, which poses that predict few contours
+reach easily."""
 
 
 @dataclass(frozen=True)
@@ -280,16 +291,29 @@ def pose_features(
     similarity: Tensor,
     appearance: Tensor | None = None,
     landmarks: Tensor | None = None,
+    contours: Tensor | None = None,
 ) -> Tensor:
-    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance``
-    (H,) where the pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has
-    any."""
-    appearance, landmarks = (
-        torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks)
+    """(H, F) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance``
+    (H,) where the pipeline has that term, the evidence of ``landmarks`` (H,) where the mesh has
+    any, and of ``contours`` (H,) where they are fitted."""
+    none = torch.zeros_like(similarity)
+    return torch.stack(
+        [
+            poses.rank,
+            similarity,
+            poses.edge_support.nan_to_num(0.0),
+            none if appearance is None else appearance,
+            none if landmarks is None else landmarks,
+            none,
+            none if contours is None else contours,
+        ],
+        dim=1,
     )
-    support = poses.edge_support.nan_to_num(0.0)
-    details = torch.zeros_like(similarity)
-    return torch.stack([poses.rank, similarity, support, appearance, landmarks, details], dim=1)
+
+
+def contours_of(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Tensor:
+    """(H,) :func:`.contour_evidence` of poses."""
+    return contour_evidence(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
 
 
 def with_details(

@@ -18,6 +18,7 @@ from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_it
 from .photograph import register
 from .poses import (
     Poses,
+    contours_of,
     distinct_poses,
     fit_poses,
     fit_texture_of,
@@ -137,7 +138,8 @@ def refine_item(
 
     def features_of(poses: Poses) -> Tensor:
         views = describer.descriptors(poses.rotation, poses.distance)
-        return pose_features(poses, similarities(views, descriptors))
+        contours = contours_of(describer, crops, poses)
+        return pose_features(poses, similarities(views, descriptors), contours=contours)
 
     best = pose_scores(features_of(poses), exact=True).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:

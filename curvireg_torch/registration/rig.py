@@ -16,7 +16,7 @@ from ..fitting.details import compare_details
 from ..fitting.edges import CROP_SIZE, EdgeCrops
 from ..fitting.landmarks import LandmarkMatches
 from ..fitting.least_squares import Measurements, pose_covariance
-from ..fitting.measured_fit import FULL_SIZE_RADII
+from ..fitting.measured_fit import FULL_SIZE_RADII, contour_evidence
 from ..geometry import rotation_error
 from ..geometry.cameras import rotation_towards, transform
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
@@ -42,6 +42,8 @@ from .tracker import boxes_at
 FITTED_CANDIDATES = 6
 JUDGED_CANDIDATES = 4
 FINISHED_CANDIDATES = 2
+# Weight of the edge support, beside log S, in the choice of the candidates that are compared
+SUPPORT_WEIGHT = 10.0
 # Degrees, and shift in object radii, within which two candidates count as one; the best view of the
 # bank so near to a pose stands for it
 SAME_ANGLE = 15.0
@@ -392,7 +394,7 @@ class Rig:
         # for those that are far off; the others lose by it
         moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)
         T, support, _ = self.fitted(half, torch.cat([T, moved]), FIRST_RADII)
-        promising = (SCORE_WEIGHTS[2] * support + _bounded(self.ranks(T))).sum(dim=0)
+        promising = (SUPPORT_WEIGHT * support + _bounded(self.ranks(T))).sum(dim=0)
         chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
         T = T[chosen]
         support = support[:, chosen]
@@ -459,12 +461,20 @@ class Rig:
             landmarks = torch.zeros_like(similarity)
             if photograph.landmarks is not None:
                 landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
-            parts.append(
-                torch.stack([similarity, appearance, landmarks, self.details(photograph, T)])
-            )
-        similarity, appearance, landmarks, details = torch.stack(parts, dim=1)
+            details = self.details(photograph, T)
+            contours = self.contours(photograph, T)
+            parts.append(torch.stack([similarity, appearance, landmarks, details, contours]))
+        similarity, appearance, landmarks, details, contours = torch.stack(parts, dim=1)
         return torch.stack(
-            [self.ranks(T), similarity, support, appearance, landmarks, details], dim=-1
+            [self.ranks(T), similarity, support, appearance, landmarks, details, contours], dim=-1
+        )
+
+    def contours(self, photograph: RigPhotograph, T: Tensor) -> Tensor:
+        """(M,) :func:`.contour_evidence` of world poses (M, 4, 4) in a photograph."""
+        K = photograph.K.expand(len(T), 3, 3)
+        index = torch.zeros(len(T), dtype=torch.long)
+        return contour_evidence(
+            self.describer.contours, photograph.crops, K, photograph.camera @ T, index
         )
 
     def details(self, photograph: RigPhotograph, T: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from ..fitting.edges import EdgeCrops
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
 from .confidence import RIVAL_ANGLE
-from .poses import POSE_FEATURES, Poses, placed, pose_scores, with_edge_support
+from .poses import POSE_FEATURES, Poses, placed, pose_scores
 from .refits import best_inside
 from .target import Target
 from .work import Work, features_of, fitted_poses, with_replaced
@@ -115,7 +115,7 @@ def with_siblings(
     best = best_inside(features, outside)
 
     def measure(some: Poses) -> Tensor:
-        return features_of(target, work, with_edge_support(target.describer, crops, some))
+        return features_of(target, work, some)
 
     siblings = Siblings.of(poses[best], symmetries.transforms, target.describer, crops, measure)
     kept = siblings.best()

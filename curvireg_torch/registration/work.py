@@ -16,7 +16,14 @@ from ..matching import Ranking
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .inputs import ImageItem
-from .poses import Poses, compare_with_photograph, fit_poses, landmark_evidence, pose_features
+from .poses import (
+    Poses,
+    compare_with_photograph,
+    contours_of,
+    fit_poses,
+    landmark_evidence,
+    pose_features,
+)
 from .priors import Limits
 from .result import FailedRegistration
 from .target import Target, nearest_view
@@ -121,7 +128,8 @@ def features_of(target: Target, work: Work, poses: Poses) -> Tensor:
         if work.landmarks is None
         else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
     )
-    return pose_features(poses, similarity, appearance, landmarks)
+    contours = None if work.crops is None else contours_of(target.describer, work.crops, poses)
+    return pose_features(poses, similarity, appearance, landmarks, contours)
 
 
 def fitted_poses(

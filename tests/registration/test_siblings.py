@@ -46,15 +46,29 @@ def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
     family = four(rows, equal, [0, 20, 100, 200])
     fitted = torch.tensor([evidence(0.9)], dtype=torch.float64)
     column = POSE_FEATURES.index("similarity")
-    poses, features = family.rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[2]), "the nearer one is no rival"
-    assert float(features[0, column]) == pytest.approx(0.8)
+    rival = family.rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
+    assert float(rival.features[0, column]) == pytest.approx(0.8)
+    assert not rival.feature_is_hidden
     alike = family.look_different.clone()
     alike[0, 2] = False
-    poses, features = replace(family, look_different=alike).rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[3])
-    assert float(features[0, column]) == pytest.approx(0.7)
-    assert replace(family, look_different=torch.zeros(4, 4) > 0).rival(0, fitted) is None
+    rival = replace(family, look_different=alike).rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[3])
+    assert float(rival.features[0, column]) == pytest.approx(0.7)
+    assert rival.feature_is_hidden
     told = [[0.0] * 4, [0.0] * 4, [-0.5, 0, 0, 0], [-2.0, 0, 0, 0]]
-    _, features = four(rows, told, [0, 20, 100, 200]).rival(0, fitted)
-    assert float(features[0, POSE_FEATURES.index("details")]) == -0.5
+    rival = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
+    assert float(rival.features[0, POSE_FEATURES.index("details")]) == -0.5
+
+
+def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
+    rows = [evidence(s) for s in (0.80, 0.79, 0.70)]
+    family = four(rows, [[0.0] * 3] * 3, [0, 20, 100])
+    family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
+    fitted = torch.tensor([evidence(0.9)], dtype=torch.float64)
+    small = family.rival(0, fitted, notable=False)
+    assert len(small.poses) == len(small.features) == 0
+    assert small.feature_is_hidden
+    notable = family.rival(0, fitted, notable=True)
+    assert torch.equal(notable.poses.T[0], family.poses.T[2])
+    assert notable.feature_is_hidden
