@@ -184,10 +184,10 @@ def test_landmarks_decide_where_most_of_the_object_is_hidden():
 
 
 def test_many_landmarks_outweigh_what_an_occluder_takes_away_and_one_does_not():
-    seen = [0.0, 0.4, 0.3, 0.0, 0.0, 0.0]
-    hidden = [0.0, 0.1, 0.1, -4.0, math.log1p(20), 0.0]
-    fits = [0.0, 0.8, 0.5, 0.0, 0.0, 0.0]
-    nearly = [0.0, 0.6, 0.3, -0.5, math.log1p(1), 0.0]
+    seen = [0.0, 0.4, 0.3, 0.0, 0.0, 0.0, 0.3]
+    hidden = [0.0, 0.1, 0.1, -4.0, math.log1p(20), 0.0, 0.1]
+    fits = [0.0, 0.8, 0.5, 0.0, 0.0, 0.0, 0.5]
+    nearly = [0.0, 0.6, 0.3, -0.5, math.log1p(1), 0.0, 0.3]
     counts = torch.tensor([0.0, 1.0, 2.0, 3.0, 22.0])
     torch.testing.assert_close(
         landmark_evidence(counts).expm1(), torch.tensor([0.0, 0.0, 0.0, 1.0, 20.0])

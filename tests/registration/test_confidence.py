@@ -92,6 +92,7 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
         "similarity": 0.7,
         "margin": 0.0,
         "edge_support": 0.5,
+        "contours": 0.4,
         "concentration": 0.3,
         "landmarks": 1.0,
     }
@@ -106,9 +107,9 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 def test_confidence_features():
     evidence = torch.tensor(
         [
-            [0.0, 0.7, 0.4, 1.0, 2.0, 0.5],
-            [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0],
-            [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0],
+            [0.0, 0.7, 0.4, 1.0, 2.0, 0.5, 0.9],
+            [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0, 0.8],
+            [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0, 1.0],
         ]
     ).double()
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
@@ -117,6 +118,7 @@ def test_confidence_features():
         "similarity": 0.7,
         "margin": 2.5,
         "edge_support": 0.4,
+        "contours": 0.9,
         "concentration": 0.3,
         "landmarks": 2.0,
         **doubts,

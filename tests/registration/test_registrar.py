@@ -148,7 +148,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, 4))
+    features = F.pad(similarity[:, None], (1, len(poses_module.POSE_FEATURES) - 2))
     outside = torch.tensor([False, False, True, False])
     assert refits.best_inside(features, outside).tolist() == [1]
 
@@ -193,7 +193,13 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
         )
         return other if options.get("again") else fitted
 
+    def contours(describer, crops, poses):
+        mine = poses.edge_support == support
+        return torch.where(mine, 2.0 * support, contours_of(describer, crops, poses))
+
+    contours_of = work.contours_of
     monkeypatch.setattr(work, "fit_poses", pretended)
+    monkeypatch.setattr(work, "contours_of", contours)
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 
