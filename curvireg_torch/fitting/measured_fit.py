@@ -2,12 +2,13 @@
 determine."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..rendering.contours import MeshContours
+from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import pixels, pose_covariance
@@ -27,7 +28,7 @@ CHANCE_DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
-class ContourFit:
+class ContourFit(Rows):
     """N poses fitted to photographs.
 
     Attributes:
@@ -45,9 +46,6 @@ class ContourFit:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
-
-    def __getitem__(self, index: Tensor) -> "ContourFit":
-        return ContourFit(*(getattr(self, f.name)[index] for f in fields(ContourFit)))
 
     @property
     def trustworthy(self) -> Tensor:

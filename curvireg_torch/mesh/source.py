@@ -78,7 +78,7 @@ class ReadMesh:
         colours = None
         if any(part.colours is not None for part in parts):
             known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
-            colours = SurfaceColours.concatenate(known)
+            colours = SurfaceColours.cat(known)
         return cls(vertices, faces, colours, unit, up)
 
 

@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..evidence import Evidence, EvidenceWeights
 from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
 from .confidence import RIVAL_ANGLE
-from .poses import POSE_FEATURES, Poses, placed, pose_scores
+from .described import evidence_of
+from .poses import Poses, placed
 from .refits import best_inside
 from .target import Target
-from .work import Work, features_of, fitted_poses, with_replaced
+from .work import Work, fitted_poses, with_replaced
 
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
 
@@ -26,14 +28,20 @@ class Rival:
 
     Attributes:
         poses: of it, one; none if it is the same pose of a symmetric mesh.
-        features: (1, F) :data:`.POSE_FEATURES`, or (0, F).
+        evidence: of as many poses.
         feature_is_hidden: whether a small feature of the mesh tells the siblings apart, and the
             photograph does not show it.
     """
 
     poses: Poses
-    features: Tensor
+    evidence: Evidence
     feature_is_hidden: bool = False
+
+    @classmethod
+    def none(cls, poses: Poses, evidence: Evidence) -> "Rival":
+        """No rival of these poses."""
+        nothing = torch.zeros(0, dtype=torch.long)
+        return cls(poses[nothing], evidence[nothing])
 
 
 @dataclass(frozen=True)
@@ -42,15 +50,17 @@ class Siblings:
 
     Attributes:
         poses: of them.
-        features: (K, F) :data:`.POSE_FEATURES`, all measured in the same way, without a fit.
+        evidence: of them, all measured in the same way, without a fit.
         details: (K, K) :func:`.compare_details` of the row with the column.
         look_different: (K, K) bool.
+        weights: of evidence.
     """
 
     poses: Poses
-    features: Tensor
+    evidence: Evidence
     details: Tensor
     look_different: Tensor
+    weights: EvidenceWeights
 
     @staticmethod
     def of(
@@ -58,20 +68,21 @@ class Siblings:
         symmetries: Tensor,
         describer: ViewDescriber,
         crops: EdgeCrops,
-        measure: Callable[[Poses], Tensor],
+        measure: Callable[[Poses], Evidence],
+        weights: EvidenceWeights,
     ) -> "Siblings":
         """Siblings of one pose by ``symmetries`` (K, 4, 4), the identity first; ``measure`` gives
-        features."""
+        evidence."""
         copies = pose[torch.zeros(len(symmetries), dtype=torch.long)]
         poses = placed(copies, copies.T @ symmetries.to(copies.T), describer.centre)
         details = compare_details(
             describer.contours, crops, poses.cameras, poses.T, poses.crop_index
         )
-        return Siblings(poses, measure(poses), *details)
+        return Siblings(poses, measure(poses), *details, weights=weights)
 
     def gain(self, other: int) -> Tensor:
         """(K,) by how much siblings score more than the ``other`` one."""
-        scores = pose_scores(self.features, exact=True)
+        scores = self.evidence.scores(self.weights)
         return scores - scores[other] + self.details[:, other]
 
     def best(self) -> int:
@@ -80,12 +91,12 @@ class Siblings:
         best = int(gain.argmax())
         return best if float(gain[best]) > BETTER else 0
 
-    def rival(self, best: int, fitted: Tensor, *, notable: bool) -> Rival:
+    def rival(self, best: int, fitted: Evidence, *, notable: bool) -> Rival:
         """The sibling with the highest score among those that differ from the ``best`` one in the
         photograph, or in a ``notable`` feature of the mesh that it does not show.
 
-        Its features are those of the best one as it was ``fitted`` (1, F), plus their difference
-        without a fit.
+        Its evidence is that of the best one as it was ``fitted``, plus their difference without a
+        fit.
         """
         angle = rotation_error(self.poses.T[:, :3, :3], self.poses.T[best, :3, :3])
         far = angle > RIVAL_ANGLE
@@ -94,9 +105,11 @@ class Siblings:
         counted = far if notable else different
         some = counted.nonzero()[:, 0]
         chosen = some[self.gain(best)[some].argsort(descending=True)[:1]]
-        features = fitted + self.features[chosen] - self.features[best]
-        features[:, POSE_FEATURES.index("details")] += self.details[chosen, best]
-        return Rival(self.poses[chosen], features, bool(alike.any()))
+        gained = fitted.table + self.evidence[chosen].table - self.evidence[best].table
+        evidence = Evidence.from_table(gained)
+        details = evidence.details + self.details[chosen, best]
+        evidence = replace(evidence, details=details)
+        return Rival(self.poses[chosen], evidence, bool(alike.any()))
 
 
 def with_siblings(
@@ -104,27 +117,30 @@ def with_siblings(
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     outside: Tensor,
-) -> tuple[Poses, Tensor, Rival]:
+) -> tuple[Poses, Evidence, Rival]:
     """Replace the best pose by what a symmetry of the shape makes of it, if small features say so;
     and return its strongest rival among these. Given symmetries are trusted."""
     symmetries = target.telling_symmetries
     if len(symmetries) == 1:
-        return poses, features, Rival(poses[:0], features[:0])
-    best = best_inside(features, outside)
+        return poses, evidence, Rival.none(poses, evidence)
+    best = best_inside(target, evidence, outside)
 
-    def measure(some: Poses) -> Tensor:
-        return features_of(target, work, some)
+    def measure(some: Poses) -> Evidence:
+        return evidence_of(target, work, some)
 
-    siblings = Siblings.of(poses[best], symmetries.transforms, target.describer, crops, measure)
+    weights = target.score_weights(exact=True)
+    siblings = Siblings.of(
+        poses[best], symmetries.transforms, target.describer, crops, measure, weights
+    )
     kept = siblings.best()
     if kept:
         fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], again=True)
-        new = features_of(target, work, fitted)
-        poses, features = with_replaced(work, poses, features, best, fitted, new)
-    rival = siblings.rival(kept, features[best], notable=symmetries.notable)
+        new = evidence_of(target, work, fitted)
+        poses, evidence = with_replaced(work, poses, evidence, best, fitted, new)
+    rival = siblings.rival(kept, evidence[best], notable=symmetries.notable)
     if work.limits is not None:
-        kept_rival = work.limits.keeps(rival.poses)
-        rival = replace(rival, poses=rival.poses[kept_rival], features=rival.features[kept_rival])
-    return poses, features, rival
+        allowed = work.limits.keeps(rival.poses)
+        rival = replace(rival, poses=rival.poses[allowed], evidence=rival.evidence[allowed])
+    return poses, evidence, rival

@@ -31,7 +31,7 @@ def roof(*, ridges: int = 1) -> trimesh.Trimesh:
 
 
 def photograph(*, line: float = 0.0, noise: float = 0.0) -> Tensor:
-    """(3, 200, 200) a bright square at the plate's place, whose right half is darker by ``line``."""
+    """(3, 200, 200) a bright square where the plate is, its right half darker by ``line``."""
     image = torch.full((3, 200, 200), 0.2)
     image[:, 50:150, 50:150] = 0.8
     image[:, 50:150, 100:150] -= line

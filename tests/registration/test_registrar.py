@@ -1,11 +1,10 @@
 import math
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import cv2
 import pytest
 import torch
-import torch.nn.functional as F
 import trimesh
 
 from curvireg_torch import (
@@ -17,12 +16,20 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, photograph, refits, work
+from curvireg_torch.registration import (
+    FailedRegistration,
+    Follower,
+    photograph,
+    refits,
+    work,
+)
+from curvireg_torch.registration import described as described_module
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration import result as result_module
@@ -148,9 +155,11 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, len(poses_module.POSE_FEATURES) - 2))
+    nothing = torch.zeros_like(similarity)
+    evidence = Evidence(*[nothing] * len(fields(Evidence)))
+    evidence = replace(evidence, similarity=similarity)
     outside = torch.tensor([False, False, True, False])
-    assert refits.best_inside(features, outside).tolist() == [1]
+    assert refits.best_inside(truck_registrar(), evidence, outside).tolist() == [1]
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
@@ -163,19 +172,19 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
     quick_fit = contour_fit.quick_fit
     fits = []
     described = []
-    compare = work.compare_with_photograph
+    measure = Evidence.of
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return quick_fit(contours, crops, K, T, *index)
 
-    def compared(*given):
-        described.append(len(given[-1]))
-        return compare(*given)
+    def measured(seen):
+        described.append(len(seen.rank))
+        return measure(seen)
 
     for module in (contour_fit, poses_module):
         monkeypatch.setattr(module, "quick_fit", counted)
-    monkeypatch.setattr(work, "compare_with_photograph", compared)
+    monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
     assert fits == [photograph.SCREENED_VIEWS, 1]
@@ -193,13 +202,13 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
         )
         return other if options.get("again") else fitted
 
-    def contours(describer, crops, poses):
-        mine = poses.edge_support == support
-        return torch.where(mine, 2.0 * support, contours_of(describer, crops, poses))
+    def contours(compared):
+        mine = compared.poses.edge_support == support
+        return torch.where(mine, 2.0 * support, measure(compared))
 
-    contours_of = work.contours_of
+    measure = described_module.ComparedPoses.contours.fget
     monkeypatch.setattr(work, "fit_poses", pretended)
-    monkeypatch.setattr(work, "contours_of", contours)
+    monkeypatch.setattr(described_module.ComparedPoses, "contours", property(contours))
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 
