@@ -17,6 +17,7 @@ from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .options import (
+    BOXES,
     PHOTOGRAPH,
     add_command,
     add_limits,
@@ -112,8 +113,7 @@ def add_register(commands: Any) -> None:
     add_options(
         parser,
         *PHOTOGRAPH,
-        "box_format",
-        "boxes",
+        *BOXES,
         "start",
         "start_convention",
         "instances",
