@@ -482,9 +482,13 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         return
     poses = zip(document["hypotheses"], document["probabilities"], strict=False)
     rivals = list(poses)[1:]
-    for rival, probability in rivals:
-        if probability >= RIVAL_FRACTION * document["confidence"]:
-            print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
+    least = RIVAL_FRACTION * document["confidence"]
+    likely = [(rival, probability) for rival, probability in rivals if probability >= least]
+    if not likely:
+        print("right up to turns that only a small feature tells apart, which is not in view")
+        return
+    for rival, probability in likely:
+        print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
         "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",

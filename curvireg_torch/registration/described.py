@@ -11,6 +11,7 @@ from ..evidence import Evidence
 from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
 from ..fitting.landmarks import LandmarkMatches
+from ..fitting.measured_fit import contour_evidence
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
 from .poses import Poses
@@ -74,6 +75,15 @@ class ComparedPoses:
         if landmarks is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
         return landmarks.agreeing(self.poses.T, self.poses.cameras)
+
+    @property
+    def contours(self) -> Tensor:
+        crops = self.photograph.crops
+        poses = self.poses
+        if crops is None:
+            return torch.zeros(len(poses), dtype=torch.float64)
+        contours = self.target.describer.contours
+        return contour_evidence(contours, crops, poses.cameras, poses.T, poses.crop_index)
 
     @cached_property
     def _views(self) -> tuple[Tensor, Tensor | None]:

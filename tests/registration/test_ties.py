@@ -131,7 +131,7 @@ def test_telling_symmetries_are_those_that_a_feature_breaks():
     assert fractions[0] == 0.0
     assert bool((fractions[1:] > FEATURE_FRACTION).all())
     telling = telling_symmetries(marked_box(), group)
-    assert torch.equal(telling[0], torch.eye(4).double())
+    assert torch.equal(telling.transforms[0], torch.eye(4).double())
     assert len(telling) == 4
 
 
