@@ -12,10 +12,6 @@ from .utils.rows import Rows
 
 __all__ = ["Evidence", "EvidenceWeights", "SeenPoses"]
 
-CHANCE_KEYPOINTS = 2
-"""Keypoints that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses
-have no more."""
-
 
 @dataclass(frozen=True)
 class EvidenceWeights:
@@ -67,7 +63,7 @@ class SeenPoses(Protocol):
 
     @property
     def keypoints(self) -> Tensor:
-        """Number of keypoints that agree with a pose."""
+        """Number of keypoints that agree with a pose, beyond those that agree by chance."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +79,8 @@ class Evidence(Rows):
         similarity: normalised correlation of the pose's view with the photograph.
         edge_support: of the fitted pose; 0 without the contour fit.
         appearance: log appearance score of the pose; 0 without that term.
-        landmarks: log (1 + n) with the number n of keypoints that agree with the pose, beyond
-            ``CHANCE_KEYPOINTS``; 0 without colours, camera or contour fit, with a similar mesh, and
+        landmarks: log (1 + n) with the number n of keypoints that agree with the pose, beyond those
+            that agree by chance; 0 without colours, camera or contour fit, with a similar mesh, and
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
@@ -105,7 +101,7 @@ class Evidence(Rows):
             similarity=seen.similarity,
             edge_support=seen.edge_support.nan_to_num(0.0),
             appearance=seen.appearance.double(),
-            landmarks=keypoint_evidence(seen.keypoints),
+            landmarks=seen.keypoints.log1p(),
             details=torch.zeros_like(seen.similarity),
         )
 
@@ -140,8 +136,3 @@ class Evidence(Rows):
     def named(self, h: int) -> dict[str, float]:
         """The evidence of pose ``h`` by name, as a hypothesis reports it."""
         return {name: float(column[h]) for name, column in self.columns().items()}
-
-
-def keypoint_evidence(count: Tensor) -> Tensor:
-    """(H,) :attr:`Evidence.landmarks` of numbers of keypoints that agree."""
-    return (count - CHANCE_KEYPOINTS).clamp(min=0.0).log1p()

@@ -73,7 +73,8 @@ class ComparedPoses:
         landmarks = self.photograph.landmarks
         if landmarks is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
-        return landmarks.agreeing(self.poses.T, self.poses.cameras)
+        count = landmarks.agreeing(self.poses.T, self.poses.cameras)
+        return (count - self.target.pipeline.fit.chance_keypoints).clamp(min=0.0)
 
     @cached_property
     def _views(self) -> tuple[Tensor, Tensor | None]:

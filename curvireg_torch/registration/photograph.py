@@ -17,8 +17,6 @@ from .focal import FINISHED
 from .inputs import ImageItem, check_crop
 from .judging import judged
 from .poses import (
-    FINISHED_FITS,
-    SCREENING_WEIGHT,
     Poses,
     best_views,
     common_score,
@@ -48,10 +46,6 @@ from .work import (
     poses_of_views,
     with_replaced,
 )
-
-SCREENED_VIEWS = 10
-"""Number of the best distinct views of an exact mesh that get a short contour fit, which decides
-with their rank which become hypotheses."""
 
 
 def register_item(target: Target, item: ImageItem) -> Registration:
@@ -98,7 +92,7 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
             poses = poses.replaced(
                 unknown, with_quick_fit(target.describer, work.crops, poses[unknown])[0]
             )
-        finish = FINISHED_FITS if work.starts is None else FINISHED
+        finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
     evidence = evidence_of(target, work, poses)
     sibling: tuple[Poses, Evidence] | None = None
@@ -112,7 +106,9 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         poses, evidence = _with_texture(target, work, work.crops, poses, evidence, outside)
     inside = (~outside).nonzero()[:, 0]
     scores = evidence[inside].scores(target.score_weights(exact=work.exact))
-    distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
+    angle = target.pipeline.fit.same_pose_angle
+    found = distinct_poses(poses[inside], scores, work.symmetries, angle=angle)
+    distinct = outside.index_copy(0, inside, found)
     # Unlike another view, these started near the pose that they merged with: they are no
     # rivals.
     other = (distinct | ~repeated).nonzero()[:, 0]
@@ -199,7 +195,9 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
 def _promising(target: Target, work: Work) -> Poses:
     """Poses of the most promising distinct views."""
     count = least_starts(target)
-    screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
+    screened = count
+    if work.crops is not None and work.exact:
+        screened = max(target.pipeline.fit.screened_views, count)
     view, rank = best_views(work.ranking, target.bank, count=screened, symmetries=work.symmetries)
     poses = poses_of_views(target, work, view, rank)
     if work.limits is not None:
@@ -213,7 +211,7 @@ def _screened(target: Target, crops: EdgeCrops, poses: Poses, count: int) -> Pos
     """The ``count`` poses with the largest sum of rank and weighted edge support after a short
     fit, best first."""
     poses, support = with_quick_fit(target.describer, crops, poses)
-    score = poses.rank + SCREENING_WEIGHT * support
+    score = poses.rank + target.pipeline.fit.screening_weight * support
     return poses[score.argsort(descending=True, stable=True)[:count]]
 
 

@@ -52,8 +52,8 @@ CONVENTIONS = {  # docs/results.md describes all keys
     "orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose "
-    f"is a guess",
+    "reliable": "confidence of at least pipeline.fit.reliable, and nothing questionable; false = "
+    "the pose is a guess",
     "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: "
     "R_true = exp([w]x) R, "
     "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
@@ -221,6 +221,7 @@ class Registration:
             of several photographs.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and
             covariance are then ``T_world_from_model``, along the world's axes.
+        reliable_from: confidence from which it is called reliable.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -236,6 +237,7 @@ class Registration:
     model: int = 0
     camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
+    reliable_from: float = RELIABLE
 
     ok = True
     """False of a :class:`FailedRegistration`."""
@@ -275,12 +277,12 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``, without ``warnings`` or a better pose
-        outside the prior, and the contours determine at least one axis of rotation; if False, the
-        pose is a guess."""
+        """Whether the confidence is at least ``reliable_from``, without ``warnings`` or a better
+        pose outside the prior, and the contours determine at least one axis of rotation; if False,
+        the pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
-        if self.confidence is None or not self.confidence >= RELIABLE or doubtful:
+        if self.confidence is None or not self.confidence >= self.reliable_from or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True

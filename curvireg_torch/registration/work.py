@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches
+from ..fitting.landmarks import LandmarkMatches
 from ..fitting.measured_fit import measure_contours
 from ..utils.threads import map_on_threads
 from .described import DescribedPhotograph
@@ -20,14 +20,6 @@ from .poses import Poses, fit_poses
 from .priors import Limits
 from .result import FailedRegistration
 from .target import Target, nearest_view
-
-MIN_REFINED = 3
-"""Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on
-rivals. Of 15 photographs of another object, 14 were called reliable with one hypothesis, 2 with
-two, none with three or five."""
-
-# Fraction of the landmarks that agree with a start, which must agree with its fit as well
-KEPT_LANDMARKS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +68,7 @@ def map_items(
 
 
 def least_starts(target: Target) -> int:
-    return max(MIN_REFINED, target.pipeline.hypotheses)
+    return max(target.pipeline.fit.least_hypotheses, target.pipeline.hypotheses)
 
 
 def poses_of_views(target: Target, work: Work, view: Tensor, rank: Tensor) -> Poses:
@@ -118,11 +110,13 @@ def fitted_poses(
 ) -> Poses:
     """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that
     agree with it."""
-    poses = fit_poses(target.describer, crops, starts, **options)
+    settings = target.pipeline.fit
+    poses = fit_poses(target.describer, crops, starts, settings=settings, **options)
     if work.landmarks is not None:
         before = work.landmarks.agreeing(starts.T, starts.cameras)
         after = work.landmarks.agreeing(poses.T, poses.cameras)
-        left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
+        is_left = (before >= settings.min_keypoints) & (after < settings.kept_keypoints * before)
+        left = is_left.nonzero()[:, 0]
         if len(left):
             kept = starts[left]
             seen = measure_contours(
