@@ -43,7 +43,16 @@ RANK_ALONE = EvidenceWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SeenPoses(Protocol):
-    """H poses of an object beside a photograph: what evidence is read from, each (H,) float64."""
+    """H poses of an object beside a photograph: what evidence is read from, each (H,) float64.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> names = ("rank", "similarity", "edge_support", "appearance", "keypoints")
+        >>> seen = SimpleNamespace(**dict.fromkeys(names, one))
+        >>> Evidence.of(seen).similarity.tolist()
+        [1.0]
+    """
 
     @property
     def rank(self) -> Tensor:
@@ -84,6 +93,12 @@ class Evidence(Rows):
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
+
+    Example:
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> evidence = Evidence(-one, 0.7 * one, 0.5 * one, 0.0 * one, 0.0 * one, 0.0 * one)
+        >>> evidence.named(0)["edge_support"], evidence.scores(EvidenceWeights()).tolist()
+        (0.5, [12.0])
     """
 
     rank: Tensor

@@ -145,6 +145,10 @@ class BankSettings:
             defaults.
         grid, bins, block, clip: of :func:`hog`.
         point_fraction: of :func:`field_points`.
+
+    Example:
+        >>> BankSettings(image_size=64).grid
+        8
     """
 
     image_size: int = 128
@@ -185,6 +189,10 @@ class DetectionSettings:
         min_size: longer side of the smallest object that is searched for, as a fraction of the
             photograph's.
         proposals: number of boxes that are compared with all views of the bank.
+
+    Example:
+        >>> replace(Pipeline(), detection=DetectionSettings(proposals=40)).detection.views
+        96
     """
 
     views: int = 96

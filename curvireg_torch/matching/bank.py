@@ -59,6 +59,14 @@ class ViewBank:
             Meshes with colours have grey features followed by coloured ones.
         described_views_file: where those of a large bank are kept, as views are described; None
             keeps them in memory.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> mesh = cr.synthetic.example_mesh()
+        >>> bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
+        >>> len(bank), bank.rotations.shape
+        (6, torch.Size([6, 3, 3]))
     """
 
     described_views_file: Path | None = None

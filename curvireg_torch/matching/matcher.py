@@ -56,6 +56,15 @@ class Ranking:
             aspect ratios in [0, 1], best view 1.
         allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,)
             the best of the others more than 30 degrees from the best view, or -1.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> ranking = cr.ViewMatcher(bank)([scene.image], [scene.box])
+        >>> ranking.scores.shape, ranking.top(2).shape
+        (torch.Size([1, 6]), torch.Size([1, 2]))
     """
 
     scores: Tensor
@@ -104,6 +113,12 @@ def distinct_views(
 
     Returns:
         (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> R = rotation_from_viewpoint(torch.tensor([0.0, 10.0, 90.0]), 0.0)
+        >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
+        [1, 2]
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)

@@ -66,6 +66,16 @@ def refine(
     Raises:
         InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid
             and finite, or a confidence that is no probability.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> start = scene.truth
+        >>> (found,) = refine(cr.Registrar(bank), [scene.image], scene.camera_matrix, [start])
+        >>> found.ok, len(found.hypotheses)
+        (True, 1)
     """
     check_cameras(images, camera_matrices, "refine")
     items = image_items(images, None, camera_matrices)
