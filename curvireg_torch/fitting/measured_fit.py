@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from ..rendering.contours import MeshContours
+from ..rendering.contours import Contours
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import pose_covariance
@@ -67,7 +67,7 @@ def measured_fit(
 
 @torch.no_grad()
 def measure_contours(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> ContourFit:
     """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay
     as they are."""
@@ -79,7 +79,7 @@ def measure_contours(
 
 @torch.no_grad()
 def contour_support(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
     fitted ones."""

@@ -69,7 +69,7 @@ def register_item(target: Target, item: ImageItem) -> Registration:
 
 
 def _register_box(target: Target, item: ImageItem) -> Registration:
-    query = target.matcher.query([item.image], item.box[None])
+    query = target.matcher.query_together(item.image, item.box)
     check_crop(query.crops[0])
     return register(target, item, query)
 
@@ -143,7 +143,9 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     target.report_progress("ranking")
     exact = target.is_exact
     limits = None if item.prior is None else limits_of(target, item)
-    ranking = target.matcher.rank(query, None if limits is None else limits.allowed()[None])
+    ranking = target.matcher.rank_together(
+        query, None if limits is None else limits.allowed()[None]
+    )
     symmetries = target.symmetries_of(exact=exact)
     crops = None
     if target.pipeline.contours:

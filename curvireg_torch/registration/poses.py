@@ -10,15 +10,20 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..fitting.contour_fit import fit_to_edges, quick_fit
 from ..fitting.contour_problem import ContourProblem
-from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit
 from ..fitting.texture_fit import fit_texture, turned
+from ..fitting.together import (
+    details_together,
+    fit_together,
+    quick_fit_together,
+    support_together,
+)
 from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..terms import Appearance, QueryFeatures
+from ..utils.company import by_key, compute_together
 from .confidence import are_near
 from .result import Hypothesis
 from .target import Target
@@ -203,16 +208,17 @@ def best_views(
     order = ranking.order[0]
     if ranking.allowed is not None:
         order = order[ranking.allowed[0][order]]
-    view = distinct_views(order, bank.rotations, count=count, symmetries=symmetries).cpu()
+    rotations = bank.views.rotations  # on the CPU, in the precision of bank.rotations
+    view = distinct_views(order, rotations, count=count, symmetries=symmetries).cpu()
     log = ranking.scores[0].cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
     return view, log[view] - log.max()
 
 
 def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
     return poses.with_fit(
-        fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
+        fit_together(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
     )
 
 
@@ -221,7 +227,8 @@ def with_quick_fit(
 ) -> tuple[Poses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`quick_fit`."""
-    T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    T, support = quick_fit_together(*given)
     return replace(poses, quick=T), support
 
 
@@ -244,7 +251,8 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Poses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    support = contour_support(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    support = support_together(*given)
     return replace(poses, edge_support=support)
 
 
@@ -266,13 +274,53 @@ def compare_with_photograph(
     photograph that is described as ``query`` and, on a grid twice as fine as the bank's, by
     ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that
     term."""
-    if Appearance.name not in ranking.terms:
-        similarity = similarities(target.describer.descriptors(rotation, distance), descriptor)
-        return similarity, torch.zeros_like(similarity)
+    request = _Comparison(target, query, descriptor, ranking, rotation, distance)
+    return compute_together(_compared, request)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """The arguments of :func:`compare_with_photograph`."""
+
+    target: Target
+    query: QueryFeatures
+    descriptor: Tensor
+    ranking: Ranking
+    rotation: Tensor
+    distance: Tensor
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        return id(self.target.describer), Appearance.name in self.ranking.terms
+
+
+def _compared(requests: Sequence[_Comparison]) -> list[tuple[Tensor, Tensor]]:
+    return by_key(requests, lambda request: request.key, _compared_with_one_mesh)
+
+
+def _compared_with_one_mesh(requests: Sequence[_Comparison]) -> list[tuple[Tensor, Tensor]]:
+    target = requests[0].target
+    counts = [len(request.rotation) for request in requests]
+    rotation = torch.cat([request.rotation for request in requests])
+    distance = torch.cat([request.distance for request in requests])
+    described = [request.descriptor.expand(len(request.rotation), -1) for request in requests]
+    descriptors = torch.cat(described) if len(requests) > 1 else requests[0].descriptor
+    if Appearance.name not in requests[0].ranking.terms:
+        views = target.describer.descriptors(rotation, distance)
+        similarity = similarities(views, descriptors)
+        return [(part, torch.zeros_like(part)) for part in similarity.split(counts)]
     views, pictures = target.describer.described(rotation, distance)
-    return similarities(views, descriptor), target.matcher.appearance_score(
-        query, ranking, pictures
+    features = target.matcher.appearance_of(pictures)
+    parts = zip(
+        requests,
+        similarities(views, descriptors).split(counts),
+        features.split(counts),
+        strict=True,
     )
+    return [
+        (part, target.matcher.appearance_score(request.query, request.ranking, pictures))
+        for request, part, pictures in parts
+    ]
 
 
 def pose_features(
@@ -303,7 +351,8 @@ def with_details(
     """Features (H, F) in which ``rivals`` (R,) are compared in detail with the ``best`` pose."""
     index = torch.cat([torch.tensor([best]), rivals])
     some = poses[index]
-    scores, _ = compare_details(describer.contours, crops, some.cameras, some.T, some.crop_index)
+    given = describer.device_contours, crops, some.cameras, some.T, some.crop_index
+    scores, _ = details_together(*given)
     column = POSE_FEATURES.index("details")
     features = features.clone()
     features[rivals, column] = features[best, column] + scores[1:, 0].to(features)

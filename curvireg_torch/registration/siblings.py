@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
+from ..fitting.together import details_together
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
 from .confidence import RIVAL_ANGLE
@@ -48,8 +48,8 @@ class Siblings:
         features."""
         copies = pose[torch.zeros(len(symmetries), dtype=torch.long)]
         poses = placed(copies, copies.T @ symmetries.to(copies.T), describer.centre)
-        details = compare_details(
-            describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+        details = details_together(
+            describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
         )
         return Siblings(poses, measure(poses), *details)
 

@@ -14,6 +14,8 @@ from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches
 from ..fitting.measured_fit import measure_contours
 from ..matching import Ranking
 from ..terms import QueryFeatures
+from ..utils.company import map_in_company
+from ..utils.precision import exact_convolutions
 from ..utils.threads import map_on_threads
 from .inputs import ImageItem
 from .poses import Poses, compare_with_photograph, fit_poses, landmark_evidence, pose_features
@@ -57,8 +59,8 @@ def map_items(
     each error.
 
     On a CPU each photograph has a thread, in which torch uses no further ones: its result is
-    the same to the bit, whatever else is registered. Items are read on demand, so that few
-    photographs are in memory.
+    the same to the bit, whatever else is registered. On other devices, what the photographs need
+    is computed together. Items are read on demand, so that few photographs are in memory.
     """
     target.share()
 
@@ -71,7 +73,10 @@ def map_items(
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 
-    return map_on_threads(run, range(len(items)), device=target.bank.device)
+    if target.bank.device.type == "cpu":
+        return map_on_threads(run, range(len(items)))
+    with exact_convolutions():
+        return map_in_company(run, range(len(items)))
 
 
 def least_starts(target: Target) -> int:
