@@ -113,11 +113,12 @@ def synthesize_photograph(
     *,
     background: Tensor | None = None,
     texture: float = 0.35,
+    defocus: float = DEFOCUS,
 ) -> tuple[Tensor, Tensor]:
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box
     (4,) in px. ``texture`` is the contrast of a random solid pattern; a mesh whose colours vary
-    shows those instead. The background (3, H, W), default :func:`procedural_background`, is out of
-    focus."""
+    shows those instead. The background (3, H, W), default :func:`procedural_background`, is blurred
+    by ``defocus`` px."""
     H, W = size
     # Supersampling by two.
     K = (
@@ -132,7 +133,11 @@ def synthesize_photograph(
         raise InvalidInputError(
             "T_cam_from_model: expected a pose that shows the object, but no pixel does"
         )
-    v, u = torch.meshgrid(torch.arange(2.0 * H), torch.arange(2.0 * W), indexing="ij")
+    # the object's rows and columns, and one more on each side for the differences
+    high = slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2)
+    wide = slice(max(int(columns[0]) - 1, 0), int(columns[-1]) + 2)
+    depth = depth[high, wide]
+    v, u = torch.meshgrid(torch.arange(2.0 * H)[high], torch.arange(2.0 * W)[wide], indexing="ij")
     points = depth[..., None] * (
         torch.stack([u, v, torch.ones_like(u)], dim=-1).double() @ torch.linalg.inv(K).T
     )
@@ -151,7 +156,8 @@ def synthesize_photograph(
         model @ waves + 6.3 * torch.rand(4, generator=generator, dtype=torch.float64)
     ).mean(dim=-1)
     colour = 0.3 + 0.6 * torch.rand(3, generator=generator, dtype=torch.float64)
-    surface = shade[..., None] * colour * (1.0 + texture * pattern[..., None])
+    surface = torch.zeros(2 * H, 2 * W, 3, dtype=torch.float64)
+    surface[high, wide] = shade[..., None] * colour * (1.0 + texture * pattern[..., None])
     coverage = F.avg_pool2d(mask[None, None].float(), 2)[0]
     front = F.avg_pool2d((surface * mask[..., None]).permute(2, 0, 1)[None].float(), 2)[0]
     if has_colours(mesh):  # drawn before white
@@ -159,7 +165,8 @@ def synthesize_photograph(
             render_colour(mesh, T_cam_from_model, camera_matrix, size)[0] - (1.0 - coverage)
         ).clamp(min=0.0)
     back = procedural_background(size, generator) if background is None else background
-    image = front + (1.0 - coverage) * gaussian_smooth(back[None], DEFOCUS)[0]
+    blurred = gaussian_smooth(back[None], defocus)[0] if defocus > 0.0 else back
+    image = front + (1.0 - coverage) * blurred
     image = image + 0.01 * torch.randn(3, H, W, generator=generator)
     # Outer borders of the outermost pixels, converted from the fine grid to the picture's.
     box = torch.tensor(

@@ -22,14 +22,15 @@ version = release = curvireg_torch.__version__
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "myst_parser",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
+    "mathml",
 ]
-exclude_patterns = ["_build", "gallery"]
+exclude_patterns = ["_build", "gallery", "notebooks"]
 nitpicky = True
+html_math_renderer = "mathml"  # nothing is fetched from elsewhere
 
 html_theme = "furo"
 html_title = "curvireg_torch"

@@ -20,7 +20,6 @@ from .options import (
     add_command,
     add_limits,
     add_options,
-    check_viewer,
     input_files,
     register_options,
 )
@@ -222,7 +221,7 @@ def add_view(commands: Any) -> None:
         "curvireg view",
         "curvireg view photo.jpg part.stl --unit mm",
         help="register in the browser: draw the box, inspect the result, correct it",
-        description="Opens a page on this machine; needs pip install -e '.[viewer]'.",
+        description="Opens a page on this machine; needs the extra [viewer].",
         run=view,
     )
     parser.add_argument("photo", type=Path, nargs="?", metavar="PHOTO")
@@ -251,8 +250,7 @@ def view(arguments: argparse.Namespace) -> None:
     if photos and photos[0].suffix.lower() == ".csv":
         message = "a table where a photograph is expected; drop a rig file on the page"
         raise InvalidInputError(message, subject=photos[0])
-    check_given(photos, meshes)
-    check_viewer("view")
+    check_given(photos, meshes, packages=["nicegui"])
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
@@ -282,7 +280,7 @@ def add_plot(commands: Any) -> None:
 
 def draw(arguments: argparse.Namespace) -> None:
     """Register one photograph and draw a picture of the result."""
-    check_given([arguments.photo], [arguments.mesh])
+    check_given([arguments.photo], [arguments.mesh], packages=["matplotlib"])
     if arguments.out.suffix.lower() not in FORMATS:
         raise InvalidInputError(
             f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"

@@ -23,7 +23,6 @@ from .options import (
     add_command,
     add_limits,
     add_options,
-    check_viewer,
     input_files,
     register_options,
 )
@@ -31,6 +30,7 @@ from .options import (
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from ..geometry import Camera
     from ..jobs.options import RegisterOptions
     from ..registration import FailedRegistration, Registrar, Registration
 
@@ -91,7 +91,8 @@ def run(arguments: argparse.Namespace) -> None:
     source = arguments.frames
     out = arguments.out
     live = source.isdecimal() or "://" in source
-    check_given([] if live else [Path(source)], [arguments.mesh])
+    packages = ["nicegui"] if arguments.show else []
+    check_given([] if live else [Path(source)], [arguments.mesh], packages=packages)
     if not live and not Path(source).exists():
         raise MissingFileError(
             "no such folder or video; or give the number of a camera, or rtsp://...", subject=source
@@ -99,14 +100,12 @@ def run(arguments: argparse.Namespace) -> None:
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
-    if options.camera is None and options.guess is None:
+    if options.camera is None and options.guess is None and options.mesh_is == "similar":
         raise InvalidInputError(
-            f"follow: needs the camera, which it does not estimate; give {CAMERA_OPTIONS}"
+            f"follow: needs the camera with --mesh-is similar; give {CAMERA_OPTIONS}"
         )
     if out is None and not (arguments.json or arguments.show):
         raise InvalidInputError("follow: give --out DIR, --show or --json")
-    if arguments.show:
-        check_viewer("follow --show")
     with ExitStack() as stack:
         if out is not None:
             from ..jobs.outputs import output_folder
@@ -148,6 +147,7 @@ class Tally:
     counts: Counter[str] = field(default_factory=Counter)
     first_message: str = ""  # why the first frame has no pose
     seconds_after_first: float = 0.0  # the first frame is registered
+    camera: str = ""  # in words, if its focal length is not known exactly
 
     @property
     def frames(self) -> int:
@@ -173,7 +173,8 @@ class Tally:
         rate = ""
         if self.frames > 1:
             rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
-        return f"{self.frames} frames: {verdict_counts(self.counts)}{rate}"
+        camera = f"; {self.camera}" if self.camera else ""
+        return f"{self.frames} frames: {verdict_counts(self.counts)}{rate}{camera}"
 
 
 def _follow(
@@ -227,6 +228,7 @@ def _follow(
                         (table.path.parent / "overlay.mp4").unlink(missing_ok=True)
                     table.add(_cells(pose))
                 tally.add(pose, took)
+                tally.camera = tally.camera or _camera_in_words(result)
                 if as_json:
                     print(json.dumps(pose, allow_nan=False), flush=True)
                 if video is not None:
@@ -269,7 +271,7 @@ def _poses(
                 image = seen.image
                 box = seen.box
             if follow is None:
-                follow = Follower(registrar, _camera_matrix(options, image), prior=prior)
+                follow = Follower(registrar, _camera(options, image), prior=prior)
                 if (start := options.read_start()) is not None:
                     pose = start_in_unit(start, mesh_unit(registrar.bank.mesh))
                     follow.start(
@@ -285,9 +287,11 @@ def _poses(
         yield name, image, result, time.perf_counter() - begun
 
 
-def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
-    """The given camera matrix, or that of the first frame by its EXIF or the field of view."""
+def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
+    """The given camera without its distortion, or that of the first frame by its EXIF or the field
+    of view; None if it is not known."""
     from ..data import Photo, read_photo
+    from ..geometry import Camera
     from ..jobs.entry import camera_of, entry_of
     from ..jobs.lists import find_photographs
 
@@ -295,10 +299,13 @@ def _camera_matrix(options: "RegisterOptions", image: "Tensor") -> "Tensor":
     photo = Photo(image, 1, None, ())
     if source.is_dir():
         source = find_photographs(source)[0]
-        photo = read_photo(source) if options.guess == "exif" else photo
+        with suppress(CurviregError, OSError):
+            photo = read_photo(source)
     camera, _ = camera_of(entry_of(source, options), photo)
-    assert camera is not None  # the command refuses to start without one
-    return camera.at((image.shape[-2], image.shape[-1])).matrix
+    if camera is None:
+        return None
+    known = camera.at((image.shape[-2], image.shape[-1]))
+    return Camera(known.matrix, focal_deviation=known.focal_deviation, source=known.source)
 
 
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
@@ -367,6 +374,16 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
             file.release()
 
     return frames(), None, file.get(cv2.CAP_PROP_FPS)
+
+
+def _camera_in_words(result: "Registration | FailedRegistration") -> str:
+    """A camera that is not known exactly; "" of one that is, and of a frame without a pose."""
+    from ..registration import FailedRegistration
+    from ..registration.result import focal_length_in_words
+
+    if isinstance(result, FailedRegistration) or result.camera is None:
+        return ""
+    return focal_length_in_words(result.camera.describe())
 
 
 def _document(result: "Registration | FailedRegistration") -> dict[str, Any]:

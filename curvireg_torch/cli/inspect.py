@@ -3,13 +3,21 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from ..errors import InvalidInputError
 from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
 from .options import MESH, METHOD, add_command, add_options, input_files, register_options
+
+STAGES = {
+    "mesh": ("mesh", "step"),
+    "bank": ("views", "view"),
+    "look-alikes": ("look-alikes", "direction"),
+    "photographs": ("photographs", "photograph"),
+}
+"""Name and unit of each stage's bar."""
 
 
 def add_inspect(commands: Any) -> None:
@@ -49,8 +57,41 @@ def add_inspect(commands: Any) -> None:
         metavar="DIR",
         help="your own photographs without the object, as backgrounds",
     )
+    add(
+        "--clutter",
+        action="store_true",
+        help="other objects around the object, and at times in front of it",
+    )
     add("--strict", action="store_true", help="exit code 3 for a mesh that cannot work")
     add_options(parser, *MESH, *METHOD)
+
+
+class StageBars:
+    """A bar for each stage in turn, on standard error."""
+
+    def __init__(self, *, shown: bool) -> None:
+        self._shown = shown
+        self._stage = ""
+        self._bar: Any = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Show how much of a stage is done."""
+        from tqdm import tqdm
+
+        if stage != self._stage:
+            self.__exit__()
+            name, unit = STAGES[stage]
+            self._bar = tqdm(total=total, desc=name, unit=unit, disable=not self._shown)
+            self._stage = stage
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)
 
 
 def run_inspect(arguments: argparse.Namespace) -> int:
@@ -58,8 +99,6 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     check_given([], [arguments.mesh])
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
-    from tqdm import tqdm
-
     from ..inspection import inspect
     from ..inspection.page import report_lines, report_page
     from ..jobs.lists import find_photographs
@@ -67,30 +106,22 @@ def run_inspect(arguments: argparse.Namespace) -> int:
 
     backgrounds = [] if arguments.photo is None else find_photographs(arguments.photo)
     options = register_options(arguments)
-    mesh = options.load_mesh(arguments.mesh)
-    with output_folder(
-        arguments.out, "inspect", inputs=input_files(arguments, arguments.mesh, *backgrounds)
-    ):
-        pipeline = options.open_pipeline()
-        bar = tqdm(total=None, desc="photographs", unit="photograph", disable=not options.progress)
-
-        def report_progress(stage: str, done: int, total: int) -> None:
-            bar.desc = stage
-            bar.total = total
-            bar.update(done - bar.n)
-
-        report = inspect(
-            mesh,
-            n=arguments.n,
-            seed=arguments.seed,
-            with_camera=arguments.with_camera,
-            pipeline=pipeline,
-            renderer=options.renderer,
-            device=options.device,
-            backgrounds=backgrounds,
-            progress=report_progress,
-        )
-        bar.close()
+    inputs = input_files(arguments, arguments.mesh, *backgrounds)
+    with output_folder(arguments.out, "inspect", inputs=inputs):
+        with StageBars(shown=options.progress) as bars:
+            bars.report("mesh", 0, 1)
+            report = inspect(
+                options.load_mesh(arguments.mesh),
+                n=arguments.n,
+                seed=arguments.seed,
+                with_camera=arguments.with_camera,
+                pipeline=options.open_pipeline(),
+                renderer=options.renderer,
+                device=options.device,
+                backgrounds=backgrounds,
+                clutter=arguments.clutter,
+                progress=bars.report,
+            )
         content = json.dumps(report.to_dict(), indent=2) + "\n"
         write_file(arguments.out / "inspect.json", content.encode())
         page = report_page(report, report.registrar, title=arguments.mesh.name)

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError, MissingDependencyError
+from ..errors import InvalidInputError
 from ..jobs.options import (
     PRIOR_OPTIONS,
     Numbers,
@@ -140,19 +140,6 @@ def ignored_option(arguments: argparse.Namespace) -> str | None:
     if given == ["front"] and getattr(arguments, "list", None) is None:
         return "--front limits nothing by itself; give --azimuth, for instance"
     return None
-
-
-def check_viewer(command: str) -> None:
-    """Refuse a command that opens a page where NiceGUI is missing."""
-    try:
-        import nicegui  # noqa: F401
-    except ImportError as error:
-        message = (
-            f"curvireg {command}: {error.name} is not installed; in the folder of "
-            f"curvireg_torch: "
-            f"pip install -e "
-        )
-        raise MissingDependencyError(f"{message}'.[viewer]'") from error
 
 
 _COUNTS = {"--camera": 4} | {

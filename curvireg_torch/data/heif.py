@@ -6,6 +6,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING
 
 from ..errors import MAX_IMAGE_BYTES, ImageError, MissingDependencyError
+from ..utils.extras import install_command
 from ..utils.pictures import check_pixels, damaged_picture, open_picture
 
 if TYPE_CHECKING:
@@ -15,11 +16,6 @@ _START = re.compile(rb".{4}ftyp", re.DOTALL)
 _HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
 _AVIF = {b"avif", b"avis"}
 _MAX_BRANDS_BYTES = 400  # of the box that names a file's kinds
-_INSTALL = (
-    "pip install 'curvireg_torch[heic]' (in a checkout: pip install -e '.[heic]'), or "
-    "save it as "
-    "JPEG"
-)
 
 
 def heif_kind(data: bytes) -> str | None:
@@ -61,7 +57,9 @@ def _heic(data: bytes) -> "Image":
     try:
         from pi_heif import HeifImageFile
     except ImportError as error:
-        raise MissingDependencyError(f"HEIC needs pi-heif: {_INSTALL}") from error
+        raise MissingDependencyError(
+            f"HEIC needs pi-heif: {install_command(['heic'])}, or save it as JPEG"
+        ) from error
     image: Image = HeifImageFile(BytesIO(data))
     return image
 

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,12 @@ _SUBFILE = 254
 _ORIENTATION = 0x0112
 _EXIF_DIRECTORY = 0x8769
 _FOCAL_35MM = 0xA405
+_FOCAL = 0x920A  # in mm, of the lens itself
+# EXIF pixels per unit of length of the sensor, and the unit: 2 = inch, 3 = cm, 4 = mm, 5 = um
+_SENSOR_X = 0xA20E
+_SENSOR_Y = 0xA20F
+_SENSOR_UNIT = 0xA210
+_SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
 # EXIF sizes in px of the picture that the camera took
@@ -43,6 +49,7 @@ _TAKEN_HEIGHT = 0xA003
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_SENSOR_DIAGONALS = (2.0, 80.0)  # mm, of telephones and of medium format: others are mistakes
 
 EXIF_DEVIATION = 0.05
 """Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections
@@ -57,7 +64,8 @@ class Photo:
     Attributes:
         image: (3, H, W) uint8 RGB.
         orientation: the EXIF orientation that was applied, 1 to 8; 1 = none.
-        focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, or None.
+        focal_35mm: EXIF focal length in mm of a 36 x 24 mm camera of the same view, as the file
+            states it, or by the focal length of the lens and the size of the sensor; or None.
         notes: changes to the pixels, in words.
         taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None
             if it is not known.
@@ -272,12 +280,30 @@ def _exif(image: "Image") -> _Exif:
         focal = float(directory.get(_FOCAL_35MM, 0))
         width = int(directory.get(_TAKEN_WIDTH, 0))
         height = int(directory.get(_TAKEN_HEIGHT, 0))
+        if focal == 0.0:
+            size = (width, height) if width > 0 and height > 0 else image.size
+            focal = _focal_by_sensor(directory, size)
     valid = isinstance(orientation, int) and orientation in range(1, 9)
     return _Exif(
         orientation if valid else 1,
         focal if 0 < focal < math.inf else None,
         (height, width) if width > 0 and height > 0 else None,
     )
+
+
+def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
+    """The focal length in mm of a 36 x 24 mm camera of the same view, from that of the lens and the
+    distance of the sensor's pixels; 0 where they are not stated, or no sensor has this size."""
+    unit = _SENSOR_UNITS_MM[int(directory.get(_SENSOR_UNIT, 2))]
+    along_x = float(directory[_SENSOR_X]) / unit
+    along_y = float(directory.get(_SENSOR_Y, directory[_SENSOR_X])) / unit
+    width, height = size
+    diagonal = math.hypot(width / along_x, height / along_y)
+    least, most = _SENSOR_DIAGONALS
+    has_square_pixels = abs(along_x / along_y - 1.0) < 0.02
+    if not (has_square_pixels and least <= diagonal <= most):
+        return 0.0
+    return float(directory[_FOCAL]) * _DIAGONAL_35MM / diagonal
 
 
 def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:

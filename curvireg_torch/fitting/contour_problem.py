@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..rendering.contours import ContourPoints, Contours
+from ..utils.rows import Rows
 from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
     Measurements,
@@ -34,7 +35,7 @@ EDGE_DAMPING = 1e-2
 
 
 @dataclass(frozen=True)
-class ContourState:
+class ContourState(Rows):
     """Poses ``T`` (N, 4, 4), nearby ones ``seen`` at which contours were last found, and the
     contour points there."""
 
@@ -42,17 +43,9 @@ class ContourState:
     seen: Tensor
     points: ContourPoints
 
-    def __getitem__(self, index: Tensor) -> "ContourState":
-        return ContourState(self.T[index], self.seen[index], self.points[index])
-
-    @staticmethod
-    def cat(parts: Sequence["ContourState"]) -> "ContourState":
-        T, seen = (torch.cat([getattr(part, name) for part in parts]) for name in ("T", "seen"))
-        return ContourState(T, seen, ContourPoints.cat([part.points for part in parts]))
-
 
 @dataclass(frozen=True)
-class ContourProblem:
+class ContourProblem(Rows):
     """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras
     ``K`` (N, 3, 3); a ``mask`` weights the edges."""
 
@@ -96,9 +89,6 @@ class ContourProblem:
     def centre(self) -> Tensor:
         """(3,) of the object, about which poses rotate."""
         return self.contours.centre
-
-    def __getitem__(self, index: Tensor) -> "ContourProblem":
-        return replace(self, image_index=self.image_index[index], K=self.K[index])
 
     def state(self, T: Tensor) -> ContourState:
         """Poses (N, 4, 4) with the mesh's contour points there."""

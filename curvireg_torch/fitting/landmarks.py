@@ -6,7 +6,7 @@ some landmarks. They need colours, and the camera of the photograph.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 from ..filters.operations import resized
-from ..geometry.cameras import transform
+from ..geometry.cameras import pose_around
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
+from ..utils.rows import Rows
 from ..utils.threads import map_on_threads
 from .least_squares import nearest_rigid
 
@@ -60,7 +61,7 @@ FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmark
 
 
 @dataclass(frozen=True)
-class _Features:
+class _Features(Rows):
     """F features of a picture: ``uv`` (F, 2) in px, ``size`` (F,) in px, ``angle`` (F,) in rad, and
     unit ``vectors`` (F, 128)."""
 
@@ -95,9 +96,6 @@ class _Features:
         return _Features(
             values[:, :2] - UPSCALING_SHIFT, values[:, 2], values[:, 3], vectors.astype(np.float32)
         )
-
-    def __getitem__(self, index: np.ndarray) -> "_Features":
-        return _Features(*(getattr(self, f.name)[index] for f in fields(_Features)))
 
 
 @dataclass(frozen=True)
@@ -145,13 +143,9 @@ class LandmarkMatches:
             )
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
-                R = pose.T[:3, :3]
-                position = pose.T[:3, 3]
-                poses.append(
-                    LandmarkPose(
-                        transform(R, position - R @ torch.from_numpy(self.centre)), pose.count
-                    )
-                )
+                centre = torch.from_numpy(self.centre)
+                T = pose_around(pose.T[:3, :3], pose.T[:3, 3], centre)
+                poses.append(LandmarkPose(T, pose.count))
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
@@ -177,7 +171,7 @@ class Landmarks:
         self._radius = describer.radius
         R = uniform_views(VIEWS).rotations.double()
         position = torch.tensor([0.0, 0.0, VIEW_DISTANCE * self._radius], dtype=torch.float64)
-        T = transform(R, position - R @ describer.centre)
+        T = pose_around(R, position, describer.centre)
         # the bounding sphere fills the picture
         focal = 0.5 * VIEW_SIZE * math.sqrt(VIEW_DISTANCE**2 - 1.0)
         middle = 0.5 * (VIEW_SIZE - 1)
@@ -201,9 +195,7 @@ class Landmarks:
             return found[z > 0], ((rays - T[k, :3, 3].numpy()) @ T[k, :3, :3].numpy())[z > 0]
 
         found = map_on_threads(features, range(VIEWS))
-        self._features = _Features(
-            *(np.concatenate([getattr(one, f.name) for one, _ in found]) for f in fields(_Features))
-        )
+        self._features = _Features.cat([features for features, _ in found])
         self._points = np.concatenate([points for _, points in found])
         # Of a feature of size 1 that is upright: the way to the object's centre, and the object's
         # radius, both in px.

@@ -1,12 +1,13 @@
 """What the edges at fitted poses tell: support, covariance, and the directions that they
 determine."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..rendering.contours import Contours
+from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import pose_covariance
@@ -21,7 +22,7 @@ scenes."""
 
 
 @dataclass(frozen=True)
-class ContourFit:
+class ContourFit(Rows):
     """N poses fitted to photographs.
 
     Attributes:
@@ -39,9 +40,6 @@ class ContourFit:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
-
-    def __getitem__(self, index: Tensor) -> "ContourFit":
-        return ContourFit(*(getattr(self, f.name)[index] for f in fields(ContourFit)))
 
     @property
     def trustworthy(self) -> Tensor:

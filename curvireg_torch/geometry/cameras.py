@@ -52,6 +52,30 @@ def transform(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat([top, bottom], dim=-2)
 
 
+def point_in_cameras(T: Tensor, point: Tensor) -> Tensor:
+    """(..., 3) a point (3,) of the model in the cameras of poses (..., 4, 4).
+
+    Example:
+        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 2.0]))
+        >>> point_in_cameras(T, torch.tensor([1.0, 0.0, 0.0])).tolist()
+        [1.0, 0.0, 2.0]
+    """
+    place: Tensor = T[..., :3, :3] @ point + T[..., :3, 3]
+    return place
+
+
+def pose_around(R: Tensor, place: Tensor, point: Tensor) -> Tensor:
+    """(..., 4, 4) poses of rotations (..., 3, 3) that have a point (3,) of the model at a ``place``
+    (..., 3).
+
+    Example:
+        >>> T = pose_around(torch.eye(3), torch.tensor([1.0, 0.0, 2.0]), torch.ones(3))
+        >>> T[:3, 3].tolist()
+        [0.0, -1.0, 1.0]
+    """
+    return transform(R, place - R @ point)
+
+
 def project_points(
     points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
 ) -> Tensor:

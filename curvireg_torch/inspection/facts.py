@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..geometry import rotation_error
 from ..matching.describe import VIEW_FACES
-from ..mesh import has_colours, mesh_symmetries, mesh_unit, mesh_warnings
+from ..mesh import has_colours, mesh_symmetries, mesh_unit, mesh_up, mesh_warnings
 from ..mesh.mesh import extreme_points, mesh_radius
 
 # From which simplification is advised: reading and the first bank take longer than a photograph
@@ -71,6 +71,8 @@ class MeshFacts:
             body has 1.
         is_coloured: whether colours vary over the surface.
         symmetries: rotations but the identity that leave the shape as it is.
+        up: the axis that points up.
+        verdicts: those of the warnings that say how its pose is seen, the gravest last.
         warnings: what is wrong, in words.
         is_hopeless: whether no photograph can show its pose.
     """
@@ -85,6 +87,8 @@ class MeshFacts:
     area_of_hull: float
     is_coloured: bool
     symmetries: tuple[Symmetry, ...]
+    up: str
+    verdicts: tuple[str, ...]
     warnings: tuple[str, ...]
     is_hopeless: bool
 
@@ -141,18 +145,19 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
         warnings.append(
             f"{parts:,} loose parts: leave out what no photograph shows, such as screws inside"
         )
+    verdicts = []
     if extents.min() < THIN * extents.max():
-        warnings.append("thin: its pose is uncertain where it is seen from the edge")
+        verdicts.append("thin: its pose is uncertain where it is seen from the edge")
     is_sphere = _is_sphere(mesh)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
-        warnings.append(
+        verdicts.append(
             "a sphere: it looks the same from everywhere, so its rotation cannot be seen"
         )
     elif symmetries and not is_coloured:
-        warnings.append(_symmetry_warning(symmetries))
+        verdicts.append(_symmetry_warning(symmetries))
     if is_wire:
-        warnings.append("hardly any surface, as of a wire: too thin for contours")
+        verdicts.append("hardly any surface, as of a wire: too thin for contours")
     return MeshFacts(
         unit=unit,
         extents=(float(extents[0]), float(extents[1]), float(extents[2])),
@@ -164,7 +169,9 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
         area_of_hull=area_of_hull,
         is_coloured=is_coloured,
         symmetries=symmetries,
-        warnings=tuple(warnings),
+        up=mesh_up(mesh),
+        verdicts=tuple(verdicts),
+        warnings=(*warnings, *verdicts),
         is_hopeless=is_wire or (is_sphere and not is_coloured),
     )
 

@@ -1,5 +1,7 @@
 """Pairs of views that the shape of a mesh does not tell apart."""
 
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,9 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
-from ..geometry.conversions import rotation_from_axis_angle
+from ..geometry import uniform_views, viewpoint_from_rotation
+from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
+from ..geometry.viewpoint import angles_between, up_rotation
 from ..matching import ViewBank, ViewDescriber
+from ..mesh import mesh_up
 
 LOOKED_AT = 48  # Directions from which the mesh is looked at
 RIVAL_ANGLE = 30.0  # Degrees beyond which a look-alike is another answer
@@ -22,6 +26,11 @@ RESOLUTION = 3.0
 HALF_TURNS = torch.stack(
     [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
 )
+# Degrees from which a rotation between two views is half a turn, and cosines of the angle between
+# its axis and the upward one that make it one about that axis, or about a level one
+HALF_TURN = 150.0
+ALONG = 0.9
+ACROSS = 0.4
 STEPS = (6.0, 2.0)  # Degrees by which a candidate is turned to come nearer
 
 
@@ -69,6 +78,7 @@ def look_alikes(
     symmetries: Tensor | None,
     *,
     elevations: tuple[float, float] = (-90, 90),
+    report_progress: Callable[[int, int], object] | None = None,
 ) -> tuple[LookAlike, ...]:
     """The most similar view beyond 30 degrees of each of 48 directions, spread evenly over the
     sphere.
@@ -81,10 +91,12 @@ def look_alikes(
         bank: views of the mesh, among which candidates are looked for.
         describer: of the mesh, with the descriptor of fitted poses.
         symmetries: (S, 4, 4) rotations that do not count; None for none.
-        elevations: degrees between which the mesh is looked at.
+        elevations: degrees between which the mesh is looked at, with its own up axis.
+        report_progress: called with directions done and in all.
     """
     directions = uniform_views(LOOKED_AT).rotations.double()
-    elevation = viewpoint_from_rotation(directions)[1]
+    up = up_rotation(mesh_up(bank.mesh)).double()
+    elevation = viewpoint_from_rotation(directions @ up.mT)[1]
     directions = directions[(elevation >= elevations[0]) & (elevation <= elevations[1])]
     distance = bank.distances.median().double().cpu()
     descriptors = _described(describer, directions, distance)
@@ -100,6 +112,8 @@ def look_alikes(
     similarity = (F.normalize(matched, dim=1) @ coarse.T).cpu()
     pairs = []
     for row, direction in enumerate(directions):
+        if report_progress is not None:
+            report_progress(row, len(directions))
         angle = _angle(views, direction, group)
         scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + STEPS[0], -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
@@ -114,12 +128,29 @@ def look_alikes(
                 direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]
             )
         )
+    if report_progress is not None:
+        report_progress(len(directions), len(directions))
     return tuple(sorted(pairs, key=lambda pair: pair.resolved - pair.similarity))
+
+
+def confused_sides(pairs: Sequence[LookAlike], up: str) -> str:
+    """Which sides most of the pairs confuse, in words: half a turn about the axis that points
+    ``up`` is front and back, one about a level axis is top and bottom."""
+    axis = up_rotation(up).double()[2]
+    kinds = Counter[str]()
+    for pair in pairs:
+        turn = axis_angle_from_rotation(pair.rotation.mT @ pair.rival)
+        steepness = abs(float(F.normalize(turn, dim=0) @ axis))
+        half = float(torch.rad2deg(turn.norm())) > HALF_TURN
+        upright = half and steepness > ALONG
+        level = half and steepness < ACROSS
+        kinds["front and back" if upright else "top and bottom" if level else "several sides"] += 1
+    return kinds.most_common(1)[0][0]
 
 
 def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to a group (S, 3, 3)."""
-    return rotation_error(rotations[:, None], (rotation @ group)[None]).amin(dim=1)
+    return angles_between(rotations, rotation[None], group)[:, 0]
 
 
 def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:

@@ -18,12 +18,12 @@ from ..registration import Registrar
 from ..utils.checks import check_integer
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
-from .look_alikes import LookAlike, look_alikes
-from .trial import SIZE, Trial, generate_photographs, run_trial
+from .look_alikes import LookAlike, confused_sides, look_alikes
+from .photographs import SIZE, UPRIGHT, PhotographGenerator
+from .trial import Report, Trial, report_nothing, run_trial
 
 ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.01)  # Borders of the ranges of the report, degrees
 PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, 1e4)
-UPRIGHT = (-10.0, 60.0)  # Elevations of an upright object, degrees
 MIN_RIGHT = 0.5  # Expected share of right answers below which a warning says so
 MANY_ALIKE = 0.1  # Share of directions with a look-alike from which a warning says so
 
@@ -45,10 +45,10 @@ class Inspection:
     """
 
     facts: MeshFacts
-    pairs: tuple[LookAlike, ...]
-    trial: Trial | None
-    seed: int
-    with_camera: bool
+    pairs: tuple[LookAlike, ...] = ()
+    trial: Trial | None = None
+    seed: int = 0
+    with_camera: bool = True
     registrar: Registrar | None = None
 
     @property
@@ -60,16 +60,8 @@ class Inspection:
     def warnings(self) -> tuple[str, ...]:
         """What to know before taking photographs, in words."""
         warnings = list(self.facts.warnings)
-        share = len(self.alike) / max(len(self.pairs), 1)
-        if share >= MANY_ALIKE:
-            remedy = (
-                "give a pose prior (--azimuth, --side)"
-                if self.facts.is_coloured
-                else "give a texture or a pose prior"
-            )
-            warnings.append(
-                f"another side looks alike from {100 * share:.0f} % of the directions: {remedy}"
-            )
+        if self.alike_share >= MANY_ALIKE:
+            warnings.append(self._alike_in_words())
         if self.trial is not None and self.trial.expected.right < MIN_RIGHT:
             right = 100 * self.trial.expected.right
             warnings.append(
@@ -77,6 +69,32 @@ class Inspection:
                 f"answers"
             )
         return tuple(warnings)
+
+    @property
+    def alike_share(self) -> float:
+        """Share of the directions from which a photograph does not tell another side from it."""
+        return len(self.alike) / max(len(self.pairs), 1)
+
+    @property
+    def in_brief(self) -> str:
+        """One sentence: what the mesh is, what looks alike, and what would help.
+
+        Example:
+            >>> Inspection(mesh_facts(trimesh.creation.icosphere(3))).in_brief
+            'grey mesh: a sphere: it looks the same from everywhere, so its rotation cannot be seen'
+        """
+        kind = "coloured mesh" if self.facts.is_coloured else "grey mesh"
+        if self.is_hopeless:
+            return f"{kind}: {self.facts.verdicts[-1]}"
+        if self.alike_share >= MANY_ALIKE:
+            return f"{kind}: {self._alike_in_words()}"
+        return "; ".join([f"{kind}: its sides differ in shape", *self.facts.verdicts])
+
+    def _alike_in_words(self) -> str:
+        sides = confused_sides(self.alike, self.facts.up)
+        remedy = "a pose prior" if self.facts.is_coloured else "a texture or a pose prior"
+        share = 100.0 * self.alike_share
+        return f"{sides} look alike from {share:.0f} % of the views; give {remedy}"
 
     @property
     def is_hopeless(self) -> bool:
@@ -128,7 +146,8 @@ def inspect(
     renderer: str = "auto",
     device: torch.device | str = "cpu",
     backgrounds: Sequence[Any] = (),
-    progress: Callable[[str, int, int], object] | None = None,
+    clutter: bool = False,
+    progress: Report | None = None,
 ) -> Inspection:
     """Examine a mesh, look for views that are alike, and register generated photographs of it.
 
@@ -142,7 +161,9 @@ def inspect(
             their file.
         renderer, device: of the views, see :class:`Registrar`.
         backgrounds: (3, H, W) pictures or paths, instead of generated ones.
-        progress: called with ("bank" or "photographs", done, total); to cancel, it may raise.
+        clutter: other objects stand around the object, and at times in front of it.
+        progress: called with the stage ("mesh", "bank", "look-alikes" or "photographs"), done and
+            total, perhaps in another thread; to cancel, it may raise.
 
     Returns:
         the report; ``to_dict()`` is the content of ``inspect.json``.
@@ -156,11 +177,14 @@ def inspect(
         (True, 3)
     """
     check_integer(n, "n", least=0)
+    report = progress or report_nothing
     registrar = mesh if isinstance(mesh, Registrar) else None
+    report("mesh", 0, 1)
     clean: trimesh.Trimesh = as_mesh(mesh) if registrar is None else registrar.bank.mesh
     facts = mesh_facts(clean)
+    report("mesh", 1, 1)
     if facts.is_hopeless:
-        return Inspection(facts, (), None, seed, with_camera)
+        return Inspection(facts, seed=seed, with_camera=with_camera)
     with one_torch_thread():
         if registrar is None:
             bank = cached_bank(
@@ -168,24 +192,39 @@ def inspect(
                 pipeline=pipeline,
                 renderer=renderer,
                 device=device,
-                progress=progress or False,
+                progress=report,
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
-        upright = registrar.pipeline.views.pose == "upright"
-        symmetries = None if has_colours(clean) else registrar.symmetries_of(exact=True)
-        elevations = UPRIGHT if upright else (-90.0, 90.0)
-        pairs = look_alikes(registrar.bank, registrar.describer, symmetries, elevations=elevations)
+        pairs = look_alikes_of(registrar, partial(report, "look-alikes"))
         if n == 0:
             return Inspection(facts, pairs, None, seed, with_camera, registrar)
         pictures = [_background(picture) for picture in backgrounds]
-        photographs = generate_photographs(
-            clean, n, seed=seed, upright=upright, backgrounds=pictures
-        )
-        report = None if progress is None else partial(progress, "photographs")
+        upright = registrar.pipeline.views.pose == "upright"
+        generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
         trial = run_trial(
-            registrar, photographs, with_camera=with_camera, compare=compare, report_progress=report
+            registrar,
+            generate,
+            n,
+            with_camera=with_camera,
+            compare=compare,
+            report=report,
         )
     return Inspection(facts, pairs, trial, seed, with_camera, registrar)
+
+
+def look_alikes_of(
+    registrar: Registrar, report_progress: Callable[[int, int], object] | None = None
+) -> tuple[LookAlike, ...]:
+    """:func:`.look_alikes` of a registrar's mesh, from where its views are looked at."""
+    mesh = registrar.bank.mesh
+    upright = registrar.pipeline.views.pose == "upright"
+    return look_alikes(
+        registrar.bank,
+        registrar.describer,
+        None if has_colours(mesh) else registrar.symmetries_of(exact=True),
+        elevations=UPRIGHT if upright else (-90.0, 90.0),
+        report_progress=report_progress,
+    )
 
 
 def _background(picture: Any) -> Tensor:

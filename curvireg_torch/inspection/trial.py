@@ -3,50 +3,51 @@ right."""
 
 import itertools
 import math
+import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
-import numpy as np
 import torch
 import trimesh
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..errors import CurviregError
 from ..evaluation.metrics import symmetric_rotation_error
-from ..filters import gaussian_smooth
-from ..geometry import PosePrior, camera_matrix, rotation_from_axis_angle, viewpoint_from_rotation
-from ..geometry.cameras import rotation_towards
+from ..geometry import PosePrior, rotation_from_axis_angle, viewpoint_from_rotation
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.viewpoint import up_rotation
-from ..mesh import has_colours, mesh_up
+from ..matching import cached_bank
+from ..mesh import has_colours, mesh_centre, mesh_up
 from ..registration import Registrar, Registration
-from ..synthetic import procedural_background, random_pose, synthesize_photograph
+from ..synthetic import synthesize_photograph
+from ..utils.threads import map_on_threads
+from .photographs import (
+    SIZE,
+    Photograph,
+    PhotographGenerator,
+    photographed_mesh,
+    to_bytes,
+    trial_camera,
+    with_print,
+    without_colours,
+)
 
-SIZE = (480, 640)  # of the photographs, H, W
-FOCAL = 700.0  # px: a field of view of 49 degrees
-FILL = (0.2, 0.7)  # of the photographs' shorter side, by the object
-BOX_ERROR = 0.05  # Standard deviation of the box's edges, as a fraction of its sides
-BLUR = 1.2  # px, the largest standard deviation
 RIGHT_DEGREES = 30.0  # within which an answer is right, as confidence understands it
 FINE_DEGREES = 5.0
-COMPARED_FRACTION = 0.25  # of the photographs, with which other conditions are tried
+COMPARED_FRACTION = 0.2  # of the photographs, with which other conditions are tried
 HINT_DEGREES = 45.0  # by which the hint may be off, and which it allows
 SECOND_CAMERA = 60.0  # Degrees about the object between two photographs
+IDENTITY = torch.eye(3, dtype=torch.float64)[None]
+
+Report: TypeAlias = Callable[[str, int, int], object]
+"""Is called with a stage, done and total."""
+
+Register: TypeAlias = Callable[[Any], "Outcome"]
 
 
-@dataclass(frozen=True)
-class Photograph:
-    """A generated photograph: (3, H, W) in [0, 1], its box (4,) in px, and the true pose (4, 4)."""
-
-    image: Tensor
-    box: Tensor
-    truth: Tensor
-
-    @property
-    def pixels_across(self) -> float:
-        """Longer side of the box in px."""
-        return float((self.box[2:] - self.box[:2]).max())
+def report_nothing(stage: str, done: int, total: int) -> None:
+    """Progress that nobody follows."""
 
 
 @dataclass(frozen=True)
@@ -121,211 +122,180 @@ class Trial:
         return ranges
 
 
-def generate_photographs(
-    mesh: trimesh.Trimesh,
-    count: int,
-    *,
-    seed: int,
-    upright: bool,
-    backgrounds: Sequence[Tensor] = (),
-) -> list[Photograph]:
-    """Photographs of a mesh at random poses, sizes and places, in random light, out of focus by up
-    to 1.2 px, with noise, in front of random or given ``backgrounds`` (3, H, W); boxes are wrong by
-    about 5 % of their sides.
-
-    Photograph k depends only on the seed and k.
-    """
-    K = trial_camera()
-    photographs = []
-    for index in range(count):
-        generator = torch.Generator().manual_seed(1_000_003 * seed + index)
-        truth = _random_truth(mesh, K, generator, upright=upright)
-        background = procedural_background(SIZE, generator)
-        if backgrounds:
-            background = backgrounds[index % len(backgrounds)]
-        image, box = synthesize_photograph(mesh, truth, K, SIZE, generator, background=background)
-        blur = BLUR * float(torch.rand((), generator=generator))
-        if blur > 0.3:
-            image = gaussian_smooth(image[None], blur)[0]
-        photographs.append(Photograph(image, _wrong_box(box, generator), truth))
-    return photographs
-
-
-def trial_camera() -> Tensor:
-    """(3, 3) float64 camera matrix of the generated photographs."""
-    height, width = SIZE
-    return camera_matrix(FOCAL, FOCAL, 0.5 * (width - 1), 0.5 * (height - 1), dtype=torch.float64)
-
-
 def run_trial(
     registrar: Registrar,
-    photographs: Sequence[Photograph],
+    generate: PhotographGenerator,
+    count: int,
     *,
     with_camera: bool = True,
     compare: bool = True,
-    report_progress: Callable[[int, int], object] | None = None,
+    report: Report = report_nothing,
 ) -> Trial:
-    """Register photographs of the registrar's mesh, and a quarter of them without a camera, with a
-    hint, and without the mesh's colours, where these are other conditions."""
-    symmetries = _symmetries(registrar)
-    K = trial_camera() if with_camera else None
-    conditions = _conditions(registrar, with_camera=with_camera) if compare else {}
-    part = photographs[: max(1, round(COMPARED_FRACTION * len(photographs)))]
-    total = len(photographs) + len(part) * len(conditions)
-    done = itertools.count(1)
+    """Register photographs 0 to ``count - 1`` of the registrar's mesh, several at a time, and a
+    fifth of them without a camera, with a hint, with a second photograph, and without the mesh's
+    colours or with a print.
 
-    def reported(outcome: Outcome) -> Outcome:
-        if report_progress is not None:
-            report_progress(next(done), total)
-        return outcome
+    Args:
+        registrar: of the mesh.
+        generate: photograph by number.
+        count: of the photographs.
+        with_camera: whether the camera is known.
+        compare: whether other conditions are tried.
+        report: called with "photographs", done and in all, by one thread at a time, after "bank" of
+            the mesh with or without a print.
+    """
+    part = max(1, round(COMPARED_FRACTION * count))
+    camera = trial_camera() if with_camera else None
+    setup = _Setup(registrar, camera, _symmetries(registrar))
+    conditions = _conditions(setup, generate, report) if compare else []
+    registrations = sum(1 if condition.before is None else 2 for condition in conditions)
+    total = count + part * registrations
+    counter = itertools.count(1)
+    lock = threading.Lock()
 
-    outcomes = [
-        reported(_register(registrar, photograph, K, symmetries)) for photograph in photographs
-    ]
-    before = Expected.of(outcomes[: len(part)])
+    def results(register: Register, items: Sequence[Any]) -> list[Outcome]:
+        def job(item: Any) -> Outcome:
+            outcome = register(item)
+            with lock:
+                report("photographs", next(counter), total)
+            return outcome
+
+        return map_on_threads(job, items, device=registrar.bank.device)
+
+    report("photographs", 0, total)
+    registrar.share()
+    outcomes = results(lambda number: setup.register(generate(number)), range(count))
+    some = outcomes[:part]
+    photographs = [outcome.photograph for outcome in some]
     compared = {}
-    for name, register in conditions.items():
-        others = [reported(register(photograph, symmetries)) for photograph in part]
-        compared[name] = (before, Expected.of(others))
+    for condition in conditions:
+        before = some if condition.before is None else results(condition.before, photographs)
+        after = results(condition.after, photographs)
+        compared[condition.name] = Expected.of(before), Expected.of(after)
     return Trial(tuple(outcomes), compared)
 
 
-def _conditions(
-    registrar: Registrar, *, with_camera: bool
-) -> dict[str, Callable[[Photograph, Tensor], Outcome]]:
-    """Other conditions by name, and how a photograph is registered under them."""
-    K = trial_camera()
-    given = K if with_camera else None
-    other = None if with_camera else K
-    camera_name = "without a camera" if with_camera else "with a camera"
+@dataclass(frozen=True)
+class _Condition:
+    """Another condition, and how a photograph is registered under it, and without it where that is
+    not how it was registered."""
 
-    def with_hint(photograph: Photograph, symmetries: Tensor) -> Outcome:
-        generator = torch.Generator().manual_seed(int(1000 * photograph.box.sum().abs()))
-        error = HINT_DEGREES * (2.0 * float(torch.rand((), generator=generator)) - 1.0)
-        middle = _azimuth(registrar.bank.mesh, photograph.truth) + error
-        prior = PosePrior(
-            azimuth=((middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0)
+    name: str
+    after: Register
+    before: Register | None = None
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """A registrar, the camera that it is told, and the (S, 3, 3) rotations that do not count as
+    errors."""
+
+    registrar: Registrar
+    K: Tensor | None
+    symmetries: Tensor
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        return self.registrar.bank.mesh
+
+    def register(self, photograph: Photograph, *, prior: PosePrior | None = None) -> Outcome:
+        found = self.registrar([photograph.image], photograph.box[None], self.K, prior=prior)[0]
+        return self.outcome(photograph, found if isinstance(found, Registration) else None)
+
+    def register_with_hint(self, photograph: Photograph) -> Outcome:
+        error = HINT_DEGREES * (2.0 * float(torch.rand((), generator=_generator(photograph))) - 1.0)
+        middle = float(viewpoint_of(self.mesh, photograph.truth[:3, :3])[0]) + error
+        azimuth = (middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0
+        return self.register(photograph, prior=PosePrior(azimuth=azimuth))
+
+    def register_with_second(self, photograph: Photograph) -> Outcome:
+        """The outcome of a photograph and a second one, of a camera to its side."""
+        K = trial_camera()
+        turn = rotation_from_axis_angle(
+            torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
         )
-        return _register(registrar, photograph, given, symmetries, prior=prior)
+        centre = point_in_cameras(photograph.truth, mesh_centre(self.mesh))
+        move = pose_around(turn, centre, centre)
+        mesh = photographed_mesh(self.mesh)
+        generator = _generator(photograph)
+        image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
+        images = [photograph.image, to_bytes(image)]
+        boxes = torch.stack([photograph.box, box])
+        cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
+        try:
+            found = self.registrar.register_views(images, boxes, K, cameras)
+        except CurviregError:
+            return self.outcome(photograph, None)
+        return self.outcome(photograph, found)
 
-    def with_two(photograph: Photograph, symmetries: Tensor) -> Outcome:
-        return _register_pair(registrar, photograph, symmetries)
+    def outcome(self, photograph: Photograph, result: Registration | None) -> Outcome:
+        """The outcome of a registration; without a camera, rotations are compared as a camera that
+        looks at the object sees them."""
+        truth = photograph.truth[:3, :3]
+        elevation = float(viewpoint_of(self.mesh, truth)[1])
+        if result is None:
+            return Outcome(photograph, None, 180.0, elevation)
+        rotation = result.rotation
+        if result.translation is None:
+            centre = point_in_cameras(photograph.truth, mesh_centre(self.mesh))
+            truth = rotation_towards(centre).mT @ truth
+            rotation = result.allocentric_rotation
+        error = float(symmetric_rotation_error(rotation.double(), truth, self.symmetries))
+        return Outcome(photograph, result, error, elevation)
 
-    conditions: dict[str, Callable[[Photograph, Tensor], Outcome]] = {
-        camera_name: lambda photograph, symmetries: _register(
-            registrar, photograph, other, symmetries
+
+def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) -> list[_Condition]:
+    """What a camera, a hint, a second photograph and a print add, or what is lost without them.
+
+    A print makes poses differ that look alike without: with and without it, each counts.
+    """
+    is_known = setup.K is not None
+    other = replace(setup, K=None if is_known else trial_camera())
+    conditions = [
+        _Condition("without a camera" if is_known else "with a camera", other.register),
+        _Condition(
+            f"with a pose prior: azimuth within {HINT_DEGREES:g} degrees", setup.register_with_hint
         ),
-        f"with a pose prior: azimuth within {HINT_DEGREES:g} degrees": with_hint,
-        "with a second photograph from another side": with_two,
-    }
-    if has_colours(registrar.bank.mesh):
-        grey = registrar.bank.mesh.copy()
-        grey.visual = trimesh.visual.ColorVisuals()
-        grey.metadata.pop("colours", None)
-        plain = Registrar(grey, pipeline=registrar.pipeline)
-        conditions["without the mesh's colours"] = lambda photograph, symmetries: _register(
-            plain, photograph, given, symmetries
+        _Condition("with a second photograph from another side", setup.register_with_second),
+    ]
+    if has_colours(setup.mesh):
+        plain = replace(
+            setup, registrar=_like(setup.registrar, without_colours(setup.mesh), report)
         )
-    return conditions
-
-
-def _register(
-    registrar: Registrar,
-    photograph: Photograph,
-    K: Tensor | None,
-    symmetries: Tensor,
-    *,
-    prior: PosePrior | None = None,
-) -> Outcome:
-    result = registrar([photograph.image], photograph.box[None], K, prior=prior)[0]
-    return _outcome(
-        registrar, photograph, result if isinstance(result, Registration) else None, symmetries
-    )
-
-
-def _register_pair(registrar: Registrar, photograph: Photograph, symmetries: Tensor) -> Outcome:
-    """The outcome of a photograph and a second one, of a camera to its side."""
-    K = trial_camera()
-    mesh = registrar.bank.mesh
-    generator = torch.Generator().manual_seed(int(photograph.box.sum().abs() * 1000))
-    turn = rotation_from_axis_angle(
-        torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
-    )
-    centre = (
-        photograph.truth[:3, :3] @ torch.from_numpy(mesh.bounds.mean(axis=0))
-        + photograph.truth[:3, 3]
-    )
-    move = torch.eye(4, dtype=torch.float64)
-    move[:3, :3] = turn
-    move[:3, 3] = centre - turn @ centre
-    image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
-    cameras = torch.stack([torch.eye(4, dtype=torch.float64), move])
-    try:
-        result = registrar.register_views(
-            [photograph.image, image], torch.stack([photograph.box, box]), K, cameras
-        )
-    except CurviregError:
-        return _outcome(registrar, photograph, None, symmetries)
-    return _outcome(registrar, photograph, result, symmetries)
-
-
-def _outcome(
-    registrar: Registrar, photograph: Photograph, result: Registration | None, symmetries: Tensor
-) -> Outcome:
-    """The outcome of a registration; without a camera, rotations are compared as a camera that
-    looks at the object sees them."""
-    truth = photograph.truth[:3, :3]
-    elevation = float(viewpoint_from_rotation(truth)[1])
-    if result is None:
-        return Outcome(photograph, None, 180.0, elevation)
-    rotation = result.rotation
-    if result.translation is None:
-        centre = truth @ registrar.describer.centre + photograph.truth[:3, 3]
-        truth = rotation_towards(centre).mT @ truth
-        rotation = result.allocentric_rotation
-    error = float(symmetric_rotation_error(rotation.double(), truth, symmetries))
-    return Outcome(photograph, result, error, elevation)
+        return [*conditions, _Condition("without the mesh's colours", plain.register)]
+    printed = with_print(setup.mesh)
+    by_shape = replace(setup, symmetries=IDENTITY)
+    by_print = replace(by_shape, registrar=_like(setup.registrar, printed, report))
+    print_seen = replace(generate, mesh=printed)
+    name = "with a print, also in the mesh: orientations that look alike without count as wrong"
+    return [
+        *conditions,
+        _Condition(
+            name,
+            lambda photograph: by_print.register(print_seen(photograph.number)),
+            lambda photograph: by_shape.register(print_seen(photograph.number)),
+        ),
+    ]
 
 
 def _symmetries(registrar: Registrar) -> Tensor:
     """(S, 3, 3) rotations that do not count as errors."""
     transforms = registrar.symmetries_of(exact=True)
-    if transforms is None:
-        return torch.eye(3, dtype=torch.float64)[None]
-    return transforms[:, :3, :3].double()
+    return IDENTITY if transforms is None else transforms[:, :3, :3].double()
 
 
-def _random_truth(
-    mesh: trimesh.Trimesh, K: Tensor, generator: torch.Generator, *, upright: bool
-) -> Tensor:
-    """A (4, 4) pose that shows the mesh; seen from everywhere and rolled, unless it is upright."""
-    elevations = (-10.0, 60.0) if upright else (-90.0, 90.0)
-    T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)
-    centre = torch.from_numpy(np.asarray(mesh.bounds.mean(axis=0)))
-    position = T[:3, :3] @ centre + T[:3, 3]
-    R = T[:3, :3]
-    if not upright:
-        quaternion = torch.randn(4, generator=generator, dtype=torch.float64)
-        R = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
-    elif mesh_up(mesh) != "z":
-        R = R @ up_rotation(mesh_up(mesh)).double()
-    truth = torch.eye(4, dtype=torch.float64)
-    truth[:3, :3] = R
-    truth[:3, 3] = position - R @ centre
-    return truth
+def _like(registrar: Registrar, mesh: trimesh.Trimesh, report: Report) -> Registrar:
+    """A registrar of another mesh with the same settings."""
+    bank = registrar.bank
+    other = cached_bank(mesh, pipeline=registrar.pipeline, device=bank.device, progress=report)
+    return Registrar(other, mesh_is="exact")
 
 
-def _azimuth(mesh: trimesh.Trimesh, truth: Tensor) -> float:
-    """Azimuth in degrees of a true pose, with the mesh's up axis."""
-    R = truth[:3, :3] @ up_rotation(mesh_up(mesh)).double().mT
-    return float(viewpoint_from_rotation(R)[0])
+def viewpoint_of(mesh: trimesh.Trimesh, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Azimuth, elevation and theta of rotations (..., 3, 3) from the mesh's axes, z up."""
+    return viewpoint_from_rotation(rotation @ up_rotation(mesh_up(mesh)).double().mT)
 
 
-def _wrong_box(box: Tensor, generator: torch.Generator) -> Tensor:
-    """The box with edges moved at random, within the photograph."""
-    sides = (box[2:] - box[:2]).repeat(2)
-    moved = box + BOX_ERROR * sides * torch.randn(4, generator=generator)
-    height, width = SIZE
-    low = torch.tensor([-0.5, -0.5, -0.5, -0.5])
-    high = torch.tensor([width - 0.5, height - 0.5, width - 0.5, height - 0.5])
-    return torch.minimum(torch.maximum(moved, low), high)
+def _generator(photograph: Photograph) -> torch.Generator:
+    """Of what is drawn for another condition of a photograph."""
+    return torch.Generator().manual_seed(int(1000 * photograph.box.sum().abs()))

@@ -201,7 +201,7 @@ class RegisterOptions:
     unit: str | None = _option(
         None,
         "of the mesh file, and of lengths in and out (default: that which the file states, as "
-        "STEP, IGES, 3MF, Collada "
+        "STEP, IGES, 3MF, Collada, USD "
         "and URDF do; else m; for a BOP scene mm)",
         choices=sorted(UNITS),
     )

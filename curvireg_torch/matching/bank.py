@@ -354,7 +354,8 @@ def _pack(mask: Tensor) -> Tensor:
         return torch.from_numpy(np.packbits(mask.numpy(), axis=1))
     bits = F.pad(mask, (0, -mask.shape[1] % 8)).unflatten(1, (-1, 8)).to(torch.uint8)
     values = torch.tensor(PIXEL_BITS, dtype=torch.uint8, device=mask.device)
-    return (bits * values).sum(dim=2, dtype=torch.uint8)
+    packed: Tensor = (bits * values).sum(dim=2, dtype=torch.uint8)
+    return packed
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:

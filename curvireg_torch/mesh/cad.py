@@ -6,7 +6,6 @@ import sys
 import tempfile
 import warnings
 import xml.etree.ElementTree as ET
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,9 @@ from ..errors import (
     MAX_CAD_SECONDS,
     MAX_MESH_BYTES,
     MAX_MESH_PARTS,
-    MissingDependencyError,
 )
 from ..utils.choices import UNITS
+from ..utils.extras import check_extras
 from ..utils.pictures import picture_format
 from .gltf import read_gltf
 from .scenes import joined_scene
@@ -48,17 +47,6 @@ _CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
 _IGES_FLAGS = {b"1": "in", b"2": "mm", b"4": "ft", b"6": "m", b"10": "cm"}
 
 
-def check_extra(package: str, suffix: str) -> None:
-    """Refuse a format whose package is not installed, with the commands that install it."""
-    if find_spec(package) is None:
-        text = (
-            f"{suffix} files need {package}: pip install 'curvireg_torch[cad]', in a checkout "
-            f"pip "
-            f"install -e '.[cad]'"
-        )
-        raise MissingDependencyError(text)
-
-
 def bounded(source: MeshSource) -> bytes:
     """The content of a file whose reader takes much more memory than the file."""
     if source.path.stat().st_size > MAX_CAD_BYTES:
@@ -72,7 +60,7 @@ def read_step(source: MeshSource) -> ReadMesh:
     """Read a STEP or IGES file: in its own unit where that is one of ``UNITS``, else in metres; z
     is up."""
     suffix = source.path.suffix.lower()
-    check_extra("cascadio", suffix)
+    check_extras([source.path])
     data = bounded(source)
     is_iges = suffix in (".igs", ".iges")
     if not is_iges and not data.lstrip().startswith(b"ISO-10303-21"):
@@ -189,7 +177,7 @@ class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
 
 def read_collada(source: MeshSource) -> ReadMesh:
     """Read a Collada file in its own unit and axes."""
-    check_extra("collada", ".dae")
+    check_extras([source.path])
     data = bounded(source)
     check_xml(data)
     root = ET.fromstring(data)

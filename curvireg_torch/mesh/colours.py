@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
 from ..utils.pictures import PICTURE_STARTS, open_picture
+from ..utils.rows import Rows
 
 TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
 SAMPLES = 20_000  # Points of the surface at which colours are compared
@@ -27,7 +28,7 @@ _Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]
 
 
 @dataclass(frozen=True)
-class SurfaceColours:
+class SurfaceColours(Rows):
     """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a
     texture.
 
@@ -42,14 +43,6 @@ class SurfaceColours:
     uv: NDArray[np.float32]
     texture: NDArray[np.int32]
     textures: tuple[NDArray[np.uint8], ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.corners)
-
-    def __getitem__(self, faces: Any) -> "SurfaceColours":
-        return SurfaceColours(
-            self.corners[faces], self.uv[faces], self.texture[faces], self.textures
-        )
 
     def check(self, faces: int) -> None:
         """Raise ValueError unless these are valid colours of ``faces`` faces."""
@@ -71,7 +64,7 @@ class SurfaceColours:
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
 
     @classmethod
-    def concatenate(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
+    def cat(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
         """The colours of a mesh that is made of several, which may share textures."""
         textures = {id(texture): texture for part in parts for texture in part.textures}
         number = {key: k for k, key in enumerate(textures)}

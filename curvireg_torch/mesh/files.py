@@ -21,11 +21,12 @@ from .source import MeshSource, ReadMesh, plain_text
 from .stl import read_stl
 from .threemf import read_threemf
 from .urdf import read_urdf
+from .usd import read_usd
 
 # it would print tracebacks of files that it cannot read
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 # Formats whose files may name buffers, material files, textures or meshes beside them
-_WITH_COMPANIONS = (".dae", ".glb", ".gltf", ".obj", ".ply", ".urdf")
+_WITH_COMPANIONS = (".dae", ".glb", ".gltf", ".obj", ".ply", ".urdf", ".usd", ".usda", ".usdc")
 
 
 def mesh_files(path: Path, *, textures: Iterable[Path] = ()) -> list[Path]:
@@ -113,4 +114,8 @@ READERS: dict[str, Callable[[MeshSource], ReadMesh]] = {
     ".step": read_step,
     ".stl": read_stl,
     ".stp": read_step,
+    ".usd": read_usd,
+    ".usda": read_usd,
+    ".usdc": read_usd,
+    ".usdz": read_usd,
 }

@@ -113,10 +113,9 @@ def _check_sizes(tree: dict[str, Any]) -> None:
 
     def count(index: Any) -> int:
         accessor = accessors[_natural(index)]
-        if "sparse" in accessor or "bufferView" not in accessor:
+        if "sparse" not in accessor and "bufferView" not in accessor:
             raise ValueError(
-                "an accessor of a part is sparse or without data, which is not read; export "
-                "without it"
+                "an accessor of a part has no data, as in compressed files; export without it"
             )
         return int(accessor["count"])
 
@@ -261,7 +260,7 @@ class _File:
         plain = SurfaceColours.plain(len(faces))
         material = self._tree["materials"][_natural(part["material"])] if "material" in part else {}
         factor, info = _base_colour(material)
-        tint = np.broadcast_to(_srgb(factor), (len(faces), 3, 3))
+        tint = np.broadcast_to(srgb(factor), (len(faces), 3, 3))
         if "COLOR_0" in attributes:
             colours = self._accessor(attributes["COLOR_0"], normalized=True)[:, :3]
             if colours.shape != (count, 3):
@@ -329,28 +328,48 @@ class _File:
         """(count, width) values of an accessor as float64; integers that stand for fractions are
         divided."""
         accessor = self._tree["accessors"][_natural(index)]
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError(
-                "an accessor is sparse or without data, which is not read; export without it"
-            )
         kind = np.dtype(_TYPES[accessor["componentType"]])
         width = _WIDTHS[accessor["type"]]
-        count = accessor["count"]
-        view = self._tree["bufferViews"][_natural(accessor["bufferView"])]
-        data = self._view(accessor["bufferView"])
-        start = _natural(accessor.get("byteOffset", 0))
-        size = width * kind.itemsize
-        stride = _natural(view.get("byteStride", 0)) or size
-        if count and start + stride * (count - 1) + size > len(data):
-            raise ValueError("an accessor is longer than its data; the file ends too early")
-        stored: NDArray[Any] = np.ndarray(
-            (count, width), kind, data, start, (stride, kind.itemsize)
-        )
+        stored = self._stored(accessor, kind, width, accessor["count"])
+        if "sparse" in accessor:
+            stored = self._with_exceptions(stored, accessor["sparse"])
         if as_stored or kind.kind == "f":
             return stored if as_stored else stored.astype(np.float64)
         values = stored.astype(np.float64)
         if normalized or accessor.get("normalized"):
             values = np.maximum(values / np.iinfo(kind).max, -1.0)
+        return values
+
+    def _stored(
+        self, place: dict[str, Any], kind: np.dtype[Any], width: int, count: int
+    ) -> NDArray[Any]:
+        """(count, width) values at the ``place`` in a view that an accessor, or a part of one,
+        names; zeros where it names none."""
+        if "bufferView" not in place:
+            return np.zeros((count, width), kind)
+        view = self._tree["bufferViews"][_natural(place["bufferView"])]
+        data = self._view(place["bufferView"])
+        start = _natural(place.get("byteOffset", 0))
+        size = width * kind.itemsize
+        stride = _natural(view.get("byteStride", 0)) or size
+        if count and start + stride * (count - 1) + size > len(data):
+            raise ValueError("an accessor is longer than its data; the file ends too early")
+        return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+    def _with_exceptions(self, stored: NDArray[Any], sparse: dict[str, Any]) -> NDArray[Any]:
+        """Values of a sparse accessor: those stored, but for some, which are named one by one."""
+        count = _natural(sparse["count"])
+        if count > len(stored):
+            raise ValueError("a sparse accessor names more values than it has")
+        places = sparse["indices"]
+        if "bufferView" not in places or "bufferView" not in sparse["values"]:
+            raise ValueError("a sparse accessor has no data")
+        kind = np.dtype(_TYPES[places["componentType"]])
+        index = self._stored(places, kind, 1, count)[:, 0].astype(np.int64)
+        if count and not 0 <= index.min() <= index.max() < len(stored):
+            raise ValueError("a sparse accessor names a value that it does not have")
+        values = stored.copy()
+        values[index] = self._stored(sparse["values"], stored.dtype, stored.shape[1], count)
         return values
 
     def _view(self, index: Any) -> memoryview:
@@ -422,7 +441,8 @@ def _base_colour(material: dict[str, Any]) -> tuple[NDArray[np.float64], dict[st
     return as_plain_numbers(factor, 4, (1.0,) * 4)[:3], info
 
 
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+def srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear colours as the values in [0, 1] that pictures store."""
     x = np.clip(np.nan_to_num(linear), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 

@@ -51,8 +51,8 @@ def load_mesh(
         path: .obj, .ply, .stl, .off, .glb, .gltf, .3mf or .urdf; with the extra ``cad`` also .step,
             .stp, .iges, .igs and .dae.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
-            None: that which the file itself states (STEP, IGES, 3MF, Collada; URDF is in m), else
-            m. An object that would be smaller than 5 mm or larger than 100 m gets a warning.
+            None: that which the file itself states (STEP, IGES, 3MF, Collada, USD; URDF is in m),
+            else m. An object below 5 mm or above 100 m gets a warning.
         up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
             ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
             other formats.

@@ -23,7 +23,7 @@ class MeshWarning:
     ``mesh.metadata["warnings"]``.
 
     Attributes:
-        kind: "texture", "material", "stray", "skin", "precision", "cut" or "link".
+        kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
         text: one sentence, without the name of the file.
     """
 
@@ -78,7 +78,7 @@ class ReadMesh:
         colours = None
         if any(part.colours is not None for part in parts):
             known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
-            colours = SurfaceColours.concatenate(known)
+            colours = SurfaceColours.cat(known)
         return cls(vertices, faces, colours, unit, up)
 
 

@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
+from ..evidence import Evidence
+from ..geometry.viewpoint import angles_between
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, Pipeline
 
@@ -29,6 +30,7 @@ CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
 RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals
+ROUNDING = 5e-4  # of these degrees: many views of a bank are 30 degrees apart
 
 Features = Mapping[str, float | None]  # by name; None where there is no rival view to compare with
 
@@ -132,10 +134,8 @@ def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = No
 
     ``symmetries`` are (K, 4, 4) or (K, 3, 3).
     """
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = rotation.to(rotations) @ group.to(rotations)
-    traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
-    return traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
+    angles = angles_between(rotation[None].to(rotations), rotations, symmetries)[0]
+    return angles <= RIVAL_ANGLE + ROUNDING
 
 
 def concentration(scores: Tensor, near: Tensor) -> float | None:
@@ -172,7 +172,7 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
 
 
 def confidence_features(
-    evidence: Tensor,
+    evidence: Evidence,
     scores: Tensor,
     share: float | None,
     *,
@@ -187,7 +187,7 @@ def confidence_features(
     of its rivals, clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
+        evidence: of the H hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
@@ -196,23 +196,22 @@ def confidence_features(
         focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count
             as 1.
     """
-    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
+    best = evidence.named(0)
     rivals = scores[1:]
     margin = (
         min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
     )
-    values = (
-        similarity,
-        margin,
-        edge_support,
-        share,
-        landmarks,
-        undetermined,
-        outside,
-        border,
-        min(focal, 1.0),
-    )
-    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
+    return {
+        "similarity": best["similarity"],
+        "margin": margin,
+        "edge_support": best["edge_support"],
+        "concentration": share,
+        "landmarks": best["landmarks"],
+        "undetermined": undetermined,
+        "outside": outside,
+        "border": border,
+        "focal": min(focal, 1.0),
+    }
 
 
 def resolution(*, exact: bool) -> float:

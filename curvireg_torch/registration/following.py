@@ -45,7 +45,9 @@ class Follower:
 
     Args:
         registrar: of one mesh, with a bank of all views; or a mesh, see :class:`Registrar`.
-        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames.
+        camera_matrix: (3, 3) in px, or a :class:`Camera`, of all frames. None estimates it, in the
+            frames that are registered until one is believed, whose camera is kept; distances are
+            then proportional to its focal length.
         prior: limits on the pose in frames that are registered.
 
     Example:
@@ -59,12 +61,20 @@ class Follower:
     """
 
     def __init__(
-        self, registrar: Any, camera_matrix: Tensor | Camera, *, prior: PosePrior | None = None
+        self,
+        registrar: Any,
+        camera_matrix: Tensor | Camera | None = None,
+        *,
+        prior: PosePrior | None = None,
     ) -> None:
         self.registrar = registrar if isinstance(registrar, Registrar) else Registrar(registrar)
         if self.registrar.others:
             raise InvalidInputError(
                 "Follower: expected a registrar of one mesh, which is followed, got several"
+            )
+        if camera_matrix is None and not self.registrar.is_exact:
+            raise InvalidInputError(
+                "Follower: a similar mesh does not show the focal length; give the camera"
             )
         self.camera_matrix = camera_matrix
         self.prior = prior
@@ -72,6 +82,14 @@ class Follower:
         self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
+
+    @property
+    def _fits_camera(self) -> bool:
+        """Whether registrations fit the focal length, which is then kept for tracking."""
+        camera = self.camera_matrix
+        return camera is None or (
+            isinstance(camera, Camera) and camera.focal_deviation > 0.0 and not camera.distorts
+        )
 
     @torch.no_grad()
     def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
@@ -85,10 +103,12 @@ class Follower:
 
         Raises:
             InvalidInputError: ``pose`` is not rigid and finite, ``confidence`` is no probability,
-                or the frame cannot be used.
+                the camera is not known, or the frame cannot be used.
             LostObjectError: at ``pose`` the mesh lies behind the camera, or outside the frame.
             ImageError: pixels around the mesh are outside [0, 1].
         """
+        if self.camera_matrix is None:
+            raise InvalidInputError("start: a known pose needs the camera; give camera_matrix")
         T = as_numbers(pose, "pose", dtype=torch.float64)
         check_tensor(T, "pose", (4, 4))
         check_pose(T, "pose")
@@ -162,8 +182,11 @@ class Follower:
             [image], None if box is None else [box], self.camera_matrix, prior=self.prior
         )[0]
         if isinstance(result, Registration) and _confidence(result) >= least:
+            pose, K = result.projection
             with suppress(LostObjectError, ImageError):
-                self._start(item, result.projection[0], _confidence(result))
+                self._start(replace(item, camera_matrix=K), pose, _confidence(result))
+                if self._fits_camera:
+                    self.camera_matrix = result.camera
         return result
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
@@ -196,7 +219,13 @@ class Follower:
         features = dict(tracked.features)
         ranking = Ranking.none()
         return Registration(
-            (hypothesis,), probabilities, ranking, features, warnings=warnings, notes=notes
+            (hypothesis,),
+            probabilities,
+            ranking,
+            features,
+            warnings=warnings,
+            notes=notes,
+            camera=item.camera,
         )
 
 

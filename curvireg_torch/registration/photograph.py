@@ -8,9 +8,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..terms import QueryFeatures
 from .confidence import are_near
+from .described import evidence_of
 from .focal import FINISHED
 from .inputs import ImageItem, check_crop
 from .judging import judged
@@ -22,7 +24,6 @@ from .poses import (
     common_score,
     distinct_poses,
     fit_texture_of,
-    pose_scores,
     projected_box,
     with_edge_support,
     with_quick_fit,
@@ -40,7 +41,6 @@ from .unknown_camera import (
 )
 from .work import (
     Work,
-    features_of,
     fitted_poses,
     landmark_poses,
     least_starts,
@@ -63,7 +63,9 @@ def register_item(target: Target, item: ImageItem) -> Registration:
         if item.shows_other_part(box):
             with suppress(CurviregError):
                 again = _register_box(target, replace(item, box=box.float()))
-                if common_score(again.hypotheses[0]) > common_score(result.hypotheses[0]):
+                weights = target.score_weights(exact=True)
+                new = common_score(again.hypotheses[0], weights)
+                if new > common_score(result.hypotheses[0], weights):
                     result = replace(again, corrected_box=box)
     return result
 
@@ -98,25 +100,25 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
             )
         finish = FINISHED_FITS if work.starts is None else FINISHED
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
-    features = features_of(target, work, poses)
-    sibling: tuple[Poses, Tensor] | None = None
+    evidence = evidence_of(target, work, poses)
+    sibling: tuple[Poses, Evidence] | None = None
     if work.crops is not None and work.exact:
         if work.item.focal_deviation:
-            poses, features = with_fitted_focal_lengths(
-                target, work, work.crops, poses, features, outside
+            poses, evidence = with_fitted_focal_lengths(
+                target, work, work.crops, poses, evidence, outside
             )
-        poses, features = fitted_again(target, work, work.crops, poses, features, outside)
-        poses, features, sibling = with_siblings(target, work, work.crops, poses, features, outside)
-        poses, features = _with_texture(target, work, work.crops, poses, features, outside)
+        poses, evidence = fitted_again(target, work, work.crops, poses, evidence, outside)
+        poses, evidence, sibling = with_siblings(target, work, work.crops, poses, evidence, outside)
+        poses, evidence = _with_texture(target, work, work.crops, poses, evidence, outside)
     inside = (~outside).nonzero()[:, 0]
-    scores = pose_scores(features[inside], exact=work.exact)
+    scores = evidence[inside].scores(target.score_weights(exact=work.exact))
     distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
     # Unlike another view, these started near the pose that they merged with: they are no
     # rivals.
     other = (distinct | ~repeated).nonzero()[:, 0]
     starts = starts[other]
     poses = poses[other]
-    features = features[other]
+    evidence = evidence[other]
     distinct = distinct[other]
     outside = outside[other]
     keep = _kept(target, work, poses, distinct, outside)
@@ -128,15 +130,15 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         if work.crops is not None:
             restored = with_edge_support(target.describer, work.crops, restored)
         poses = poses.replaced(back, restored)
-        features = features.index_copy(0, back, features_of(target, work, restored))
+        evidence = evidence.replaced(back, evidence_of(target, work, restored))
     if work.crops is not None and work.item.focal_deviation:
-        work, poses = with_focal_deviation(target, work, work.crops, poses, features, outside)
+        work, poses = with_focal_deviation(target, work, work.crops, poses, evidence, outside)
     if sibling is not None:
         poses = Poses.cat([poses, sibling[0]])
-        features = torch.cat([features, sibling[1]])
+        evidence = Evidence.cat([evidence, sibling[1]])
         distinct = F.pad(distinct, (0, 1), value=True)
         outside = F.pad(outside, (0, 1))
-    return judged(target, work, poses, features, distinct, outside)
+    return judged(target, work, poses, evidence, distinct, outside)
 
 
 def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
@@ -151,9 +153,17 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     if target.pipeline.contours:
         mask = target.object_mask(query, [item])
         crops = EdgeCrops.cut([item.image], item.box[None], target.bank.settings.margin, mask)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    descriptor = target.describer.descriptor(query.field)
-    return Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
+    return Work(
+        query=query,
+        ranking=ranking,
+        descriptor=target.describer.descriptor(query.field),
+        crops=crops,
+        landmarks=target.landmark_matches(item, item.box) if target.uses_landmarks else None,
+        item=item,
+        limits=limits,
+        exact=exact,
+        symmetries=symmetries,
+    )
 
 
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
@@ -223,18 +233,18 @@ def _searched(target: Target, work: Work) -> Registration:
         poses = work.limits.moved_inside(poses)
     distinct = torch.ones(len(poses), dtype=torch.bool)
     by_rank = replace(work, exact=False)
-    return judged(target, by_rank, poses, features_of(target, work, poses), distinct, ~distinct)
+    return judged(target, by_rank, poses, evidence_of(target, work, poses), distinct, ~distinct)
 
 
 def _with_texture(
-    target: Target, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-) -> tuple[Poses, Tensor]:
+    target: Target, work: Work, crops: EdgeCrops, poses: Poses, evidence: Evidence, outside: Tensor
+) -> tuple[Poses, Evidence]:
     """Fit the best pose to the mesh's colours as well."""
-    best = best_inside(features, outside)
+    best = best_inside(target, evidence, outside)
     fitted = fit_texture_of(target.describer, crops, poses, int(best))
     if fitted is None:
-        return poses, features
-    return with_replaced(work, poses, features, best, fitted, features_of(target, work, fitted))
+        return poses, evidence
+    return with_replaced(work, poses, evidence, best, fitted, evidence_of(target, work, fitted))
 
 
 def _kept(target: Target, work: Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:

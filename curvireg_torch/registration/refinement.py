@@ -13,6 +13,7 @@ from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
+from .described import DescribedPhotograph, evidence_of
 from .focal import focal_covariance
 from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .photograph import register
@@ -22,10 +23,6 @@ from .poses import (
     fit_poses,
     fit_texture_of,
     hypothesis_of,
-    named_features,
-    pose_features,
-    pose_scores,
-    similarities,
 )
 from .result import FailedRegistration, Registration
 from .starts import why_outside
@@ -135,15 +132,13 @@ def refine_item(
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
     poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
 
-    def features_of(poses: Poses) -> Tensor:
-        views = describer.descriptors(poses.rotation, poses.distance)
-        return pose_features(poses, similarities(views, descriptors))
-
-    best = pose_scores(features_of(poses), exact=True).argmax()[None]
+    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, landmarks=None)
+    weights = target.score_weights(exact=True)
+    best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
         poses = poses.replaced(best, fitted)
-    evidence = features_of(poses)
-    scores = pose_scores(evidence, exact=True)
+    evidence = evidence_of(target, photograph, poses)
+    scores = evidence.scores(weights)
     distinct = distinct_poses(poses, scores, target.symmetries_of(exact=True))
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     if item.focal_deviation:
@@ -151,7 +146,7 @@ def refine_item(
         covariance, deviation = focal_covariance(describer, crops, poses[first], item)
         poses = replace(poses, covariance=poses.covariance.index_copy(0, first, covariance))
         item = replace(item, focal_deviation=deviation)
-    hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
+    hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
     if confidence < LOST_CONFIDENCE:
@@ -171,11 +166,10 @@ def refine_item(
         )
     warnings = item.warnings + target.mesh_warnings
     notes = target.mesh_notes
-    ranking = Ranking.none()
     return Registration(
         hypotheses,
         probabilities,
-        ranking,
+        photograph.ranking,
         dict(features),
         warnings=warnings,
         notes=notes,

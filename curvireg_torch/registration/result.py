@@ -529,22 +529,31 @@ def camera_in_words(document: Mapping[str, Any]) -> list[str]:
     """A line about a camera that was not given exactly: where it is from, and how well its focal
     length is known."""
     camera = document["camera"]
-    if camera is None or not camera["focal_deviation"]:
-        return []
-    picture = document["inputs"]["picture"]
-    widths = camera["matrix"][0][0] / picture["width"]
-    deviation = 100.0 * camera["focal_deviation"]
+    line = "" if camera is None else focal_length_in_words(camera, document["inputs"]["picture"])
+    return [line] if line else []
+
+
+def focal_length_in_words(
+    camera: Mapping[str, Any], picture: Mapping[str, Any] | None = None
+) -> str:
+    """Where a camera, as :meth:`.Camera.describe` has it, is from, and how well its focal length is
+    known; "" if it was given exactly. ``picture`` has the ``focal_35mm`` of the EXIF data."""
+    if not camera["focal_deviation"]:
+        return ""
     if camera["source"] == "exif":
-        return [f"camera: from the file's EXIF, {picture['focal_35mm']:g} mm"]
+        millimetres = "" if picture is None else f", {picture['focal_35mm']:.3g} mm"
+        return f"camera: from the file's EXIF{millimetres}"
+    widths = camera["matrix"][0][0] / camera["size"][1]
+    deviation = 100.0 * camera["focal_deviation"]
     known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
     if camera["source"] == "given":
-        return [f"camera: field of view given, focal length {known}"]
+        return f"camera: field of view given, focal length {known}"
     weak = (
         ", as perspective is too weak to measure it"
         if camera["focal_deviation"] > WEAK_PERSPECTIVE
         else ""
     )
-    return [f"camera: focal length estimated, {known}{weak}"]
+    return f"camera: focal length estimated, {known}{weak}"
 
 
 def view_in_words(view: Mapping[str, Any]) -> str:

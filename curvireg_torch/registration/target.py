@@ -11,6 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.landmarks import LandmarkMatches, Landmarks
 from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
@@ -67,6 +68,10 @@ class Target:
             return self.symmetries
         with _SHAPE_LOCK:  # photographs share them
             return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
+
+    def score_weights(self, *, exact: bool) -> EvidenceWeights:
+        """What evidence counts for with an exact mesh, or with a similar one."""
+        return EvidenceWeights() if exact else RANK_ALONE
 
     @cached_property
     def telling_symmetries(self) -> Tensor:

@@ -26,7 +26,7 @@ from ..fitting.least_squares import (
 from ..fitting.regions import RegionModel, line_posterior
 from ..fitting.texture_fit import surface_corners
 from ..geometry import rotation_error
-from ..geometry.cameras import projected_boxes, transform
+from ..geometry.cameras import point_in_cameras, pose_around, projected_boxes
 from ..rendering import DepthRenderer
 from ..rendering.contours import MeshContours
 from .confidence import RELIABLE, tracking_confidence
@@ -175,11 +175,10 @@ class Tracker:
         the last pose."""
         if len(self._poses) < 2:
             return [self.last_pose]
-        (R0, c0), (R1, c1) = (
-            (T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses
-        )
-        R = R1 @ R0.mT @ R1
-        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), self.last_pose]
+        before, last = self._poses
+        R = last[:, :3, :3] @ before[:, :3, :3].mT @ last[:, :3, :3]
+        place = 2.0 * point_in_cameras(last, self.centre) - point_in_cameras(before, self.centre)
+        return [pose_around(R, place, self.centre), self.last_pose]
 
     def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose around a start (1, 4, 4)."""

@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches
 from ..fitting.measured_fit import measure_contours
-from ..matching import Ranking
-from ..terms import QueryFeatures
 from ..utils.company import map_in_company
 from ..utils.precision import exact_convolutions
 from ..utils.threads import map_on_threads
+from .described import DescribedPhotograph
 from .inputs import ImageItem
-from .poses import Poses, compare_with_photograph, fit_poses, landmark_evidence, pose_features
+from .poses import Poses, fit_poses
 from .priors import Limits
 from .result import FailedRegistration
 from .target import Target, nearest_view
@@ -32,21 +32,22 @@ two, none with three or five."""
 KEPT_LANDMARKS = 0.5
 
 
-@dataclass(frozen=True)
-class Work:
-    """A photograph under work, with ``descriptor`` (1, D) on a grid twice as fine as the bank's,
-    ``crops`` for contour fits, and ``landmarks`` in the box, if there are any; ``starts`` with
-    several cameras if the camera is unknown."""
+@dataclass(frozen=True, kw_only=True)
+class Work(DescribedPhotograph):
+    """A photograph under work.
+
+    Attributes:
+        item: what is known of it.
+        limits: of its poses, if there are any.
+        exact: whether the mesh is that of this very object.
+        symmetries: (S, 4, 4) of the object, or None.
+        starts: with several cameras if the camera is unknown.
+    """
 
     item: ImageItem
-    query: QueryFeatures
-    ranking: Ranking
-    descriptor: Tensor
     limits: Limits | None
     exact: bool
     symmetries: Tensor | None
-    crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
     starts: Poses | None = None
 
 
@@ -117,18 +118,6 @@ def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Pos
     return replace(poses, view=views), torch.tensor([float(pose.count) for pose in found])
 
 
-def features_of(target: Target, work: Work, poses: Poses) -> Tensor:
-    """(H, F) :data:`POSE_FEATURES`."""
-    given = work.query, work.descriptor, work.ranking
-    similarity, appearance = compare_with_photograph(target, *given, poses.rotation, poses.distance)
-    landmarks = (
-        None
-        if work.landmarks is None
-        else landmark_evidence(work.landmarks.agreeing(poses.T, poses.cameras))
-    )
-    return pose_features(poses, similarity, appearance, landmarks)
-
-
 def fitted_poses(
     target: Target, work: Work, crops: EdgeCrops, starts: Poses, **options: Any
 ) -> Poses:
@@ -149,10 +138,10 @@ def fitted_poses(
 
 
 def with_replaced(
-    work: Work, poses: Poses, features: Tensor, index: Tensor, fitted: Poses, new: Tensor
-) -> tuple[Poses, Tensor]:
-    """Put ``fitted`` poses with ``new`` features in the places ``index``, unless that exceeds
+    work: Work, poses: Poses, evidence: Evidence, index: Tensor, fitted: Poses, new: Evidence
+) -> tuple[Poses, Evidence]:
+    """Put ``fitted`` poses with ``new`` evidence in the places ``index``, unless that exceeds
     the limits."""
     if work.limits is not None and not bool(work.limits.keeps(fitted)):
-        return poses, features
-    return poses.replaced(index, fitted), features.index_copy(0, index, new)
+        return poses, evidence
+    return poses.replaced(index, fitted), evidence.replaced(index, new)

@@ -1,8 +1,7 @@
 """Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered
 picture."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
+from ..utils.rows import Rows
 from .embree import RayScene, float32
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
@@ -40,7 +40,7 @@ BEHIND = 16  # Bit of a vertex nearer than that
 
 
 @dataclass(frozen=True)
-class ContourPoints:
+class ContourPoints(Rows):
     """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals``
     (N, P, 2) across the contour in the image; False in ``valid`` (N, P) marks padding. ``outline``
     (N, P) marks points with the background beside them. Normals of occluding contours point
@@ -50,15 +50,6 @@ class ContourPoints:
     normals: Tensor
     valid: Tensor
     outline: Tensor
-
-    def __getitem__(self, index: Tensor) -> "ContourPoints":
-        return ContourPoints(*(getattr(self, f.name)[index] for f in fields(ContourPoints)))
-
-    @staticmethod
-    def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
-        return ContourPoints(
-            *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints))
-        )
 
 
 class Contours(Protocol):

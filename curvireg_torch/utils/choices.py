@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import InvalidInputError, MissingFileError
+from .extras import check_extras
 
 RENDERER_NAMES = ("auto", "embree", "pyrender")  # renderers
 DEFAULT = "learned"  # the default preset
@@ -43,6 +44,10 @@ MESHES = (
     ".igs",
     ".dae",
     ".urdf",
+    ".usd",
+    ".usda",
+    ".usdc",
+    ".usdz",
 )
 MESHES_AND_BANKS = (*MESHES, ".safetensors")  # suffixes of file names, in lower case
 
@@ -93,8 +98,15 @@ def is_one_photograph(paths: Sequence[Path]) -> bool:
     )
 
 
-def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | None = None) -> None:
-    """Refuse files of another kind, swapped files, and a missing list, mesh or only photograph.
+def check_given(
+    photos: Sequence[Path],
+    meshes: Sequence[Path],
+    listed: Path | None = None,
+    *,
+    packages: Sequence[str] = (),
+) -> None:
+    """Refuse files of another kind, swapped files, a missing list, mesh or only photograph, and
+    files whose readers are not installed, together with ``packages`` that are not.
 
     Of several photographs, those that are missing are reported later, each by itself.
     """
@@ -131,3 +143,4 @@ def check_given(photos: Sequence[Path], meshes: Sequence[Path], listed: Path | N
     for path, kind in required:
         if not path.is_file():
             raise MissingFileError(f"no such file; check the path of the {kind}", subject=path)
+    check_extras([path for path, _ in required], packages)

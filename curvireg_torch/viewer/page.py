@@ -20,6 +20,7 @@ STAGES: Mapping[str, str] = {
     "search": "searching around the best views",
     "contours": "fitting contours",
 }
+EXAMINING = "Looking for sides that look alike."
 BOX_HINT = (
     "Drag a rectangle around the object. Without one the whole photograph is searched: "
     "slower, "
@@ -55,6 +56,7 @@ def build_page(workspace: Workspace) -> None:
             inputs = Inputs(workspace)
 
     async def refresh() -> None:
+        workspace.examination.start_if_due(searching=workspace.searching)
         steps.refresh()
         inputs.refresh()
         await stage.refresh()
@@ -102,6 +104,7 @@ class Steps:
                                 "quiet",
                             )
                     if name == "mesh":
+                        self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
                         self.use_mm = button(
                             "Use mm",
                             lambda: workspace.set_option("unit", "mm"),
@@ -139,6 +142,8 @@ class Steps:
             card.classes(**{"add" if done[name] else "remove": "done"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
+        examining = EXAMINING if workspace.examination.running else ""
+        set_text(self.facts["advice"], workspace.examination.advice or examining)
         box = " ".join(f"{v:g}" for v in shot.box or ())
         set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())

@@ -3,10 +3,10 @@ no NiceGUI."""
 
 import math
 import re
-import shlex
+import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,24 +37,12 @@ from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_unit, mesh_up, me
 from ..registration import Registrar, Registration
 from ..utils.files import only_in
 from ..visualization.pose_glb import mesh_glb
+from .programs import command_line, python_program
 from .shot import Answer, Numbers, Result, Shot, numbers
 
 STATIC = Path(__file__).parent / "static"  # parts of the page, and the files of its sample
 Found = tuple[Registration, dict[str, Any], Sequence[View]]
 UNPACKED = "parts"  # the folder of what was in an archive
-_OPTIONS = (
-    "unit",
-    "link",
-    "textures",
-    "up",
-    "pose",
-    "mesh_is",
-    "preset",
-    "pipeline",
-    "renderer",
-    "device",
-)
-_DEFAULTS = {option.name: option.default for option in fields(RegisterOptions)}
 
 
 @dataclass
@@ -86,6 +74,7 @@ class Session:
     progress: tuple[str, int, int] = ("", 0, 1)
     cancelled: bool = False
     _registrar: tuple[RegisterOptions, Registrar] | None = None
+    _opening: threading.Lock = field(default_factory=threading.Lock)
 
     def load(self) -> None:
         """Open the files that the options name, and take their box."""
@@ -385,7 +374,7 @@ class Session:
         photograph, or boxes and photographs that a rig does not have."""
         if self.shot.view is None:
             return (
-                "" if self.shot.is_undistorted else _command_line(self.request(), self.usable_name)
+                "" if self.shot.is_undistorted else command_line(self.request(), self.usable_name)
             )
         shots = self.together()
         if (
@@ -394,7 +383,7 @@ class Session:
             or not all(shot.has_box_of_view for shot in shots)
         ):
             return ""
-        return _command_line(
+        return command_line(
             self.request(), self.name, "SCENE" if self.rig_path.is_dir() else self.rig_name
         )
 
@@ -415,11 +404,11 @@ class Session:
             raise InvalidInputError("a pose prior: photographs of a rig take none; press No prior")
         self.searched = tuple(shots)
         try:
-            registrar = self._open_registrar(request)
-            registrar.progress = self._report_progress
+            registrar = self.open_registrar(request, self.report_progress)
+            registrar.progress = self.report_progress
             register = self._register_alone if shot.view is None else self._register_rig
             found, boxes = register(shots, request, registrar, time.perf_counter() - start)
-            self._report_progress("contours", 1, 1)  # it may have been stopped in the last step
+            self.report_progress("contours", 1, 1)  # it may have been stopped in the last step
         except CurviregError as error:
             raise (CurviregError("stopped") if self.cancelled else error) from None
         finally:
@@ -491,58 +480,7 @@ class Session:
 
     def python(self) -> str:
         """A Python program that gives the answer."""
-        result = self.shot.require_result()
-        (request, boxes), prior = result.inputs, result.registration.prior
-        mesh = repr(self.usable_name(request.meshes[0]))
-        rows = result.document.get("photographs", [])
-        photos = [repr(self.usable_name(path)) for path in request.photos]
-        if self.shot.is_undistorted:
-            read = (
-                "cr.geometry.undistorted(cr.data.read_photo({}).image, "
-                "cr.load_camera('CALIBRATION')).image"
-            )
-            photos = list(map(read.format, photos))
-        more = {
-            name: getattr(request, name)
-            for name in ("link", "textures")
-            if getattr(request, name) is not None
-        }
-        given = "".join(f", {name}={str(value)!r}" for name, value in more.items())
-        model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r}{given})"
-        model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
-        pipeline = (
-            f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
-        )
-        pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
-        pipeline = f"{pipeline}.with_pose_prior({request.pose!r})" if request.pose else pipeline
-        pipeline = "None" if request.bank_decides and not request.pose else pipeline
-        if result.photographs:
-            call = [
-                f"cameras = {[row['camera']['matrix'] for row in rows]}",
-                f"T_cam_from_world = {[row['T_cam_from_world'] for row in rows]}",
-                f"photos, boxes = [{', '.join(photos)}], {list(boxes)}",
-                "result = registrar.register_views(photos, boxes, cameras, T_cam_from_world)",
-            ]
-        else:
-            call = [
-                f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
-                f"box, camera = {request.box}, {result.document['inputs']['camera']}",
-                f"result = cr.register({photos[0]}, registrar, box=box, camera=camera, "
-                f"prior=prior)",
-            ]
-        lines = [
-            "import curvireg_torch as cr",
-            "",
-            f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
-            *call,
-            f"pose = result.hypotheses[{result.answer.number}].pose_dict()",
-            *(
-                [f"pose = {result.answer.pose.pose_dict()}  # corrected by hand"]
-                if result.answer.edits
-                else []
-            ),
-        ]
-        return "\n".join([*lines, "print(pose)", ""])
+        return python_program(self.shot, self.usable_name)
 
     def describe_warning(self, warning: Warning) -> str:
         """The text of a warning, with the user's name of its file."""
@@ -550,17 +488,27 @@ class Session:
             warning = warning.with_subject(self.name(warning.subject))
         return str(warning)
 
-    def _report_progress(self, stage: str, done: int, total: int) -> None:
+    def report_progress(self, stage: str, done: int, total: int) -> None:
+        """Show progress, and end a registration that was stopped."""
         self.progress = (stage, done, total)
         if self.cancelled:
             raise CurviregError("stopped")
 
-    def _open_registrar(self, request: RegisterOptions) -> Registrar:
-        """The registrar of a mesh and options; the last one is reused."""
-        key = replace(request, photos=(), box=None, limits=None, camera=None, guess=None)
-        if self._registrar is None or self._registrar[0] != key:
-            self._registrar = key, open_registrar(key, key.meshes, progress=self._report_progress)
-        return self._registrar[1]
+    def open_registrar(
+        self, request: RegisterOptions, report: Callable[[str, int, int], object]
+    ) -> Registrar:
+        """The registrar of a mesh and options; the last one is reused, and one thread at a time
+        builds one."""
+        key = registrar_key(request)
+        with self._opening:
+            if self._registrar is None or self._registrar[0] != key:
+                self._registrar = key, open_registrar(key, key.meshes, progress=report)
+            return self._registrar[1]
+
+
+def registrar_key(request: RegisterOptions) -> RegisterOptions:
+    """The options of a request on which its registrar depends."""
+    return replace(request, photos=(), box=None, limits=None, camera=None, guess=None)
 
 
 def _colours_in_words(mesh: trimesh.Trimesh) -> str:
@@ -580,37 +528,3 @@ def _key(photo: Path) -> str:
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
-def _command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:
-    """``curvireg register`` with these options; ``name`` tells what the user calls a file."""
-    words = [
-        "curvireg",
-        "register",
-        *(["--views", rig] if rig else list(map(name, options.photos)) or ["PHOTO"]),
-    ]
-    words += list(map(name, options.meshes)) or ["MESH"]
-    limits = (
-        {}
-        if options.limits is None or not options.limits.keys() - QUALIFIERS
-        else dict(options.limits)
-    )
-    values: dict[str, Any] = {
-        "box": options.box,
-        "camera": "exif" if options.guess == "exif" else options.camera,
-        "fov": None if options.guess == "exif" else options.guess,
-        **{"near" if limit == "viewpoint" else limit: value for limit, value in limits.items()},
-        **{
-            key.replace("_", "-"): v
-            for key in _OPTIONS
-            if (v := getattr(options, key)) != _DEFAULTS[key]
-        },
-    }
-    for option, value in values.items():
-        if value is not None:
-            texts = [
-                str(v).removesuffix(".0") for v in (value if isinstance(value, tuple) else (value,))
-            ]
-            is_like_option = texts[0][0] == "-" and isinstance(value, str)
-            words += [f"--{option}={value}"] if is_like_option else [f"--{option}", *texts]
-    return shlex.join([*words, "--out", "result"])

@@ -28,6 +28,7 @@ from ..errors import (
 from ..jobs.options import RegisterOptions
 from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
 from ..utils.pictures import PICTURE_NAMES
+from .examination import Examination
 from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
@@ -62,6 +63,7 @@ class Workspace:
 
     Attributes:
         session: inputs and results.
+        examination: of the mesh.
         messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the
             "page" itself.
         files: pictures and downloads by name, with their media types.
@@ -71,6 +73,7 @@ class Workspace:
 
     def __init__(self, options: RegisterOptions, folder: Path) -> None:
         self.session = Session(options, folder)
+        self.examination = Examination(self.session)
         self.folder = folder
         self.messages: dict[str, str] = {}
         self.asks_for_unit = False
@@ -143,6 +146,7 @@ class Workspace:
                 time.monotonic(),
             )
             self._begun = False
+            self.examination.waits = True
             self._search = asyncio.create_task(self._find())
         return self._search
 
@@ -161,6 +165,7 @@ class Workspace:
     def close(self) -> None:
         """End the search, and remove the uploaded files."""
         self.stop()
+        self.examination.close()
         for folder in self.folder.glob("upload-*"):
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -6,6 +6,7 @@ from typing import Any
 from ..errors import MissingDependencyError
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration
+from ..utils.extras import install_command
 from .overlay import side_pictures
 
 
@@ -61,6 +62,6 @@ def _figure(width: float, height: float) -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingDependencyError(
-            "plots: matplotlib is not installed; pip install matplotlib"
+            f"plots: matplotlib is not installed: {install_command(['plot'])}"
         ) from error
     return Figure(figsize=(width, height), layout="constrained")

@@ -38,6 +38,7 @@ from tqdm import tqdm
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
@@ -48,7 +49,6 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
-from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
 Row: TypeAlias = dict[str, Any]
@@ -232,13 +232,11 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         seen = sample | {
             "rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()
         }
-    evidence = torch.tensor(
-        [[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]
-    ).double()
-    weights = torch.tensor(SCORE_WEIGHTS if registrar.is_exact else RANK_ALONE, dtype=torch.float64)
-    row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
+    evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
+    scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
+    row = {"features": dict(result.confidence_features), "scores": scores.tolist()}
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
-    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.tolist()}
+    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.table.tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)

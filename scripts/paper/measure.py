@@ -1,8 +1,8 @@
 """What the paper measures, for the photographs of one mesh: values that its tables are made of.
 
-Ranking is by the paper's S_hog and S_rep alone, in two variants: ``literal`` is the preset
-``paper``; ``corrected`` has what docs/method.md corrects, with S_hog as a cosine, in perspective
-views of the mesh in its own frame.
+Ranking is by the paper's S_hog and S_rep alone, in three variants: ``literal`` is the preset
+``paper``; ``printed`` has what docs/method.md corrects, in perspective views of the mesh in its own
+frame, and S_hog as the paper prints it; ``corrected`` is that with S_hog as a cosine.
 """
 
 import math
@@ -54,13 +54,12 @@ BEST_PAIR = "CS/MFC"
 
 
 def variants(pose: str) -> dict[str, Pipeline]:
-    """The two variants of the paper's ranking and search."""
+    """The three variants of the paper's ranking and search."""
     literal = PRESETS["paper"]
-    corrected = replace(literal, views=ViewPolicy(pose), bank=BankSettings())
-    corrected = corrected.with_term("repeatability", mode="monotone").with_term(
-        "hog", whitening="none"
-    )
-    return {"literal": literal, "corrected": corrected}
+    views = replace(literal, views=ViewPolicy(pose), bank=BankSettings())
+    printed = views.with_term("repeatability", mode="monotone")
+    corrected = printed.with_term("hog", whitening="none")
+    return {"literal": literal, "printed": printed, "corrected": corrected}
 
 
 def photo_fields(variant: str) -> dict[str, nn.Module]:
@@ -176,6 +175,15 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
     crops = torch.cat([case.crop(settings) for case in cases])
     truths = torch.stack([case.view(mesh)[0] for case in cases])
     records: list[Record] = [{} for _ in cases]
+    banks: dict[tuple[ViewPolicy, BankSettings], ViewBank] = {}
+
+    def bank_of(pipeline: Pipeline) -> ViewBank:
+        """Variants that differ in their terms share views."""
+        key = pipeline.views, pipeline.bank
+        if key not in banks:
+            banks[key] = ViewBank.build(mesh, pipeline=pipeline, renderer=renderer, progress=False)
+        return banks[key]
+
     for variant, pipeline in variants(pose).items():
         bank_settings = replace(
             pipeline.bank, image_size=settings.image_size, margin=settings.margin
@@ -184,9 +192,9 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
         fields = photo_fields(variant)
         for depth in DEPTHS:
             given = replace(pipeline, bank=replace(bank_settings, depth_field=depth))
-            bank = ViewBank.build(mesh, pipeline=given, renderer=renderer, progress=False)
+            bank = bank_of(given)
             errors = rotation_error(truths[:, None], bank.rotations.double())
-            matcher = ViewMatcher(bank, renderer=renderer)
+            matcher = ViewMatcher(bank, pipeline=given, renderer=renderer)
             for photo in PHOTOS:
                 matcher.field = fields[photo]
                 for b, case in enumerate(cases):
@@ -200,8 +208,9 @@ def measure_views(cases: list[Case], settings: BankSettings, pose: str) -> list[
             records[b][variant]["grid 8"] = records[b][variant][BEST_PAIR]["top"][0]
         for grid in (4, 16):
             given = replace(pipeline, bank=replace(bank_settings, grid=grid))
-            bank = ViewBank.build(mesh, pipeline=given, renderer=renderer, progress=False)
-            matcher = ViewMatcher(bank, renderer=renderer, field=fields["MFC"])
+            matcher = ViewMatcher(
+                bank_of(given), pipeline=given, renderer=renderer, field=fields["MFC"]
+            )
             for b in range(len(cases)):
                 best = matcher.rank(matcher.features(crops[b : b + 1])).order[0, 0]
                 records[b][variant][f"grid {grid}"] = float(errors[b, best])

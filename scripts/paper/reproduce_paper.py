@@ -11,7 +11,7 @@ TABLE is one of
 - repeatability: {CS, ASG, HFN} x {MFC, MCS, IG}
 - curve: repeatability in 40 views around the right one
 - sensitivity: intersection percentage by radius and share of points
-- precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected
+- precision: {CS, ASG, AR} x {MFC, MCS, IG}, literally and corrected, also with S_hog as printed
 - ranks: precision at rank 1, 3, 5, 10, 20
 - angles: errors of elevation, azimuth, in-plane angle and distance, of the estimate and of the
   closest retrieved view
@@ -30,8 +30,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -39,17 +37,15 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-import torch
-from tqdm import tqdm
-
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingDependencyError
 from curvireg_torch.evaluation import DATASETS
 from curvireg_torch.jobs.runner import results_digest
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.utils.files import file_digest, text_digest
-from scripts._shared import commit, write_json
+from scripts._shared import commit
 from scripts.paper import tables as paper
 from scripts.paper.cases import Case, by_mesh, find_cases
+from scripts.paper.parts import Part, complete, read
 
 CURVE_OFFSETS = range(-100, 100, 5)
 OF_POINTS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
@@ -65,16 +61,9 @@ OF_VIEWS: dict[str, Callable[[paper.Records], list[paper.Table]]] = {
     "grids": paper.grid_tables,
 }
 TABLES = (*OF_POINTS, *OF_VIEWS)
-ON_PAGE = (
-    "detectors",
-    "repeatability",
-    "curve",
-    "precision",
-    "ranks_literal",
-    "ranks_corrected",
-    "angles_literal",
-)
-ON_PAGE += ("angles_corrected", "grids", "sensitivity")
+ON_PAGE = ("detectors", "ip_classes", "hausdorff_classes", "repeatability", "curve", "precision")
+ON_PAGE += ("precision_classes", *(f"ranks_{variant}" for variant in paper.VARIANTS))
+ON_PAGE += (*(f"angles_{variant}" for variant in paper.VARIANTS), "grids", "sensitivity")
 PHASES = {"points": OF_POINTS, "views": OF_VIEWS}
 
 
@@ -144,39 +133,14 @@ def collect(
             [phase, str(settings), pose, code, files, [case.key for case in group]]
         )
         paths.append(arguments.out / "records" / f"{phase}-{text_digest(request)}.json")
+    parts = [
+        Part(path, (phase, group, settings, pose), len(group))
+        for path, group in zip(paths, groups, strict=True)
+    ]
     if arguments.partial:
-        paths = [path for path in paths if path.exists()]
-    missing = [k for k, path in enumerate(paths) if not path.exists()]
-    done = len(cases) - sum(len(groups[k]) for k in missing)
-    options = (
-        [phase] * len(missing),
-        [groups[k] for k in missing],
-        [settings] * len(missing),
-        [pose] * len(missing),
-    )
-    with tqdm(
-        total=len(cases), initial=done, desc=phase, unit="photo", disable=arguments.quiet
-    ) as bar:
-        if arguments.jobs == 1 or len(missing) < 2:
-            measured = map(measure, *options)
-        else:
-            pool = ProcessPoolExecutor(
-                arguments.jobs, get_context("spawn"), torch.set_num_threads, (1,)
-            )
-            measured = pool.map(measure, *options)
-        for k, found in zip(missing, measured, strict=True):
-            write_json(paths[k], _finite(found), indent=0)
-            bar.update(len(groups[k]))
-    return [record for path in paths for record in json.loads(path.read_text(encoding="utf-8"))]
-
-
-def _finite(value: Any) -> Any:
-    """The same with None in place of what JSON has no number for."""
-    if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_finite(each) for each in value]
-    return None if isinstance(value, float) and value - value != 0.0 else value
+        parts = [part for part in parts if part.path.exists()]
+    complete(parts, measure, label=phase, jobs=arguments.jobs, quiet=arguments.quiet)
+    return [record for part in parts for record in read(part)]
 
 
 def own_digest() -> str:

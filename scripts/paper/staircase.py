@@ -1,39 +1,59 @@
-"""From the letter of the paper to the default pipeline, one change at a time.
+"""From the letter of the paper to the default pipeline, one change at a time; and what each part of
+the default is worth.
 
     python scripts/paper/staircase.py pascal3d=/data/pascal3d_mini lm=/data/bop/lm --out DIR
-    [--limit N] [--page PAGE]
+    [--limit N] [--jobs N] [--page PAGE]
 
 Each set is NAME=ROOT: ROOT is a PASCAL3D+ release if it has a folder ``CAD``, else a BOP set. Steps
-are cumulative, each is evaluated as ``curvireg evaluate`` does, and a second call does only what is
-missing: DIR/NAME/STEP holds the results, DIR/staircase.csv one row for each set and step that is
-done. --page writes the table into a page of the documentation, between its markers.
+are cumulative, each has the results of ``curvireg evaluate``, and a second call does only what is
+missing: DIR/NAME holds one file for each mesh, DIR/staircase.csv one row for each set and step. All
+steps of a mesh are measured together, so that it is opened once. --page writes the table into a
+page of the documentation, between its markers.
+
+``--table parts`` measures the default without each of its parts instead, and the other presets, as
+DIR/parts.csv.
 """
 
 import argparse
 import csv
 import json
+import statistics
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # with an installed wheel, scripts is not a package that Python finds
 sys.path.insert(0, str(REPOSITORY))
 
-import torch
-
 from curvireg_torch.data import BOPDataset, Pascal3DPlus
 from curvireg_torch.errors import CurviregError, InvalidInputError
-from curvireg_torch.evaluation import BOPBenchmark, Pascal3DBenchmark, Protocol, evaluate
+from curvireg_torch.evaluation import Benchmark, BOPBenchmark, Pascal3DBenchmark, Protocol
+from curvireg_torch.evaluation.benchmark import true_rotations
+from curvireg_torch.jobs.entry import Observation, observe
+from curvireg_torch.jobs.photograph import register_observation
+from curvireg_torch.jobs.runner import results_digest
+from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
+from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
+from curvireg_torch.registration import Registrar
+from curvireg_torch.registration.result import line_document
 from curvireg_torch.terms import Appearance, BoxShape
-from curvireg_torch.utils.files import write_csv
+from curvireg_torch.utils.files import file_digest, text_digest, write_csv
+from curvireg_torch.utils.threads import map_on_threads
 from scripts._shared import commit, table_lines, update_page
-from scripts.paper.measures import Estimate, bootstrap
+from scripts.paper.measures import bootstrap
+from scripts.paper.parts import Part, complete
+from scripts.paper.parts import read as read_part
 
 RIGHT_DEG = 30.0
-COLUMNS = ("set", "step", "change", "n", "right", "low", "high", "median", "commit")
+FEWEST_CADS = 3  # for an interval
+COLUMNS = ("set", "step", "change", "n", "cads", "right", "low", "high", "median", "commit")
 
 
 @dataclass(frozen=True)
@@ -75,12 +95,33 @@ STEPS = (
 def pipelines(pose: str) -> Iterator[tuple[str, Pipeline]]:
     """The name of each step and its pipeline, for a dataset of which ``pose`` is known."""
     pipeline = PRESETS["paper"]
-    for step in STEPS:
+    for k, step in enumerate(STEPS):
         pipeline = step.change(pipeline, pose)
-        yield step.name, pipeline
+        yield f"{k}. {step.name}", pipeline
 
 
-def benchmark_of(root: Path, pixel_origin: int) -> Pascal3DBenchmark | BOPBenchmark:
+def parts(pose: str) -> Iterator[tuple[str, Pipeline]]:
+    """The default, the same without each of its parts, and other presets."""
+    default = Pipeline().with_pose_prior(pose)
+    classical = PRESETS["classical"].with_pose_prior(pose)
+    yield "learned: the default", default
+    yield "without the contour fit", replace(default, hypotheses=1, contours=False)
+    yield "without the appearance term", default.with_term("appearance", weight=0)
+    yield "without repeatability", default.with_term("repeatability", weight=0)
+    yield "without the box's shape", default.with_term("box", weight=0)
+    yield "without box jitter", replace(default, box_jitter=0.0)
+    yield "fast", PRESETS["fast"].with_pose_prior(pose)
+    yield "classical", classical
+    yield "gradient instead of focus curves", replace(classical, field="gradient")
+    yield "paper", PRESETS["paper"]
+
+
+LADDERS = {"staircase": pipelines, "parts": parts}
+HEADERS = {"staircase": "change", "parts": "pipeline"}
+TEXTS = {"staircase": "; each line adds one change to the line above", "parts": ""}
+
+
+def benchmark_of(root: Path, pixel_origin: int) -> Benchmark:
     """The objects of a PASCAL3D+ release or a BOP set under the usual protocol."""
     if (root / "CAD").is_dir():
         return Pascal3DBenchmark(
@@ -89,70 +130,183 @@ def benchmark_of(root: Path, pixel_origin: int) -> Pascal3DBenchmark | BOPBenchm
     return BOPBenchmark(BOPDataset(root), Protocol(pose="any"))
 
 
-def measure(benchmark: Pascal3DBenchmark | BOPBenchmark, folder: Path) -> tuple[Estimate, float]:
-    """Share of the objects within 30 degrees with its interval by CAD, and the median error, of
-    stored results."""
-    with (folder / "results.jsonl").open(encoding="utf-8") as file:
-        known = {row["key"]: row for row in map(json.loads, file)}
-    found = [i for i, entry in enumerate(benchmark.entries) if entry.key in known]
-    samples = [benchmark.samples[i] for i in found]
-    rows = [known[benchmark.entries[i].key] for i in found]
-    errors = next(iter(benchmark.errors(samples, rows).values()))
-    cads = [str(sample[benchmark.mesh]) for sample in samples]
-    right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
-    return right, float(errors.nan_to_num(torch.inf).quantile(0.5))
+def chosen_objects(benchmark: Benchmark, limit: int | None) -> list[list[int]]:
+    """Indices of ``limit`` objects of known pose, spread evenly, those of one mesh together."""
+    known = true_rotations(benchmark.samples).isfinite().flatten(1).all(dim=1)
+    groups = defaultdict[Any, list[int]](list)
+    for i in benchmark.selection(limit):
+        if known[i] and not benchmark.entries[i].error:
+            groups[benchmark.entries[i].meshes].append(i)
+    return list(groups.values())
+
+
+class Climber:
+    """One mesh on the staircase, with those of its photographs that can be read.
+
+    What steps have in common is computed once: mesh, contours, and the views, which :data:`STEPS`
+    change five times only.
+    """
+
+    def __init__(
+        self, benchmark: Benchmark, chosen: list[int], every: Sequence[Pipeline] = ()
+    ) -> None:
+        """``every`` pipeline that is measured: views hold what any of them needs."""
+        self.benchmark = benchmark
+        self.every = every
+        self.mesh = load_mesh(benchmark.entries[chosen[0]].meshes[0], unit=benchmark.unit)
+        self.samples = []
+        self.photographs = []
+        for i in chosen:
+            entry = benchmark.entries[i]
+            with suppress(CurviregError, OSError):  # a photograph that cannot be read
+                self.photographs.append(observe(entry, entry.read()))
+                self.samples.append(benchmark.samples[i])
+        self.bank: ViewBank | None = None
+        self.describer: ViewDescriber | None = None
+
+    def errors(self, pipeline: Pipeline) -> list[float]:
+        """Rotation errors of a pipeline in degrees, up to symmetries where they are known; 180
+        where it finds no pose."""
+        registrar = self._registrar(pipeline)
+
+        def row(observation: Observation) -> dict[str, Any]:
+            try:
+                return line_document(register_observation(observation, registrar).document)
+            except CurviregError:
+                return {}
+
+        rows = map_on_threads(row, self.photographs)
+        errors = self.benchmark.errors(self.samples, rows)[self.benchmark.page_error]
+        return errors.clamp(max=180.0).tolist()
+
+    def _registrar(self, pipeline: Pipeline) -> Registrar:
+        bank = self._bank(pipeline)
+        matcher = map_on_threads(lambda bank: ViewMatcher(bank, pipeline=pipeline), [bank])[0]
+        if self.describer is None:
+            self.describer = matcher.describer
+            _ = self.describer.contours
+        matcher.describer = self.describer.with_settings(bank.settings)
+        # as in :func:`curvireg_torch.evaluation.evaluate`
+        mesh_is = "exact" if self.benchmark.gives_camera else "similar"
+        return Registrar(matcher, mesh_is=mesh_is)
+
+    def _bank(self, pipeline: Pipeline) -> ViewBank:
+        """The views of the step before, if a pipeline has the same."""
+        views = pipeline.views, pipeline.bank
+        if self.bank is None or (self.bank.pipeline.views, self.bank.pipeline.bank) != views:
+            same = [one for one in self.every if (one.views, one.bank) == views]
+            needy = [one for one in same if one.stored_appearance(1) is not None]
+            built = next(iter(needy), pipeline)
+            self.bank = ViewBank.build(self.mesh, pipeline=built, progress=False)
+            # as files of the cache have them
+            self.bank.descriptors = self.bank.descriptors.half().float()
+        return self.bank
+
+
+def measure(
+    ladder: str, root: Path, pixel_origin: int, chosen: list[int], steps: list[int]
+) -> dict[str, Any]:
+    """Errors of some objects of one mesh after each of some steps."""
+    benchmark = benchmark_of(root, pixel_origin)
+    every = [pipeline for _, pipeline in LADDERS[ladder](benchmark.protocol.pose)]
+    start = time.process_time()
+    errors: dict[str, list[float]] = {str(k): [] for k in steps}
+    seconds: dict[str, float] = {}
+    result = {"errors": errors, "seconds": seconds, "commit": commit()}
+    try:
+        climber = Climber(benchmark, chosen, every)
+    except (CurviregError, OSError):
+        return {**result, "cads": [], "unreadable": len(chosen)}
+    for k in steps:
+        errors[str(k)] = climber.errors(every[k])
+        seconds[str(k)] = time.process_time() - start
+        start = time.process_time()
+    cads = [str(sample[benchmark.mesh]) for sample in climber.samples]
+    return {**result, "cads": cads, "unreadable": len(chosen) - len(cads)}
 
 
 def climb(name: str, root: Path, options: argparse.Namespace) -> None:
-    """Evaluate the steps of one set, and record each when it is known."""
-    out = options.out
+    """Measure the steps of one set, and record them when all of its meshes are done."""
     benchmark = benchmark_of(root, options.pixel_origin)
-    for k, (change, pipeline) in enumerate(pipelines(benchmark.protocol.pose)):
-        if k not in options.steps:
-            continue
-        folder = out / name / f"{k:02d}"
-        evaluate(
-            benchmark, folder, pipeline=pipeline, limit=options.limit, progress=not options.quiet
-        )
-        right, median = measure(benchmark, folder)
-        row = [name, k, change, right.n, right.mean, right.low, right.high, median, commit()]
-        kept = [old for old in read(out) if (old["set"], old["step"]) != (name, str(k))]
-        ordered = sorted(
-            [*(list(old.values()) for old in kept), row], key=lambda r: (str(r[0]), int(r[1]))
-        )
-        write_csv(out / "staircase.csv", [COLUMNS, *ordered])
+    groups = chosen_objects(benchmark, options.limit)
+    steps = dict(enumerate(LADDERS[options.table](benchmark.protocol.pose)))
+    chosen = [k for k in options.steps or steps if k in steps]
+    settings = [steps[k][1].describe() for k in chosen]
+    code = [results_digest(), file_digest(Path(__file__))]
+    jobs = []
+    for group in groups:
+        entries = [benchmark.entries[i] for i in group]
+        files = [entries[0].meshes[0], *(entry.photo for entry in entries)]
+        requests = [repr(entry.request()) for entry in entries]
+        digests = [file_digest(path) for path in files]
+        request = json.dumps([code, settings, requests, digests])
+        path = options.out / name / f"{text_digest(request)}.json"
+        given = (options.table, root, options.pixel_origin, group, chosen)
+        jobs.append(Part(path, given, len(group)))
+    if options.partial:
+        jobs = [job for job in jobs if job.path.exists()]
+    complete(jobs, measure, label=name, jobs=options.jobs, quiet=options.quiet)
+    names = {k: steps[k][0] for k in chosen}
+    record(name, names, [read_part(job) for job in jobs], options.out / f"{options.table}.csv")
 
 
-def read(out: Path) -> list[dict[str, str]]:
+def record(name: str, steps: dict[int, str], records: list[dict[str, Any]], path: Path) -> None:
+    """Write the rows of a set from the records of its meshes."""
+    cads = [cad for one in records for cad in one["cads"]]
+    commits = " ".join(sorted({one["commit"] for one in records}))
+    if unreadable := sum(one["unreadable"] for one in records):
+        message = "objects left out, whose photograph or mesh cannot be read"
+        print(f"staircase: {name}: {unreadable} {message}", file=sys.stderr)
+    rows = []
+    for k, step in steps.items() if cads else ():
+        errors = [error for one in records for error in one["errors"][str(k)]]
+        right = bootstrap([float(error < RIGHT_DEG) for error in errors], cads)
+        numbers = [
+            right.n,
+            len(set(cads)),
+            right.mean,
+            right.low,
+            right.high,
+            statistics.median(errors),
+        ]
+        rows.append([name, k, step, *numbers, commits])
+    measured = {(name, str(row[1])) for row in rows}
+    kept = [row for row in read(path) if (row["set"], row["step"]) not in measured]
+    every = sorted([*(list(row.values()) for row in kept), *rows], key=lambda r: (r[0], int(r[1])))
+    write_csv(path, [COLUMNS, *every])
+
+
+def read(path: Path) -> list[dict[str, str]]:
     """The rows that are known."""
-    path = out / "staircase.csv"
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-def table(rows: list[dict[str, str]]) -> str:
+def table(rows: list[dict[str, str]], ladder: str = "staircase") -> str:
     """Markdown: one line for each step, one column for each set; share within 30 degrees and median
     error."""
     names = list(dict.fromkeys(row["set"] for row in rows))
     known = {(row["set"], int(row["step"])): row for row in rows}
     counts = {name: max(int(row["n"]) for row in rows if row["set"] == name) for name in names}
-    cells = [["change", *(f"`{name}`, N {counts[name]}" for name in names)]]
-    for k, step in enumerate(STEPS):
-        line = [f"{k}. {step.name}"]
-        for name in names:
-            row = known.get((name, k))
-            line.append(
-                "-" if row is None else f"{float(row['right']):.2f}, {float(row['median']):.0f}°"
-            )
-        cells.append(line)
+    cells = [[HEADERS[ladder], *(f"`{name}`, N {counts[name]}" for name in names)]]
+    for k, (step, _) in enumerate(LADDERS[ladder]("any")):
+        found = [known.get((name, k)) for name in names]
+        cells.append([step, *("-" if row is None else cell_of(row) for row in found)])
     commits = ", ".join(sorted({row["commit"] for row in rows}))
     text = (
-        "Share of the rotations within 30° and median error; each line adds one change to the "
-        "line above."
+        "Share of the rotations within 30° with its 95 % interval by bootstrap of the CADs (none "
+        "for one or two of them), and median error, up to symmetries where they are known"
     )
-    return "\n".join([f"{text} Commit {commits}.", "", *table_lines(cells), ""])
+    return "\n".join([f"{text}{TEXTS[ladder]}. Commit {commits}.", "", *table_lines(cells), ""])
+
+
+def cell_of(row: dict[str, str]) -> str:
+    """Share, interval and median; intervals of fewer than ``FEWEST_CADS`` mean nothing."""
+    right, low, high = (float(row[name]) for name in ("right", "low", "high"))
+    interval = f" ({low:.2f} to {high:.2f})" if int(row["cads"]) >= FEWEST_CADS else ""
+    return f"{right:.2f}{interval}, {float(row['median']):.0f}°"
 
 
 def main() -> int:
@@ -165,7 +319,12 @@ def main() -> int:
         "--limit", type=int, metavar="N", help="N objects of each set, spread evenly"
     )
     parser.add_argument(
-        "--steps", type=int, nargs="+", default=list(range(len(STEPS))), help="default: all"
+        "--table", choices=LADDERS, default="staircase", help="what is measured (staircase)"
+    )
+    parser.add_argument("--steps", type=int, nargs="+", help="numbers of steps (default: all)")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    parser.add_argument(
+        "--partial", action="store_true", help="rows of what is measured so far; measures nothing"
     )
     parser.add_argument(
         "--pixel-origin", type=int, choices=(0, 1), default=1, help="of PASCAL3D+ (default: 1)"
@@ -182,9 +341,9 @@ def main() -> int:
     except CurviregError as error:
         print(f"staircase: error: {error}", file=sys.stderr)
         return 2
-    print(text := table(read(options.out)))
+    print(text := table(read(options.out / f"{options.table}.csv"), options.table))
     if options.page is not None:
-        update_page(options.page, "staircase", text)
+        update_page(options.page, options.table, text)
     return 0
 
 

@@ -20,7 +20,8 @@ PAIRS = printed.PAIRS
 RANKS = (1, 3, 5, 10, 20)
 GRIDS = (4, 8, 16)
 RIGHT_DEG = 30.0
-VARIANTS = ("literal", "corrected")
+VARIANTS = ("literal", "printed", "corrected")
+NAMES = {"literal": "literal", "printed": "corrected, S_hog as printed", "corrected": "corrected"}
 SHOWN_OFFSETS = (-90, -45, -20, -10, -5, 0, 5, 10, 20, 45, 90)
 PARTS = ("elevation", "azimuth", "in-plane", "distance")
 POSE_COLUMNS = tuple(f"{name} {kind}" for name in PARTS for kind in ("Est.", "Clo."))
@@ -113,6 +114,31 @@ def by_class(name: str, title: str, records: Records, columns: dict[str, Value])
     return Table(f"{name}_by_class", f"{title} by class", records.text, ["class", *columns], rows)
 
 
+def beside_the_paper(
+    name: str,
+    title: str,
+    records: Records,
+    columns: dict[str, list[Value]],
+    paper: dict[str, dict[str, float]],
+    parts: Sequence[str],
+    digits: int,
+) -> Table:
+    """One row for each class that we or the paper have. Cells hold our numbers, one for each of
+    ``parts``, and the paper's."""
+    rows: list[list[Cell]] = []
+    for category in sorted({*records.categories, *paper}):
+        group = records.of(category)
+        cells: list[Cell] = []
+        for column, values in columns.items():
+            means = [group.mean(value) for value in values]
+            ours = [_printed(one.mean if one.n else None, digits) for one in means]
+            theirs = _printed(paper.get(category, {}).get(column), digits)
+            cells.append(" / ".join([*ours, theirs]))
+        rows.append([category, f"{len(group.records)}", *cells])
+    text = f"{' / '.join([*parts, 'the paper'])}; N photographs of ours. {records.what}."
+    return Table(f"{name}_classes", title, text, ["class", "N", *columns], rows)
+
+
 def at(*keys: str | int) -> Value:
     """The number of a record under these keys, one within the other."""
 
@@ -134,11 +160,12 @@ def detector_tables(records: Records) -> list[Table]:
     rows: list[list[Cell]] = []
     for name in names:
         ours = [records.mean(at(kind, name)) for kind in ("ip", "hausdorff", "points")]
-        paper = [_printed(printed.IP.get(name), 2), _printed(printed.WEB_IP.get(name), 2)]
-        rows.append(
-            [name, ours[0], *paper, ours[1], _printed(printed.HAUSDORFF.get(name), 0), ours[2]]
-        )
-    rows.append(["any pixel (chance)", records.mean(at("ip", "chance")), "-", "-", "-", "-", "-"])
+        ip = [_printed(means.get(name), 2) for means in (printed.IP, printed.WEB_IP)]
+        distances = printed.HAUSDORFF, printed.WEB_HAUSDORFF
+        hausdorff = [_printed(means.get(name), 0) for means in distances]
+        rows.append([name, ours[0], *ip, ours[1], *hausdorff, ours[2]])
+    chance = records.mean(at("ip", "chance"))
+    rows.append(["any pixel (chance)", chance, *["-"] * 6])
     text = (
         "IP: fraction of the photograph's points within 2 px of a point of the curvilinear "
         "saliency (CS) of the view "
@@ -155,9 +182,30 @@ def detector_tables(records: Records) -> list[Table]:
         "paper, web",
         "HD",
         "paper, PASCAL3D+ ",
+        "paper, web ",
         "points",
     ]
     tables = [Table("detectors", "Detectors: IP and Hausdorff distance", text, columns, rows)]
+    tables += [
+        beside_the_paper(
+            "ip",
+            "IP by class",
+            records,
+            {name: [at("ip", name)] for name in names},
+            printed.IP_BY_CLASS,
+            ("ours",),
+            2,
+        ),
+        beside_the_paper(
+            "hausdorff",
+            "Hausdorff distance by class",
+            records,
+            {name: [at("hausdorff", name)] for name in names},
+            printed.HAUSDORFF_BY_CLASS,
+            ("ours",),
+            0,
+        ),
+    ]
     for kind in ("ip", "hausdorff"):
         tables.append(by_class(kind, kind, records, {name: at(kind, name) for name in names}))
     return tables
@@ -243,9 +291,18 @@ def precision_tables(records: Records) -> list[Table]:
             "precision",
             "Precision, nine pairs",
             text,
-            ["depth / photograph", *VARIANTS, "paper"],
+            ["depth / photograph", *NAMES.values(), "paper"],
             rows,
-        )
+        ),
+        beside_the_paper(
+            "precision",
+            "Precision by class",
+            records,
+            {pair: [_right(variant, pair, 1) for variant in VARIANTS] for pair in PAIRS},
+            printed.PRECISION_BY_CLASS,
+            tuple(NAMES.values()),
+            2,
+        ),
     ]
     for variant in VARIANTS:
         columns = {pair: _right(variant, pair, 1) for pair in PAIRS}
@@ -265,7 +322,7 @@ def rank_tables(records: Records) -> list[Table]:
     for variant in VARIANTS:
         rows = [[pair, *(records.mean(_right(variant, pair, k)) for k in RANKS)] for pair in PAIRS]
         tables.append(
-            Table(f"ranks_{variant}", f"Precision at rank k, {variant}", text, columns, rows)
+            Table(f"ranks_{variant}", f"Precision at rank k, {NAMES[variant]}", text, columns, rows)
         )
     return tables
 
@@ -298,7 +355,7 @@ def angle_tables(records: Records) -> list[Table]:
         rows.append(["bank", *limits])
         columns = ["depth / photograph", *POSE_COLUMNS]
         tables.append(
-            Table(f"angles_{variant}", f"Errors of the pose, {variant}", text, columns, rows)
+            Table(f"angles_{variant}", f"Errors of the pose, {NAMES[variant]}", text, columns, rows)
         )
     return tables
 
@@ -322,4 +379,4 @@ def grid_tables(records: Records) -> list[Table]:
         f"best. "
         f"{records.text}"
     )
-    return [Table("grids", "Grids", text, ["cells", *VARIANTS], rows)]
+    return [Table("grids", "Grids", text, ["cells", *NAMES.values()], rows)]

@@ -125,6 +125,25 @@ def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path
         check_pose(row, T, 4.0, 0.04)
 
 
+def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(
+    frames, follow, tmp_path, capsys
+):
+    assert follow("--out", tmp_path / "exif") == 0
+    assert "camera: from the file's EXIF" in capsys.readouterr().out
+    for row, (_, _, T) in zip(table(tmp_path / "exif"), frames[1], strict=False):
+        check_pose(row, T, 4.0, 0.1)
+    assert follow("--out", tmp_path / "none", source="turn.avi") == 0
+    assert "camera: focal length estimated" in capsys.readouterr().out
+    rows = table(tmp_path / "none")
+    zooms = []
+    for row, (_, _, T) in zip(rows, frames[1], strict=False):
+        check_pose(row, T, 8.0, 0.5)
+        zooms.append(float(row["tz"]) / float(T[2, 3]))
+    assert max(zooms) < 1.05 * min(zooms), "one camera for all frames"
+    assert follow("--mesh-is", "similar", "--out", tmp_path / "other") == 2
+    assert "needs the camera with --mesh-is similar" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("confidence", "verdict"), [(None, "reliable"), (0.2, "no match")])
 def test_follow_starts_from_a_known_pose_and_its_confidence(
     frames, follow, tmp_path, monkeypatch, confidence, verdict

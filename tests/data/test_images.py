@@ -98,6 +98,37 @@ def test_guessed_camera_matrix_uses_the_exif_focal_length(tmp_path):
     assert K[:2, 2].tolist() == [14.5, 19.5]
 
 
+EOS = {0x920A: 50.0, 0xA20E: 5184 / 0.894, 0xA20F: 3456 / 0.596, 0xA002: 5184, 0xA003: 3456}
+"""EXIF data of a camera with a sensor of 22.7 x 15.1 mm and a lens of 50 mm."""
+
+
+@pytest.mark.parametrize(
+    ("tags", "focal_35mm"),
+    [
+        ({}, 79.3),
+        ({0xA210: 3, 0xA20E: 5184 / 2.27, 0xA20F: 3456 / 1.514}, 79.3),  # in cm
+        ({0xA210: 4, 0xA20E: 5184 / 22.7, 0xA20F: 3456 / 15.14}, 79.3),  # in mm
+        ({0xA405: 80}, 80.0),  # what the camera states goes first
+        ({0xA20F: 2 * 3456 / 0.596}, None),  # pixels that are not square
+        ({0xA20E: 300.0, 0xA20F: 300.0}, None),  # that of a print: a sensor of half a metre
+        ({0xA210: 1}, None),  # no unit
+        ({0x920A: 0.0}, None),
+    ],
+)
+def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35mm):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
+    Image.new("RGB", (648, 432)).save(tmp_path / "a.jpg", exif=exif)
+    photo = read_photo(tmp_path / "a.jpg")
+    if focal_35mm is None:
+        assert photo.focal_35mm is photo.camera() is None
+        return
+    assert photo.focal_35mm == pytest.approx(focal_35mm, rel=2e-3)
+    if 0xA405 not in tags:  # 50 mm of 22.7 mm in width
+        assert float(photo.camera().matrix[0, 0]) == pytest.approx(648 * 50 / 22.7, rel=5e-3)
+        assert photo.camera().source == "exif"
+
+
 def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(tmp_path):
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
     assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]

@@ -3,6 +3,7 @@ is made."""
 
 import importlib.util
 import inspect
+import json
 import re
 from importlib import import_module
 from pathlib import Path
@@ -107,20 +108,41 @@ def test_the_page_of_commands_is_current():
         assert f"| `{option}` |" in page
 
 
-SEARCHED = {
-    "STEP": "guides/unit-and-up.md",
-    "HEIC": "guides/photographs.md",
-    "URDF": "guides/unit-and-up.md",
-    "Unity": "guides/blender-unity.md",
-    "Blender": "guides/blender-unity.md",
-    "ONNX": "guides/layers.md",
-    "unknown focal length": "guides/no-camera.md",
-}
+CHECK_SITE = module_of_docs("check_site")
 
 
-@pytest.mark.parametrize(("word", "page"), SEARCHED.items())
+@pytest.mark.parametrize(("word", "page"), CHECK_SITE.SEARCHED.items())
 def test_what_people_search_for_is_on_its_page(word: str, page: str) -> None:
-    assert word in (DOCS / page).read_text(encoding="utf-8")
+    assert word in (DOCS / f"{page}.md").read_text(encoding="utf-8")
+
+
+def test_the_check_of_the_site_finds_faults(tmp_path: Path) -> None:
+    """Words that the index lacks, and what a browser would fetch; ``scripts/docs.sh`` runs it."""
+    pytest.importorskip("sphinx", reason="Sphinx is not installed")
+    pages = sorted(set(CHECK_SITE.SEARCHED.values()))
+    stems = {"Unity": "uniti"}
+    terms = {}
+    for words, page in CHECK_SITE.SEARCHED.items():
+        for word in words.split():
+            terms[stems.get(word, word.lower())] = [pages.index(page)]
+    number = terms.pop("step")[0]  # one page is a number instead of a list
+    index = {"docnames": pages, "terms": {**terms, "heic": []}, "titleterms": {"step": number}}
+    (tmp_path / "searchindex.js").write_text(f"Search.setIndex({json.dumps(index)})")
+    head = '<link rel="canonical" href="https://a.org/"><link href="#a"><a id="a" href="https://a.org/">'
+    (tmp_path / "index.html").write_text(head)
+    assert not list(CHECK_SITE.find_faults(tmp_path))
+    missing = list(CHECK_SITE.search_faults(tmp_path))
+    assert [fault.split("'")[1] for fault in missing] == ["HEIC"]
+    (tmp_path / "index.html").write_text(head + '<script src="https://cdn.org/a.js"></script>')
+    (fault,) = CHECK_SITE.find_faults(tmp_path)
+    assert fault.endswith("https://cdn.org/a.js is fetched from elsewhere")
+
+
+def test_formulas_need_no_script() -> None:
+    pytest.importorskip("latex2mathml", reason="latex2mathml is not installed")
+    formula = module_of_docs("mathml").formula(r"\sqrt{a < b}", display="inline")
+    assert "<msqrt>" in formula
+    assert formula.startswith('<math title="\\sqrt{a &lt; b}" xmlns=')
 
 
 def test_messages_are_listed_with_what_to_do():

@@ -1,6 +1,7 @@
 """What is said of a mesh before a photograph is taken."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +14,17 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.inspection.facts import mesh_facts
 from curvireg_torch.inspection.look_alikes import look_alikes
 from curvireg_torch.inspection.page import report_lines, report_page
-from curvireg_torch.inspection.trial import (
-    Expected,
-    Outcome,
+from curvireg_torch.inspection.photographs import (
+    SIZE,
     Photograph,
-    generate_photographs,
-    run_trial,
+    PhotographGenerator,
+    trial_camera,
+    with_print,
+    without_colours,
 )
+from curvireg_torch.inspection.trial import Expected, Outcome
 from curvireg_torch.matching import ViewBank
+from curvireg_torch.mesh import has_colours
 from curvireg_torch.mesh.mesh import as_mesh
 from curvireg_torch.registration import Registrar
 from curvireg_torch.synthetic import example_mesh
@@ -152,41 +156,75 @@ def test_look_alikes_leave_out_symmetries():
     assert min(pair.angle for pair in left_out) > 30.0
 
 
-def test_photographs_depend_on_seed_and_number_alone():
+@pytest.mark.parametrize("clutter", [False, True])
+def test_photographs_depend_on_seed_and_number_alone(clutter):
     mesh = example_mesh()
-    three = generate_photographs(mesh, 3, seed=5, upright=False)
-    two = generate_photographs(mesh, 2, seed=5, upright=False)
-    assert torch.equal(three[1].image, two[1].image)
-    assert torch.equal(three[1].truth, two[1].truth)
-    assert not torch.equal(
-        three[1].truth, generate_photographs(mesh, 2, seed=6, upright=False)[1].truth
-    )
+    first = PhotographGenerator(mesh, 5, clutter=clutter)
+    again = PhotographGenerator(mesh, 5, clutter=clutter)
+    first(0)
+    assert torch.equal(first(1).image, again(1).image)
+    assert torch.equal(first(1).truth, again(1).truth)
+    other = PhotographGenerator(mesh, 6, clutter=clutter)
+    assert not torch.equal(first(1).truth, other(1).truth)
 
 
 def test_upright_photographs_are_seen_from_the_side():
-    photographs = generate_photographs(example_mesh(), 6, seed=0, upright=True)
-    elevations = [float(cr.viewpoint_from_rotation(p.truth[:3, :3])[1]) for p in photographs]
+    generate = PhotographGenerator(example_mesh(), 0, upright=True)
+    elevations = [float(cr.viewpoint_from_rotation(generate(k).truth[:3, :3])[1]) for k in range(6)]
     assert min(elevations) > -25.0
     assert max(elevations) < 75.0
 
 
-def test_trial_counts_right_and_reliable(registrar):
-    photographs = generate_photographs(registrar.bank.mesh, 2, seed=1, upright=True)
+def test_clutter_is_seen_beside_the_object_and_covers_less_than_half_of_it():
+    mesh = trimesh.creation.box((1, 2, 3))
+    grey = torch.full((3, *SIZE), 0.5)
+    plain = PhotographGenerator(mesh, 3, backgrounds=[grey])
+    cluttered = replace(plain, clutter=True)
+    changed, covered = [], []
+    for index in range(4):
+        without, photograph = plain(index), cluttered(index)
+        assert torch.equal(photograph.truth, without.truth)
+        assert torch.equal(photograph.box, without.box)
+        seen = cr.render_depth(mesh, photograph.truth, trial_camera(), SIZE)[0, 0] > 0
+        change = (photograph.image.float() - without.image.float()).abs().amax(dim=0) > 20
+        changed.append(float(change[~seen].double().mean()))
+        covered.append(float(change[seen].double().mean()))
+    assert min(changed) > 0.002
+    assert max(covered) < 0.5
+    assert 0 < sum(fraction > 0.05 for fraction in covered) < 4, "in some photographs"
+
+
+def test_a_print_varies_over_the_surface_and_leaves_the_shape():
+    mesh = trimesh.creation.cylinder(1.0, 3.0)
+    mesh.units = "cm"
+    printed = with_print(mesh)
+    assert has_colours(printed)
+    assert printed.units == "cm"
+    assert printed.bounds == pytest.approx(mesh.bounds)
+    assert not has_colours(without_colours(printed))
+
+
+def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(registrar):
     calls = []
-    trial = run_trial(
-        registrar,
-        photographs,
-        compare=False,
-        report_progress=lambda *progress: calls.append(progress),
+    report = cr.inspect(
+        registrar, n=2, compare=False, progress=lambda *progress: calls.append(progress)
     )
-    assert calls == [(1, 2), (2, 2)]
-    assert trial.expected.n == 2
-    assert not trial.compared
+    assert report.trial.expected.n == 2
+    assert not report.trial.compared
+    stages = ["mesh", "look-alikes", "photographs"]  # the bank is there
+    assert list(dict.fromkeys(stage for stage, _, _ in calls)) == stages
+    for stage in stages:
+        done = [(done, total) for name, done, total in calls if name == stage]
+        assert done == sorted(done)
+        assert done[0][0] == 0
+        assert done[-1][0] == done[-1][1]
 
 
 def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
     photograph = Photograph(
-        torch.zeros(3, 4, 4), torch.tensor([0.0, 0, 200, 100]), torch.eye(4, dtype=torch.float64)
+        torch.zeros(3, 4, 4, dtype=torch.uint8),
+        torch.tensor([0.0, 0, 200, 100]),
+        torch.eye(4, dtype=torch.float64),
     )
     return Outcome(photograph, None, error, elevation)
 
@@ -239,6 +277,7 @@ def test_command_writes_report_and_page(tmp_path, capsys):
         "without a camera",
         "with a pose prior: azimuth within 45 degrees",
         "with a second photograph from another side",
+        "with a print, also in the mesh: orientations that look alike without count as wrong",
     }
     page = (tmp_path / "out" / "inspect.html").read_text()
     assert page.count("data:image/jpeg") >= 12, "six pairs of views"

@@ -18,6 +18,8 @@ import curvireg_torch as cr
 from curvireg_torch.errors import MeshError, MissingDependencyError
 from curvireg_torch.mesh import cad, has_colours, mesh_up, surface_colours
 from curvireg_torch.mesh.files import mesh_files
+from curvireg_torch.utils import extras
+from curvireg_torch.utils.extras import is_installed
 from tests.mesh.step import iges_file, step_file
 
 Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
@@ -25,7 +27,7 @@ BOX = trimesh.creation.box((30.0, 20.0, 10.0))
 
 
 def needs(package: str) -> pytest.MarkDecorator:
-    return pytest.mark.skipif(cad.find_spec(package) is None, reason=f"{package} is not installed")
+    return pytest.mark.skipif(not is_installed(package), reason=f"{package} is not installed")
 
 
 @needs("cascadio")
@@ -96,7 +98,7 @@ def test_step_files_are_bounded_in_size_and_time(
 def test_the_message_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, package: str
 ) -> None:
-    monkeypatch.setattr(cad, "find_spec", lambda _: None)
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
     (tmp_path / f"a.{suffix}").write_text("a part")
     with pytest.raises(MissingDependencyError, match=package) as caught:
         cr.load_mesh(tmp_path / f"a.{suffix}")

@@ -97,6 +97,63 @@ def test_strips_and_fans_have_all_their_faces(tmp_path: Path, load: Load) -> Non
     assert mesh.area == pytest.approx(22 + 16 * 0.5 * math.sin(math.pi / 8), rel=1e-6)
 
 
+def sparse(tree: Tree, index: Any, values: Any, kind: str = "B") -> dict[str, Any]:
+    """What an accessor says of ``values`` at places that differ from its own."""
+    accessors = tree.content["accessors"]
+    places = [tree.array(index, kind), tree.array(values, "f")]
+    parts = [{key: accessors[k][key] for key in ("bufferView", "componentType")} for k in places]
+    return {
+        "count": len(index),
+        "indices": parts[0],
+        "values": {"bufferView": parts[1]["bufferView"]},
+    }
+
+
+@pytest.mark.parametrize("kind", ["B", "H", "I"])
+def test_sparse_accessors_replace_some_of_their_values(
+    tmp_path: Path, load: Load, kind: str
+) -> None:
+    """As exporters write what differs from a copy, or from zeros where there is no view."""
+    moved = [0, 7]
+    tree = Tree()
+    part = tree.part(BOX.faces)
+    accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
+    accessor["sparse"] = sparse(tree, moved, BOX.vertices[moved] * 3.0, kind)
+    expected = BOX.vertices.copy()
+    expected[moved] *= 3.0
+    mesh, texts = load(tree.write(tmp_path / "a.gltf"))
+    assert not texts
+    np.testing.assert_allclose(mesh.triangles, expected[BOX.faces], atol=1e-6)
+    del accessor["bufferView"]
+    accessor["sparse"] = sparse(tree, [*range(7)], BOX.vertices[:7], kind)
+    expected = np.vstack([BOX.vertices[:7], np.zeros(3)])
+    mesh, _ = load(tree.write(tmp_path / "b.gltf"))
+    np.testing.assert_allclose(mesh.triangles, expected[BOX.faces], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"count": 9}, "more values than it has"),
+        ({"count": 3}, "longer than its data"),
+        ({"count": -1}, "integer >= 0"),
+        ({"values": {}}, "no data"),
+        ({"indices": {"componentType": 5121}}, "no data"),
+        ({"indices": {"componentType": 5120, "bufferView": 2}}, "does not have"),
+        ({}, "does not have"),
+    ],
+)
+def test_damaged_sparse_accessors_are_refused(
+    tmp_path: Path, load: Load, changes: dict[str, Any], match: str
+) -> None:
+    tree = Tree()
+    part = tree.part(BOX.faces)
+    accessor = tree.content["accessors"][part["attributes"]["POSITION"]]
+    accessor["sparse"] = {**sparse(tree, [1, 255], BOX.vertices[:2]), **changes}
+    with pytest.raises(MeshError, match=match):
+        load(tree.write(tmp_path / "a.gltf"))
+
+
 @pytest.mark.parametrize(("dtype", "largest"), [("B", 255), ("H", 65535), ("f", 1)])
 @pytest.mark.parametrize("factor", [None, [1.0, 1.0, 1.0, 1.0], [0.5, 1.0, 0.0, 1.0]])
 def test_vertex_colours_are_multiplied_by_the_material(

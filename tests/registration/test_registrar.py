@@ -17,6 +17,7 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
@@ -163,19 +164,19 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
     quick_fit = contour_fit.quick_fit
     fits = []
     described = []
-    compare = work.compare_with_photograph
+    measure = Evidence.of
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return quick_fit(contours, crops, K, T, *index)
 
-    def compared(*given):
-        described.append(len(given[-1]))
-        return compare(*given)
+    def measured(seen):
+        described.append(len(seen.rank))
+        return measure(seen)
 
     for module in (contour_fit, poses_module):
         monkeypatch.setattr(module, "quick_fit", counted)
-    monkeypatch.setattr(work, "compare_with_photograph", compared)
+    monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
     assert fits == [photograph.SCREENED_VIEWS, 1]

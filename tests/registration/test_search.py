@@ -10,6 +10,7 @@ from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.fitting.landmarks import LandmarkMatches
 from curvireg_torch.geometry import (
     PosePrior,
     paper_views,
@@ -172,11 +173,11 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
         (photograph, "with_quick_fit"),
         (photograph, "with_edge_support"),
         (photograph, "fit_texture_of"),
-        (work, "landmark_evidence"),
         (photograph, "EdgeCrops"),
     ):
         monkeypatch.setattr(module, name, refused)
     monkeypatch.setattr(poses, "fit_to_edges", refused)
+    monkeypatch.setattr(LandmarkMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
     stages: list[str] = []

@@ -1,6 +1,7 @@
 """The paper's measurements on rendered photographs, for which the true view must win."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +15,8 @@ import pytest
 import torch
 
 from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evaluation import evaluate
 from curvireg_torch.geometry import (
     camera_matrix,
     projected_boxes,
@@ -85,12 +88,13 @@ def test_points_of_the_true_view_are_repeated_most(root):
 
 
 def test_tables_rank_by_the_terms_of_the_paper_alone():
-    for pipeline, whitening in zip(
-        measure.variants("upright").values(), ("paper", "none"), strict=True
-    ):
+    variants = measure.variants("upright")
+    assert tuple(variants) == tables.VARIANTS == tuple(tables.NAMES)
+    for pipeline, whitening in zip(variants.values(), ("paper", "paper", "none"), strict=True):
         assert [term.name for term in pipeline.terms] == ["hog", "repeatability"]
         assert pipeline.terms[0].whitening == whitening
         assert (pipeline.box_jitter, pipeline.search, pipeline.contours) == (0.0, True, False)
+    assert variants["printed"].with_term("hog", whitening="none") == variants["corrected"]
     assert measure.variants("any")["literal"] == PRESETS["paper"]
     assert measure.variants("any")["corrected"].views == ViewPolicy("any")
 
@@ -161,6 +165,58 @@ def test_printed_numbers_are_the_means_of_the_papers_rows():
     assert printed.IP["MFC"] == pytest.approx(0.46)
     assert printed.WEB_IP["PCI"] == pytest.approx(0.449)
     assert printed.HAUSDORFF["FUZZY"] == pytest.approx(98.5)
+    assert printed.WEB_HAUSDORFF["MFC"] == pytest.approx(23.8)
+
+
+def numbers_printed_in(text, label):
+    """The rows of numbers of the table with a label in the paper's source."""
+    end = text.index(f"\\label{{{label}}}")
+    start = text.rindex("\\begin{table}", 0, end)
+    rows = []
+    for line in text[start:end].splitlines():
+        cells = re.sub(r"\\cellcolor\{[^}]*\}|[{}\s$]|\^o|\\\\|\\hline", "", line).split("&")[1:]
+        row = [float(cell) for cell in cells if re.fullmatch(r"[\d.]+", cell)]
+        rows += [row] if len(row) > 6 else []
+    return rows
+
+
+ERRORS = [[float(x.rstrip("°cm")) for x in row] for row in printed.POSE_ERRORS.values()]
+
+
+@pytest.mark.parametrize(
+    ("label", "found"),
+    [
+        ("DTLSampleIP", printed._rows(printed._WEB_IP, 1)),
+        ("IPPASCAL3D", printed._rows(printed._IP, 1)),
+        ("DTLSampleHD", printed._rows(printed._WEB_HAUSDORFF, 1)),
+        ("HDPASCAL3D", printed._rows(printed._HAUSDORFF, 1)),
+        ("HDPASCAL3D2", printed._rows(printed._PRECISION, 1)),
+        ("AErrorAngles", ERRORS),
+    ],
+)
+def test_printed_numbers_are_those_of_the_paper(label, found):
+    source = Path(__file__).parents[3] / "shared" / "paper"
+    files = list(source.glob("*.tex"))
+    if not files:
+        pytest.skip("needs the paper's source in ../shared/paper")
+    text = files[0].read_text(encoding="utf-8")
+    assert numbers_printed_in(text, label) == found
+
+
+def test_classes_stand_beside_the_papers():
+    pairs = {pair: {"top": [10.0 if pair == "CS/MFC" else 90.0]} for pair in tables.PAIRS}
+    known = dict.fromkeys(tables.VARIANTS, pairs)
+    record = {"cad": "a", "category": "boat", **known}
+    (table,) = [
+        each
+        for each in tables.precision_tables(tables.Records([record], "one"))
+        if each.name == "precision_classes"
+    ]
+    rows = {row[0]: row for row in table.rows}
+    assert table.columns[:3] == ["class", "N", "CS/MFC"]
+    assert rows["boat"][1:4] == ["1", "1.00 / 1.00 / 1.00 / 0.78", "0.00 / 0.00 / 0.00 / 0.71"]
+    assert rows["sofa"][1:3] == ["0", "- / - / - / 0.85"]
+    assert "literal / corrected, S_hog as printed / corrected / the paper" in table.definition
 
 
 def run(monkeypatch, *words):
@@ -268,8 +324,96 @@ def test_the_staircase_leads_from_the_paper_to_the_default_one_change_at_a_time(
 
 
 def test_the_staircase_shows_what_is_known():
-    row = {"set": "lm", "step": "2", "n": "8", "right": "0.625", "median": "12.3", "commit": "abc"}
-    text = staircase.table([row, {**row, "step": "0", "right": "0"}])
+    row = {"set": "lm", "step": "2", "n": "8", "cads": "2", "right": "0.625", "low": "0.5"}
+    row |= {"high": "0.75", "median": "12.3", "commit": "abc"}
+    text = staircase.table([row, {**row, "step": "0", "right": "0", "cads": "3"}])
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
+    assert "| 0. the paper to the letter | 0.00 (0.50 to 0.75), 12° |" in text
     assert "| 13. contour fit of five hypotheses: the default | - |" in text
+
+
+def test_parts_are_left_out_one_at_a_time():
+    default = Pipeline().with_pose_prior("upright")
+    found = dict(staircase.parts("upright"))
+    changed = {}
+    for name, pipeline in found.items():
+        names = ("views", "bank", "field", "box_jitter", "search", "hypotheses", "contours")
+        changed[name] = [n for n in names if getattr(pipeline, n) != getattr(default, n)]
+        mine = {term.name: term.weight for term in pipeline.terms}
+        theirs = {term.name: term.weight for term in default.terms}
+        changed[name] += [n for n in theirs if mine.get(n) != theirs[n]]
+    assert found["learned: the default"] == default
+    assert changed["without the contour fit"] == ["hypotheses", "contours"]
+    assert changed["without the appearance term"] == ["appearance"]
+    assert changed["without repeatability"] == ["repeatability"]
+    assert changed["without the box's shape"] == ["box"]
+    assert changed["without box jitter"] == ["box_jitter"]
+    assert changed["classical"] == ["field", "appearance"]
+    assert found["gradient instead of focus curves"].field == "gradient"
+    assert found["paper"] == PRESETS["paper"]
+    assert "| without repeatability | - |" in staircase.table(
+        [
+            {
+                "set": "lm",
+                "step": "0",
+                "n": "8",
+                "cads": "2",
+                "right": "0.6",
+                "low": "0",
+                "high": "1",
+                "median": "3",
+                "commit": "",
+            }
+        ],
+        "parts",
+    )
+
+
+def climb(monkeypatch, out, *words):
+    monkeypatch.setattr(sys, "argv", ["staircase.py", *map(str, words), "--out", str(out)])
+    return staircase.main()
+
+
+@pytest.mark.slow
+def test_steps_have_the_results_of_an_evaluation(pascal, tmp_path, monkeypatch, capsys):
+    steps = [0, 8]
+    words = [f"mini={pascal.root}", "--quiet", "--steps", *steps]
+    assert climb(monkeypatch, tmp_path / "stairs", *words) == 0
+    benchmark = staircase.benchmark_of(pascal.root, 1)
+    pipelines = list(staircase.pipelines("upright"))
+    assert "mini: 2 objects left out" in capsys.readouterr().err
+    rows = staircase.read(tmp_path / "stairs" / "staircase.csv")
+    assert [row["step"] for row in rows] == ["0", "8"]
+    for k, row in zip(steps, rows, strict=True):
+        found = evaluate(benchmark, tmp_path / str(k), pipeline=pipelines[k][1], progress=False)
+        assert float(row["median"]) == pytest.approx(found["med_err_deg"], abs=1e-4)
+        assert float(row["right"]) == pytest.approx(found["acc_pi_6"])
+        assert int(row["n"]) == found["n"]
+
+
+def test_the_staircase_goes_on_where_it_was(pascal, tmp_path, monkeypatch):
+    words = [f"mini={pascal.root}", "--quiet", "--steps", "0"]
+    assert climb(monkeypatch, tmp_path, *words, "--partial") == 0
+    assert staircase.read(tmp_path / "staircase.csv") == []
+    assert climb(monkeypatch, tmp_path, *words) == 0
+    (row,) = staircase.read(tmp_path / "staircase.csv")
+    monkeypatch.setattr(staircase, "measure", Mock(side_effect=AssertionError("measured again")))
+    assert climb(monkeypatch, tmp_path, *words) == 0
+    assert staircase.read(tmp_path / "staircase.csv") == [row]
+    with pytest.raises(AssertionError, match="measured again"):
+        climb(monkeypatch, tmp_path, *words[:-1], "1")
+    assert climb(monkeypatch, tmp_path, "nothing") == 2
+
+
+def test_objects_without_a_pose_count_as_wrong(pascal, monkeypatch):
+    benchmark = staircase.benchmark_of(pascal.root, 1)
+    (chosen,) = staircase.chosen_objects(benchmark, 1)
+    climber = staircase.Climber(benchmark, chosen)
+    monkeypatch.setattr(
+        staircase, "register_observation", Mock(side_effect=InvalidInputError("no"))
+    )
+    assert climber.errors(PRESETS["paper"]) == [180.0]
+    errors = {"error_deg": torch.tensor([90.0]), "symmetric_error_deg": torch.tensor([5.0])}
+    monkeypatch.setattr(benchmark, "errors", lambda *_: errors)
+    assert climber.errors(PRESETS["paper"]) == [5.0], "up to symmetries"

@@ -271,7 +271,8 @@ def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monke
     )
     request = replace(RegisterOptions(), meshes=(folder / "truck.ply",), pose="any")
     session = new_session()
-    first = session._open_registrar(request)
+    report = session.report_progress
+    first = session.open_registrar(request, report)
     assert first == ("any", request.meshes)
     box = (1.0, 2.0, 30.0, 40.0)
     camera = (260.0, 260.0, 119.5, 89.5)
@@ -282,11 +283,11 @@ def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monke
         camera=camera,
         limits={"theta": (0.0, 9.0)},
     )
-    assert session._open_registrar(other) is first
-    assert session._open_registrar(replace(other, camera=None, guess=60.0)) is first
+    assert session.open_registrar(other, report) is first
+    assert session.open_registrar(replace(other, camera=None, guess=60.0), report) is first
     for changes in ({"pose": "upright"}, {"meshes": (folder / "other.ply",)}):
         changed = replace(request, **changes)
-        assert session._open_registrar(changed) == (changed.pose, changed.meshes)
+        assert session.open_registrar(changed, report) == (changed.pose, changed.meshes)
 
 
 def test_distortion_is_removed_from_all_photographs(folder):

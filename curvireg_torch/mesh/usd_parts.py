@@ -1,0 +1,249 @@
+"""The meshes of a USD file as arrays: a program of its own, without the rest of the package.
+
+    python usd_parts.py FILE.usd OUT.npz MOST_PARTS MOST_FACES
+
+OUT has an entry ``about``, a text in JSON: unit, axis and parts, or an ``error``. Arrays of part
+number k are called ``k.points``, ``k.counts``, and so on. OpenUSD follows references and prints; so
+:mod:`.usd` runs this in a process that may end as it likes.
+"""
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Ar, Sdf, Usd, UsdGeom, UsdShade
+
+MAX_MEMORY = 8 << 30  # bytes of this process
+MAX_PRIMS_PER_PART = 20  # groups, materials and lights beside the parts
+MAX_LAYERS = 1000
+COLOUR_NAMES = ("diffuseColor", "baseColor", "base_color")
+COORDINATES = ("TexCoord2fArray", "Float2Array")
+
+
+def main() -> None:
+    path, out, most_parts, most_faces = sys.argv[1:]
+    with contextlib.suppress(ImportError):  # as on Windows
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
+    arrays: dict[str, Any] = {}
+    try:
+        layers = used_layers(path)
+        about = read(path, arrays, int(most_parts), int(most_faces))
+        about["layers"] = layers
+    except ValueError as error:
+        arrays = {}
+        about = {"error": str(error)}
+    except RuntimeError:  # of OpenUSD, in several lines
+        arrays = {}
+        about = {"error": "not a USD file, or damaged"}
+    np.savez(out, about=np.array(json.dumps(about)), **arrays)
+
+
+def used_layers(path: str) -> list[str]:
+    """The files beside the first one that a stage would open, which must lie in its folder or
+    package."""
+    folder = Path(path).resolve().parent
+    waiting = [path]
+    known = {path}
+    beside = []
+    while waiting:
+        identifier = waiting.pop()
+        layer = Sdf.Layer.FindOrOpen(identifier)
+        if layer is None:
+            if identifier == path:
+                raise ValueError("not a USD file, or damaged")
+            continue  # a stage goes on without it
+        layer.Traverse("/", refuse_clips(layer))
+        for name in layer.GetCompositionAssetDependencies():
+            target = layer.ComputeAbsolutePath(name)
+            package = Ar.SplitPackageRelativePathOuter(target)[0]
+            if "://" in name or "`" in name or not is_inside(package, path, folder):
+                raise ValueError(f"it refers to {name[:100]!r}, outside of its folder; flatten it")
+            if target not in known:
+                known.add(target)
+                waiting.append(target)
+                if package != path:
+                    beside.append(str(Path(package).resolve().relative_to(folder)))
+            if len(known) > MAX_LAYERS:
+                raise ValueError(f"it refers to more than {MAX_LAYERS:,} files; flatten it")
+    return beside
+
+
+def is_inside(package: str, path: str, folder: Path) -> bool:
+    """Whether a file is the first one itself, or in its folder; a package stands alone."""
+    if package == path:
+        return True
+    return not path.lower().endswith(".usdz") and Path(package).resolve().is_relative_to(folder)
+
+
+def refuse_clips(layer: Any) -> Any:
+    """A visitor that refuses animation by further files."""
+
+    def visit(place: Any) -> None:
+        if place.IsPrimPath() and layer.GetPrimAtPath(place).HasInfo("clips"):
+            raise ValueError("value clips are not read; export one frame")
+
+    return visit
+
+
+def read(path: str, arrays: dict[str, Any], most_parts: int, most_faces: int) -> dict[str, Any]:
+    """Unit, axis and parts of a stage at its first frame."""
+    stage = Usd.Stage.Open(path)
+    if stage is None:
+        raise ValueError("not a USD file, or damaged")
+    metres = None
+    if UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        metres = float(UsdGeom.GetStageMetersPerUnit(stage))
+    about: dict[str, Any] = {"metres": metres, "up": str(UsdGeom.GetStageUpAxis(stage)).lower()}
+    parts: list[dict[str, Any]] = []
+    left_out: set[str] = set()
+    places = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
+    prims = 0
+    faces = 0
+    walk = iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
+    for prim in walk:
+        prims += 1
+        if len(parts) > most_parts or prims > MAX_PRIMS_PER_PART * most_parts:
+            raise ValueError(f"more than {most_parts:,} parts; join them")
+        if is_hidden(prim):
+            walk.PruneChildren()
+            continue
+        if prim.IsA(UsdGeom.PointInstancer):
+            raise ValueError("point instancers are not read; export their copies as meshes")
+        if prim.IsA(UsdGeom.Gprim) and not prim.IsA(UsdGeom.Mesh):
+            left_out.add(prim.GetTypeName())
+        if not prim.IsA(UsdGeom.Mesh):
+            continue
+        part = read_mesh(UsdGeom.Mesh(prim), f"{len(parts)}.", arrays)
+        if part is None:
+            continue
+        faces += part.pop("faces")
+        if faces > most_faces:
+            raise ValueError(f"more than {most_faces:,} faces; simplify it")
+        part["place"] = np.array(places.GetLocalToWorldTransform(prim)).T.tolist()
+        parts.append(part)
+    return {**about, "parts": parts, "left_out": sorted(left_out)}
+
+
+def is_hidden(prim: Any) -> bool:
+    """Whether a part is only a helper, or switched off."""
+    image = UsdGeom.Imageable(prim)
+    if not image:
+        return False
+    is_helper = image.GetPurposeAttr().Get() in (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
+    now = Usd.TimeCode.EarliestTime()
+    return is_helper or image.GetVisibilityAttr().Get(now) == UsdGeom.Tokens.invisible
+
+
+def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | None:
+    """A mesh: its arrays, and what is known of its materials; None without faces."""
+    now = Usd.TimeCode.EarliestTime()
+    points = np.array(mesh.GetPointsAttr().Get(now) or [], np.float64).reshape(-1, 3)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(now) or [], np.int64)
+    indices = np.array(mesh.GetFaceVertexIndicesAttr().Get(now) or [], np.int64)
+    if not len(counts):
+        return None
+    if counts.min() < 0 or counts.sum() != len(indices):
+        raise ValueError("faces that do not fit their corners")
+    if indices.size and not 0 <= indices.min() <= indices.max() < len(points):
+        raise ValueError("a face names a vertex that does not exist")
+    arrays[key + "points"] = points
+    arrays[key + "counts"] = counts
+    arrays[key + "indices"] = indices
+    holes = np.array(mesh.GetHoleIndicesAttr().Get(now) or [], np.int64)
+    colour = by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
+    if colour is not None:
+        arrays[key + "colour"] = colour.reshape(-1, 3)
+    materials: list[dict[str, Any]] = []
+    of_face = np.zeros(len(counts), np.int64)
+    prim = mesh.GetPrim()
+    bound = [(prim, None), *((g.GetPrim(), g) for g in UsdGeom.Subset.GetAllGeomSubsets(mesh))]
+    for owner, subset in bound:
+        material = UsdShade.MaterialBindingAPI(owner).ComputeBoundMaterial()[0]
+        faces = None if subset is None else np.array(subset.GetIndicesAttr().Get(now) or [])
+        if not material or (faces is not None and not faces.size):
+            continue
+        surface = surface_of(material)
+        name = surface.get("coordinates")
+        uv = None
+        if name:
+            primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
+            uv = by_corner(primvar, counts, indices, len(points))
+        if uv is None:
+            surface.pop("texture", None)
+        else:
+            arrays[f"{key}uv{len(materials)}"] = uv.reshape(-1, 2)
+        materials.append(surface)
+        of_face[slice(None) if faces is None else faces.astype(np.int64)] = len(materials)
+    of_face[holes] = -1
+    arrays[key + "material"] = of_face
+    is_left_handed = mesh.GetOrientationAttr().Get(now) == UsdGeom.Tokens.leftHanded
+    triangles = int(np.maximum(counts - 2, 0).sum())
+    return {"faces": triangles, "materials": materials, "left_handed": is_left_handed}
+
+
+def by_corner(primvar: Any, counts: Any, indices: Any, vertices: int) -> Any:
+    """Values of a primvar for each corner of each face; None if it has none, or too few."""
+    if not primvar or not primvar.HasValue():
+        return None
+    flat = primvar.ComputeFlattened(Usd.TimeCode.EarliestTime())
+    values = None if flat is None else np.array(flat, np.float64)
+    if values is None or not len(values):
+        return None
+    corners = len(indices)
+    chosen = {
+        UsdGeom.Tokens.constant: (1, np.zeros(corners, np.int64)),
+        UsdGeom.Tokens.uniform: (len(counts), np.repeat(np.arange(len(counts)), counts)),
+        UsdGeom.Tokens.vertex: (vertices, indices),
+        UsdGeom.Tokens.varying: (vertices, indices),
+        UsdGeom.Tokens.faceVarying: (corners, np.arange(corners)),
+    }
+    wanted, index = chosen.get(primvar.GetInterpolation(), (0, None))
+    return values[index] if index is not None and len(values) >= wanted else None
+
+
+def surface_of(material: Any) -> dict[str, Any]:
+    """The colour of a material, linear, or its texture and the name of its coordinates."""
+    shader = material.ComputeSurfaceSource()[0]
+    if not shader:
+        return {}
+    for name in COLOUR_NAMES:
+        entry = shader.GetInput(name)
+        if not entry:
+            continue
+        source = entry.GetConnectedSources()[0]
+        if source:
+            return texture_of(UsdShade.Shader(source[0].source.GetPrim()))
+        value = entry.Get()
+        return {} if value is None else {"colour": [float(v) for v in value][:3]}
+    return {}
+
+
+def texture_of(shader: Any) -> dict[str, Any]:
+    """The file of a texture, and the primvar of its coordinates."""
+    file = shader.GetInput("file") if shader else None
+    asset = file.Get() if file else None
+    if asset is None:
+        return {"unread": True}
+    found = {"texture": asset.path, "resolved": asset.resolvedPath, "coordinates": "st"}
+    coordinates = shader.GetInput("st")
+    source = coordinates.GetConnectedSources()[0] if coordinates else None
+    if source:
+        reader = UsdShade.Shader(source[0].source.GetPrim())
+        if reader.GetIdAttr().Get() == "UsdTransform2d":
+            return {"unread": True}
+        name = reader.GetInput("varname")
+        while name and name.GetConnectedSources()[0]:  # to an input of the material
+            above = name.GetConnectedSources()[0][0]
+            name = UsdShade.ConnectableAPI(above.source.GetPrim()).GetInput(above.sourceName)
+        value = name.Get() if name else None
+        found["coordinates"] = str(value or "st")
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Which sides of the mesh on the page look alike: found in a thread, while nothing else is done."""
+
+import asyncio
+import time
+import traceback
+from functools import partial
+
+import trimesh
+
+from ..errors import CurviregError
+from ..inspection.facts import mesh_facts
+from ..inspection.report import Inspection, look_alikes_of
+from ..jobs.options import RegisterOptions
+from .session import Session, registrar_key
+
+MAX_SECONDS = 60.0  # after which an examination is given up
+TOO_LONG = "not examined: that takes longer than a minute"
+
+
+class Examination:
+    """Examines the mesh of a session once.
+
+    A search that begins meanwhile waits for the views, which it needs too, and ends the
+    examination, which begins again after it.
+
+    Attributes:
+        advice: one sentence about the mesh, "" before it is known.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self.advice = ""
+        self.waits = False
+        self._subject: tuple[trimesh.Trimesh, RegisterOptions] | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._deadline = 0.0
+
+    @property
+    def running(self) -> bool:
+        """Whether the mesh is being examined."""
+        return self._task is not None
+
+    def start_if_due(self, *, searching: bool) -> None:
+        """Examine the mesh if it is new, unless there is a search."""
+        self.waits = searching
+        if not self._is_current():
+            self.advice = ""
+        mesh = self.session.mesh
+        if self.running or searching or mesh is None or self._is_current():
+            return
+        self._subject = mesh, registrar_key(self.session.request())
+        self._deadline = time.monotonic() + MAX_SECONDS
+        self._task = asyncio.create_task(self._run(*self._subject))
+
+    def _is_current(self) -> bool:
+        """Whether the mesh and the options are those that were examined."""
+        if self._subject is None or self.session.mesh is None:
+            return False
+        mesh, key = self._subject
+        return mesh is self.session.mesh and key == registrar_key(self.session.request())
+
+    async def _run(self, mesh: trimesh.Trimesh, key: RegisterOptions) -> None:
+        try:
+            advice = await asyncio.to_thread(self.examined, mesh, key)
+            if self._is_current():
+                self.advice = advice
+        except _StoppedError:
+            self._subject = None  # begins again
+        except CurviregError as error:
+            if self._is_current():
+                self.advice = str(error)
+        except Exception:  # a defect must not end the page; the terminal has the traceback
+            traceback.print_exc()
+        finally:
+            self._task = None
+
+    def examined(self, mesh: trimesh.Trimesh, key: RegisterOptions) -> str:
+        """The sentence about a mesh, as it is registered with the options."""
+        facts = mesh_facts(mesh)
+        if facts.is_hopeless:
+            return Inspection(facts).in_brief
+        registrar = self.session.open_registrar(key, self._report)
+        pairs = look_alikes_of(registrar, partial(self._report, "look-alikes"))
+        return Inspection(facts, pairs).in_brief
+
+    def close(self) -> None:
+        """End the examination at its next step."""
+        self._subject = None
+
+    def _report(self, stage: str, done: int, total: int) -> None:
+        """End the examination if it takes too long, if there is another mesh, or if a search needs
+        the processor."""
+        is_current = self._is_current()
+        if self.waits and stage == "bank" and is_current and not self.session.cancelled:
+            self.session.progress = (stage, done, total)
+        elif self.waits or not is_current:
+            raise _StoppedError("stopped")
+        elif time.monotonic() > self._deadline:
+            raise CurviregError(TOO_LONG)
+
+
+class _StoppedError(CurviregError):
+    """The examination has ended before its end."""

@@ -1,0 +1,72 @@
+"""Optional packages: one message names all that are missing, and the command that installs them."""
+
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+
+import pytest
+
+from curvireg_torch.cli import main
+from curvireg_torch.errors import MissingDependencyError
+from curvireg_torch.utils import extras
+from curvireg_torch.utils.extras import EXTRAS, PACKAGE_OF_SUFFIX, check_extras, is_installed
+
+PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
+HEIC = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic"
+
+
+@pytest.fixture
+def only(monkeypatch: pytest.MonkeyPatch):
+    """Let only some packages be installed."""
+
+    def install(*packages: str) -> None:
+        monkeypatch.setattr(
+            extras, "find_spec", lambda name: ModuleSpec(name, None) if name in packages else None
+        )
+
+    return install
+
+
+def test_one_message_names_all_missing_packages_and_one_command(only, tmp_path, capsys):
+    photo = tmp_path / "photo.HEIC"
+    photo.write_bytes(HEIC)
+    mesh = tmp_path / "part.STEP"
+    mesh.write_text("a part")
+    only()
+    command = (
+        r"pip install 'curvireg_torch\[cad,heic\]', in a checkout pip install -e '\.\[cad,heic\]'$"
+    )
+    match = rf"photo\.HEIC needs pi_heif, .*part\.STEP needs cascadio: {command}"
+    with pytest.raises(MissingDependencyError, match=match):
+        check_extras([photo, mesh])
+    words = [str(photo), str(mesh), "--unit", "mm"]
+    assert main(["register", *words, "--out", str(tmp_path / "out")]) == 2
+    assert "in a checkout pip install -e '.[cad,heic]'" in capsys.readouterr().err
+    assert main(["view", *words]) == 2
+    assert "in a checkout pip install -e '.[cad,heic,viewer]'" in capsys.readouterr().err
+    assert main(["plot", "overlay", *words, "--out", str(tmp_path / "a.png")]) == 2
+    assert "in a checkout pip install -e '.[cad,heic,plot]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    only("cascadio")
+    with pytest.raises(MissingDependencyError, match=r"curvireg_torch\[heic\]"):
+        check_extras([photo, mesh])
+    only("cascadio", "pi_heif")
+    check_extras([photo, mesh])
+
+
+def test_a_jpeg_called_heic_needs_no_decoder(only, tmp_path):
+    only()
+    (tmp_path / "a.heic").write_bytes(b"\xff\xd8\xff\xe0\0\x10JFIF")
+    check_extras([tmp_path / "a.heic", tmp_path / "a.jpg", tmp_path / "a.stl"])
+
+
+def test_the_extras_are_those_of_the_project():
+    text = PYPROJECT.read_text(encoding="utf-8")
+    assert set(PACKAGE_OF_SUFFIX.values()) <= set(EXTRAS)
+    for extra in EXTRAS.values():
+        assert f"\n{extra} = [" in text
+
+
+def test_modules_without_a_specification_count_as_missing(monkeypatch):
+    monkeypatch.setitem(extras.find_spec.__globals__["sys"].modules, "pi_heif", None)
+    assert not is_installed("pi_heif")
+    assert is_installed("json")
