@@ -23,26 +23,28 @@ class EvidenceWeights:
     (docs/experiments.md).
 
     The rank does not count where poses are fitted: how near a view of the bank was to one is a
-    matter of sampling.
+    matter of sampling. Nor does the edge support, which poses that predict few contours reach
+    easily.
 
     Example:
-        >>> EvidenceWeights(details=0.0).edge_support
+        >>> EvidenceWeights(details=0.0).contours
         10.0
     """
 
     rank: float = 0.0
     similarity: float = 10.0
-    edge_support: float = 10.0
+    edge_support: float = 0.0
     appearance: float = 2.5
     landmarks: float = 6.0
     details: float = 1.0
+    contours: float = 10.0
 
     def __post_init__(self) -> None:
         for name, weight in vars(self).items():
             check_number(weight, name)
 
 
-RANK_ALONE = EvidenceWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+RANK_ALONE = EvidenceWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Weights with the mesh of a similar object: poses keep the order of the ranking."""
 
 
@@ -69,6 +71,10 @@ class SeenPoses(Protocol):
     def keypoints(self) -> Tensor:
         """Number of keypoints that agree with a pose."""
 
+    @property
+    def contours(self) -> Tensor:
+        """See :func:`.contour_evidence`; 0 without the contour fit."""
+
 
 @dataclass(frozen=True)
 class Evidence(Rows):
@@ -88,6 +94,8 @@ class Evidence(Rows):
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
+        contours: by how much the edges under its contours exceed chance, see
+            :func:`.contour_evidence`; 0 without the contour fit.
     """
 
     rank: Tensor
@@ -96,6 +104,7 @@ class Evidence(Rows):
     appearance: Tensor
     landmarks: Tensor
     details: Tensor
+    contours: Tensor
 
     @classmethod
     def of(cls, seen: SeenPoses) -> "Evidence":
@@ -107,6 +116,7 @@ class Evidence(Rows):
             appearance=seen.appearance.double(),
             landmarks=keypoint_evidence(seen.keypoints),
             details=torch.zeros_like(seen.similarity),
+            contours=seen.contours,
         )
 
     @classmethod

@@ -218,6 +218,15 @@ class ContourProblem(Rows):
             min=1
         )
 
+    def strength_near(self, uv: Tensor, normals: Tensor) -> Tensor:
+        """(N, P) float64 strength of the edges within about 1 px of points (N, P, 2) px with
+        ``normals`` (N, P, 2)."""
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
+        near = self.edges.strength(uv, normals, offsets, self.image_index) * torch.exp(
+            -0.5 * offsets**2
+        )
+        return near.amax(dim=-1).double()
+
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
         points = state.points

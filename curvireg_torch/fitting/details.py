@@ -57,11 +57,7 @@ def contour_details(
     problem = ContourProblem.of(contours, crops, K, image_index)
     points = problem.state(T).points
     uv = pixels(points.model, T, problem.K, problem.centre)
-    offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
-    near = problem.edges.strength(uv, points.normals, offsets, image_index) * torch.exp(
-        -0.5 * offsets**2
-    )
-    strength = near.amax(dim=-1).double()
+    strength = problem.strength_near(uv, points.normals)
     counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
     return ContourDetails(uv, strength, points.valid, counted)
 

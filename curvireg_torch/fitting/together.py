@@ -13,7 +13,7 @@ from ..utils.company import by_key, compute_together
 from .contour_fit import fit_to_edges, quick_fit
 from .details import ContourDetails, compared, contour_details
 from .edges import EdgeCrops
-from .measured_fit import ContourFit, contour_support
+from .measured_fit import ContourFit, contour_evidence, contour_support
 
 
 @dataclass(frozen=True)
@@ -137,6 +137,17 @@ def support_together(
 
 def _supports(requests: Sequence[FitRequest]) -> list[Tensors]:
     return _computed(requests, lambda request: (contour_support(*request.arguments()),))
+
+
+def evidence_together(
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+) -> Tensor:
+    """:func:`.contour_evidence`, on the device of the contours; the result is on the CPU."""
+    return compute_together(_evidence, FitRequest(contours, crops, K, T, image_index, {}))[0]
+
+
+def _evidence(requests: Sequence[FitRequest]) -> list[Tensors]:
+    return _computed(requests, lambda request: (contour_evidence(*request.arguments()),))
 
 
 def details_together(

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.landmarks import LandmarkMatches
-from ..fitting.together import details_together
+from ..fitting.together import details_together, evidence_together
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
 from ..utils.company import by_key, compute_together
@@ -76,6 +76,15 @@ class ComparedPoses:
         if landmarks is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
         return landmarks.agreeing(self.poses.T, self.poses.cameras)
+
+    @property
+    def contours(self) -> Tensor:
+        crops = self.photograph.crops
+        poses = self.poses
+        if crops is None:
+            return torch.zeros(len(poses), dtype=torch.float64)
+        contours = self.target.describer.device_contours
+        return evidence_together(contours, crops, poses.cameras, poses.T, poses.crop_index)
 
     @cached_property
     def _views(self) -> tuple[Tensor, Tensor | None]:
