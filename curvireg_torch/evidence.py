@@ -19,26 +19,33 @@ class EvidenceWeights:
     (docs/experiments.md).
 
     The rank does not count where poses are fitted: how near a view of the bank was to one is a
-    matter of sampling.
+    matter of sampling. Nor does the edge support, which poses that predict few contours reach
+    easily.
 
     Example:
-        >>> EvidenceWeights(details=0.0).edge_support
+        >>> EvidenceWeights(details=0.0).contours
         10.0
     """
 
     rank: float = 0.0
     similarity: float = 10.0
-    edge_support: float = 10.0
+    edge_support: float = 0.0
     appearance: float = 2.5
     landmarks: float = 6.0
     details: float = 1.0
+    contours: float = 10.0
 
     def __post_init__(self) -> None:
         for name, weight in vars(self).items():
             check_number(weight, name)
 
+    @classmethod
+    def only(cls, **weights: float) -> "EvidenceWeights":
+        """Weights of some kinds, the others 0."""
+        return cls(**{**dict.fromkeys((field.name for field in fields(cls)), 0.0), **weights})
 
-RANK_ALONE = EvidenceWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+RANK_ALONE = EvidenceWeights.only(rank=1.0)
 """Weights with the mesh of a similar object: poses keep the order of the ranking."""
 
 
@@ -74,6 +81,10 @@ class SeenPoses(Protocol):
     def keypoints(self) -> Tensor:
         """Number of keypoints that agree with a pose, beyond those that agree by chance."""
 
+    @property
+    def contours(self) -> Tensor:
+        """See :func:`.contour_evidence`; 0 without the contour fit."""
+
 
 @dataclass(frozen=True)
 class Evidence(Rows):
@@ -93,12 +104,14 @@ class Evidence(Rows):
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
+        contours: by how much the edges under its contours exceed chance, see
+            :func:`.contour_evidence`; 0 without the contour fit.
 
     Example:
-        >>> one = torch.ones(1, dtype=torch.float64)
-        >>> evidence = Evidence(-one, 0.7 * one, 0.5 * one, 0.0 * one, 0.0 * one, 0.0 * one)
-        >>> evidence.named(0)["edge_support"], evidence.scores(EvidenceWeights()).tolist()
-        (0.5, [12.0])
+        >>> similarity = torch.tensor([0.75, 0.5], dtype=torch.float64)
+        >>> evidence = replace(Evidence.zeros(2), similarity=similarity)
+        >>> evidence.named(0)["similarity"], evidence.scores(EvidenceWeights()).tolist()
+        (0.75, [7.5, 5.0])
     """
 
     rank: Tensor
@@ -107,6 +120,7 @@ class Evidence(Rows):
     appearance: Tensor
     landmarks: Tensor
     details: Tensor
+    contours: Tensor
 
     @classmethod
     def of(cls, seen: SeenPoses) -> "Evidence":
@@ -118,7 +132,14 @@ class Evidence(Rows):
             appearance=seen.appearance.double(),
             landmarks=seen.keypoints.log1p(),
             details=torch.zeros_like(seen.similarity),
+            contours=seen.contours,
         )
+
+    @classmethod
+    def zeros(cls, count: int) -> "Evidence":
+        """``count`` poses for which nothing speaks."""
+        nothing = torch.zeros(count, dtype=torch.float64)
+        return cls(**{field.name: nothing for field in fields(cls)})
 
     @classmethod
     def of_hypotheses(cls, reported: Sequence[Mapping[str, float]]) -> "Evidence":

@@ -4,7 +4,7 @@ ranking multiplies."""
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from dataclasses import field as dataclass_field
 from typing import Any, ClassVar
 
@@ -93,6 +93,26 @@ class QueryFeatures:
     def crops(self) -> Tensor:
         """(B, C, S, S) crops of the boxes themselves."""
         return self.regions[:, 0]
+
+    def split(self) -> "list[QueryFeatures]":
+        """Each photograph by itself."""
+        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
+        known = [getattr(self, name) for name in names]
+        count = len(self.regions)
+        parts = [[None] * count if x is None else x.split(1) for x in known]
+        queries = [QueryFeatures(*row) for row in zip(*parts, strict=True)]
+        for name, x in self.computed.items():
+            for query, part in zip(queries, x.split(1), strict=True):
+                query.computed[name] = part
+        return queries
+
+    @staticmethod
+    def cat(queries: "Sequence[QueryFeatures]") -> "QueryFeatures":
+        """The photographs together."""
+        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
+        known = [[getattr(query, name) for query in queries] for name in names]
+        parts = [None if some[0] is None else torch.cat(some) for some in known]
+        return QueryFeatures(*parts)  # type: ignore[arg-type]
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -42,11 +42,13 @@ def test_evidence_is_read_from_poses():
         edge_support=torch.tensor([0.4, torch.nan]).double(),
         appearance=torch.tensor([0.5, -0.5]).double(),
         keypoints=torch.tensor([0.0, 20.0]).double(),
+        contours=torch.tensor([0.3, 0.0]).double(),
     )
     read = Evidence.of(seen)
     assert read.edge_support.tolist() == pytest.approx([0.4, 0.0])
     assert read.landmarks.expm1().tolist() == pytest.approx([0.0, 20.0])
     assert read.details.tolist() == [0.0, 0.0]
+    assert read.contours.tolist() == pytest.approx([0.3, 0.0])
     assert list(read.named(1)) == NAMES
     assert read.named(1)["appearance"] == -0.5
     again = Evidence.of_hypotheses([read.named(0), read.named(1)])
@@ -62,12 +64,12 @@ def test_photographs_are_averaged_by_weight():
 
 def test_many_keypoints_outweigh_what_an_occluder_takes_away_and_one_does_not():
     similarity = [0.4, 0.1, 0.8, 0.6]
-    edge_support = [0.3, 0.1, 0.5, 0.3]
+    contours = [0.3, 0.1, 0.5, 0.3]
     keypoints = torch.tensor([0.0, 20.0, 0.0, 1.0]).log1p().tolist()
     four = evidence(
         4,
         similarity=similarity,
-        edge_support=edge_support,
+        contours=contours,
         appearance=[0.0, -4.0, 0.0, -0.5],
         landmarks=keypoints,
     )

@@ -17,6 +17,7 @@ from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .options import (
+    BOXES,
     PHOTOGRAPH,
     add_command,
     add_limits,
@@ -112,8 +113,7 @@ def add_register(commands: Any) -> None:
     add_options(
         parser,
         *PHOTOGRAPH,
-        "box_format",
-        "boxes",
+        *BOXES,
         "start",
         "start_convention",
         "instances",
@@ -482,9 +482,13 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         return
     poses = zip(document["hypotheses"], document["probabilities"], strict=False)
     rivals = list(poses)[1:]
-    for rival, probability in rivals:
-        if probability >= RIVAL_FRACTION * document["confidence"]:
-            print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
+    least = RIVAL_FRACTION * document["confidence"]
+    likely = [(rival, probability) for rival, probability in rivals if probability >= least]
+    if not likely:
+        print("right up to turns that only a small feature tells apart, which is not in view")
+        return
+    for rival, probability in likely:
+        print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
         "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",

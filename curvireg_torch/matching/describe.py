@@ -16,7 +16,9 @@ from ..mesh.edges import simplified
 from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
-from ..rendering.contours import LEVELS, MeshContours
+from ..rendering.contours import LEVELS, Contours, MeshContours
+from ..rendering.device_contours import DeviceContours
+from ..rendering.zbuffer import DeviceRenderer
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
 # to which larger meshes are simplified for views: their contours are those of full size
@@ -83,10 +85,12 @@ class ViewDescriber:
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
         self.hull = extreme_points(mesh)
-        self._device = device
+        self._device = torch.device(device)
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self._simple = view_mesh(mesh)
             self.view_renderer = make_renderer(self._simple, renderer, many_views=True)
+        if renderer == "auto" and self._device.type != "cpu":
+            self.view_renderer = DeviceRenderer(self._simple, self._device)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -97,8 +101,15 @@ class ViewDescriber:
 
     @cached_property
     def contours(self) -> MeshContours:
-        """Occluding contours and creases at any pose."""
+        """Occluding contours and creases at any pose, on the CPU."""
         return MeshContours(self._simple)
+
+    @cached_property
+    def device_contours(self) -> Contours:
+        """The same, on the device of the views."""
+        if self._device.type == "cpu":
+            return self.contours
+        return DeviceContours(self.contours, self._device)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
         """The same mesh and renderer with other settings; convex hulls of large meshes take

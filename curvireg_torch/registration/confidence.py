@@ -24,7 +24,14 @@ from ..pipeline import BankSettings, FitSettings, Pipeline
 LANDMARK_PROBABILITY = 0.95
 RELIABLE = FitSettings().reliable  # Confidence from which an answer is called reliable by default
 # the more, the better
-EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
+EVIDENCE_FEATURES = (
+    "similarity",
+    "margin",
+    "edge_support",
+    "contours",
+    "concentration",
+    "landmarks",
+)
 DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
@@ -184,8 +191,8 @@ def confidence_features(
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest
-    of its rivals, clamped to +-5; None without rivals.
+    similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
+    the largest of its rivals, clamped to +-5; None without rivals.
 
     Args:
         evidence: of the H hypotheses, the best first.
@@ -206,6 +213,7 @@ def confidence_features(
         "similarity": best["similarity"],
         "margin": margin,
         "edge_support": best["edge_support"],
+        "contours": best["contours"],
         "concentration": share,
         "landmarks": best["landmarks"],
         "undetermined": undetermined,

@@ -29,7 +29,7 @@ from .poses import (
 from .refits import best_inside, fitted_again
 from .result import Registration
 from .search import search
-from .siblings import with_siblings
+from .siblings import Rival, with_siblings
 from .target import Target
 from .unknown_camera import (
     limits_of,
@@ -65,7 +65,7 @@ def register_item(target: Target, item: ImageItem) -> Registration:
 
 
 def _register_box(target: Target, item: ImageItem) -> Registration:
-    query = target.matcher.query([item.image], item.box[None])
+    query = target.matcher.query_together(item.image, item.box)
     check_crop(query.crops[0])
     return register(target, item, query)
 
@@ -95,7 +95,7 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
     evidence = evidence_of(target, work, poses)
-    sibling: tuple[Poses, Evidence] | None = None
+    sibling = Rival.none(poses, evidence)
     if work.crops is not None and work.exact:
         if work.item.focal_deviation:
             poses, evidence = with_fitted_focal_lengths(
@@ -129,19 +129,21 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         evidence = evidence.replaced(back, evidence_of(target, work, restored))
     if work.crops is not None and work.item.focal_deviation:
         work, poses = with_focal_deviation(target, work, work.crops, poses, evidence, outside)
-    if sibling is not None:
-        poses = Poses.cat([poses, sibling[0]])
-        evidence = Evidence.cat([evidence, sibling[1]])
-        distinct = F.pad(distinct, (0, 1), value=True)
-        outside = F.pad(outside, (0, 1))
-    return judged(target, work, poses, evidence, distinct, outside)
+    poses = Poses.cat([poses, sibling.poses])
+    evidence = Evidence.cat([evidence, sibling.evidence])
+    distinct = F.pad(distinct, (0, len(sibling.poses)), value=True)
+    outside = F.pad(outside, (0, len(sibling.poses)))
+    result = judged(target, work, poses, evidence, distinct, outside)
+    return replace(result, feature_is_hidden=sibling.feature_is_hidden)
 
 
 def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     target.report_progress("ranking")
     exact = target.is_exact
     limits = None if item.prior is None else limits_of(target, item)
-    ranking = target.matcher.rank(query, None if limits is None else limits.allowed()[None])
+    ranking = target.matcher.rank_together(
+        query, None if limits is None else limits.allowed()[None]
+    )
     symmetries = target.symmetries_of(exact=exact)
     crops = None
     if target.pipeline.contours:

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from ..evidence import EvidenceWeights
-from ..fitting.contour_fit import fit_to_edges, quick_fit
 from ..fitting.contour_problem import ContourProblem
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit
 from ..fitting.texture_fit import fit_texture, turned
+from ..fitting.together import fit_together, quick_fit_together, support_together
 from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..pipeline import FitSettings
@@ -137,7 +137,8 @@ def best_views(
     order = ranking.order[0]
     if ranking.allowed is not None:
         order = order[ranking.allowed[0][order]]
-    view = distinct_views(order, bank.rotations, count=count, symmetries=symmetries).cpu()
+    rotations = bank.views.rotations  # on the CPU, in the precision of bank.rotations
+    view = distinct_views(order, rotations, count=count, symmetries=symmetries).cpu()
     log = ranking.scores[0].cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
     return view, log[view] - log.max()
 
@@ -151,9 +152,9 @@ def fit_poses(
     **options: Any,
 ) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
     finish = options.pop("finish", settings.finished_fits)
-    fit = fit_to_edges(*given, settings=settings, finish=finish, **options)
+    fit = fit_together(*given, settings=settings, finish=finish, **options)
     return poses.with_fit(fit, describer.centre)
 
 
@@ -162,7 +163,8 @@ def with_quick_fit(
 ) -> tuple[Poses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`quick_fit`."""
-    T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    T, support = quick_fit_together(*given)
     return replace(poses, quick=T), support
 
 
@@ -185,7 +187,8 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Poses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    support = contour_support(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    support = support_together(*given)
     return replace(poses, edge_support=support)
 
 

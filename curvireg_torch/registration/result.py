@@ -235,6 +235,9 @@ class Registration:
             not reliable.
         notes: what the mesh lacks, as its textures, or what was left out of it, in words; reliable
             all the same.
+        feature_is_hidden: whether a small feature of the mesh tells turns of it apart, as the pull
+            tab of a can does, and the photograph does not show it: the pose is right up to these
+            turns.
         model: number of the mesh, of several.
         camera: of the photograph without its distortion; its ``source`` tells whether it was given,
             and ``focal_deviation`` how well its focal length is known. None without a camera, and
@@ -263,6 +266,7 @@ class Registration:
     prior_contradiction: str | None = None
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    feature_is_hidden: bool = False
     model: int = 0
     camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
@@ -295,14 +299,15 @@ class Registration:
     @property
     def ambiguous(self) -> str | None:
         """How poses differ that are nearly as probable as the first: "half turn", "mirror" or
-        "several"; else None."""
+        "several", as are those that only a hidden feature of the mesh tells apart; else None."""
         likely = [p >= RIVAL_FRACTION * self.probabilities[0] for p in self.probabilities]
         near = [
             h.allocentric_rotation
             for h, is_near in zip(self.hypotheses, likely, strict=False)
             if is_near
         ]
-        return ambiguity(torch.stack(near)) if near else None
+        named = ambiguity(torch.stack(near)) if near else None
+        return "several" if named is None and self.feature_is_hidden else named
 
     @property
     def reliable(self) -> bool:
@@ -395,6 +400,7 @@ class Registration:
             "probabilities": list(self.probabilities),
             "no_match_probability": self.no_match_probability,
             "ambiguous": self.ambiguous,
+            "feature_is_hidden": self.feature_is_hidden,
             "confidence_features": dict(self.confidence_features),
             "edge_support": self.edge_support,
             "standard_deviations": deviations

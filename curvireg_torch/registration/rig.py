@@ -37,6 +37,8 @@ from .tracker import boxes_at
 FITTED_CANDIDATES = 6
 JUDGED_CANDIDATES = 4
 FINISHED_CANDIDATES = 2
+# Weight of the edge support, beside log S, in the choice of the candidates that are compared
+SUPPORT_WEIGHT = 10.0
 # Degrees, and shift in object radii, within which two candidates count as one; the best view of the
 # bank so near to a pose stands for it
 SAME_ANGLE = 15.0
@@ -385,8 +387,7 @@ class Rig:
         # for those that are far off; the others lose by it
         moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)
         T, support, _ = self.fitted(half, torch.cat([T, moved]), FIRST_RADII)
-        weight = self.target.score_weights(exact=True).edge_support
-        promising = (weight * support + _bounded(self.ranks(T))).sum(dim=0)
+        promising = (SUPPORT_WEIGHT * support + _bounded(self.ranks(T))).sum(dim=0)
         chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
         T = T[chosen]
         support = support[:, chosen]

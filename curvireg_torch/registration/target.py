@@ -19,7 +19,7 @@ from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
 from .inputs import ImageItem
-from .shape_symmetries import telling_symmetries
+from .shape_symmetries import TellingSymmetries, telling_symmetries
 
 # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
 FLAT_EXTENT = 1e-3
@@ -74,12 +74,12 @@ class Target:
         return self.pipeline.fit.weights if exact else RANK_ALONE
 
     @cached_property
-    def telling_symmetries(self) -> Tensor:
-        """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity
-        alone if they are given, and trusted."""
+    def telling_symmetries(self) -> TellingSymmetries:
+        """Symmetries of the shape of an exact mesh whose poses are compared; the identity alone if
+        they are given, and trusted."""
         symmetries = self.symmetries_of(exact=True)
         if self.symmetries is not None or symmetries is None:
-            return torch.eye(4, dtype=torch.float64)[None]
+            return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
         return telling_symmetries(self.bank.mesh, symmetries)
 
     @property

@@ -13,6 +13,8 @@ from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.landmarks import LandmarkMatches
 from ..fitting.measured_fit import measure_contours
+from ..utils.company import map_in_company
+from ..utils.precision import exact_convolutions
 from ..utils.threads import map_on_threads
 from .described import DescribedPhotograph
 from .inputs import ImageItem
@@ -50,8 +52,8 @@ def map_items(
     each error.
 
     On a CPU each photograph has a thread, in which torch uses no further ones: its result is
-    the same to the bit, whatever else is registered. Items are read on demand, so that few
-    photographs are in memory.
+    the same to the bit, whatever else is registered. On other devices, what the photographs need
+    is computed together. Items are read on demand, so that few photographs are in memory.
     """
     target.share()
 
@@ -64,7 +66,10 @@ def map_items(
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 
-    return map_on_threads(run, range(len(items)), device=target.bank.device)
+    if target.bank.device.type == "cpu":
+        return map_on_threads(run, range(len(items)))
+    with exact_convolutions():
+        return map_in_company(run, range(len(items)))
 
 
 def least_starts(target: Target) -> int:

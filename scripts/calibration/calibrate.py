@@ -187,13 +187,16 @@ def render_sets(
 
 def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
     """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
-    that an exact mesh without colours has for the registrar."""
+    that an exact mesh without colours has for the registrar, unless a notable feature of it tells
+    them apart."""
     listed = sample["model_info"].get("symmetries_discrete", [])
     known = [
         torch.eye(3).double()[None],
         *(torch.tensor(values).view(1, 4, 4)[:, :3, :3].double() for values in listed),
     ]
-    found = None if registrar is None else registrar.symmetries_of(exact=True)
+    found = None
+    if registrar is not None and not registrar.telling_symmetries.notable:
+        found = registrar.symmetries_of(exact=True)
     return torch.cat(known if found is None else [*known, found[:, :3, :3].double()])
 
 

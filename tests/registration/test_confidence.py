@@ -92,6 +92,7 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
         "similarity": 0.7,
         "margin": 0.0,
         "edge_support": 0.5,
+        "contours": 0.4,
         "concentration": 0.3,
         "landmarks": 1.0,
     }
@@ -111,6 +112,7 @@ def test_confidence_features():
         appearance=torch.tensor([1.0, 0.4, 0.8]).double(),
         landmarks=torch.tensor([2.0, 0.0, 3.0]).double(),
         details=torch.tensor([0.5, 0.0, 0.0]).double(),
+        contours=torch.tensor([0.9, 0.8, 1.0]).double(),
     )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
@@ -118,6 +120,7 @@ def test_confidence_features():
         "similarity": 0.7,
         "margin": 2.5,
         "edge_support": 0.4,
+        "contours": 0.9,
         "concentration": 0.3,
         "landmarks": 2.0,
         **doubts,

@@ -22,7 +22,14 @@ from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.pipeline import PRESETS, FitSettings
-from curvireg_torch.registration import FailedRegistration, Follower, photograph, refits, work
+from curvireg_torch.registration import (
+    FailedRegistration,
+    Follower,
+    photograph,
+    refits,
+    work,
+)
+from curvireg_torch.registration import described as described_module
 from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.inputs import ImageItem, check_crop
@@ -146,8 +153,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    nothing = torch.zeros_like(similarity)
-    evidence = Evidence(nothing, similarity, nothing, nothing, nothing, nothing)
+    evidence = replace(Evidence.zeros(4), similarity=similarity)
     outside = torch.tensor([False, False, True, False])
     assert refits.best_inside(truck_registrar(), evidence, outside).tolist() == [1]
 
@@ -192,7 +198,13 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
         )
         return other if options.get("again") else fitted
 
+    def contours(compared):
+        mine = compared.poses.edge_support == support
+        return torch.where(mine, 2.0 * support, measure(compared))
+
+    measure = described_module.ComparedPoses.contours.fget
     monkeypatch.setattr(work, "fit_poses", pretended)
+    monkeypatch.setattr(described_module.ComparedPoses, "contours", property(contours))
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 

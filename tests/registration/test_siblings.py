@@ -26,9 +26,8 @@ def four(similarity: list[float], compare: list[list[float]], angles: list[float
 
 
 def evidence(*similarity: float) -> Evidence:
-    nothing = torch.zeros(len(similarity), dtype=torch.float64)
-    values = Evidence(nothing, nothing, nothing, nothing, nothing, nothing)
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
+    nothing = Evidence.zeros(len(similarity))
+    return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
@@ -46,15 +45,27 @@ def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
     equal = [[0.0] * 4] * 4
     family = four(rows, equal, [0, 20, 100, 200])
     fitted = evidence(0.9)
-    poses, found = family.rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[2]), "the nearer one is no rival"
-    assert float(found.similarity) == pytest.approx(0.8)
+    rival = family.rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
+    assert float(rival.evidence.similarity) == pytest.approx(0.8)
+    assert not rival.feature_is_hidden
     alike = family.look_different.clone()
     alike[0, 2] = False
-    poses, found = replace(family, look_different=alike).rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[3])
-    assert float(found.similarity) == pytest.approx(0.7)
-    assert replace(family, look_different=torch.zeros(4, 4) > 0).rival(0, fitted) is None
+    rival = replace(family, look_different=alike).rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[3])
+    assert float(rival.evidence.similarity) == pytest.approx(0.7)
+    assert rival.feature_is_hidden
     told = [[0.0] * 4, [0.0] * 4, [-0.5, 0, 0, 0], [-2.0, 0, 0, 0]]
-    _, found = four(rows, told, [0, 20, 100, 200]).rival(0, fitted)
-    assert float(found.details) == -0.5
+    rival = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
+    assert float(rival.evidence.details) == -0.5
+
+
+def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
+    family = four([0.80, 0.79, 0.70], [[0.0] * 3] * 3, [0, 20, 100])
+    family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
+    small = family.rival(0, evidence(0.9), notable=False)
+    assert len(small.poses) == len(small.evidence) == 0
+    assert small.feature_is_hidden
+    notable = family.rival(0, evidence(0.9), notable=True)
+    assert torch.equal(notable.poses.T[0], family.poses.T[2])
+    assert notable.feature_is_hidden
