@@ -55,7 +55,7 @@ class SeenPoses(Protocol):
     Example:
         >>> from types import SimpleNamespace
         >>> one = torch.ones(1, dtype=torch.float64)
-        >>> names = ("rank", "similarity", "edge_support", "appearance", "keypoints")
+        >>> names = ("rank", "similarity", "edge_support", "appearance", "keypoints", "contours")
         >>> seen = SimpleNamespace(**dict.fromkeys(names, one))
         >>> Evidence.of(seen).similarity.tolist()
         [1.0]
@@ -108,6 +108,7 @@ class Evidence(Rows):
             :func:`.contour_evidence`; 0 without the contour fit.
 
     Example:
+        >>> from dataclasses import replace
         >>> similarity = torch.tensor([0.75, 0.5], dtype=torch.float64)
         >>> evidence = replace(Evidence.zeros(2), similarity=similarity)
         >>> evidence.named(0)["similarity"], evidence.scores(EvidenceWeights()).tolist()
