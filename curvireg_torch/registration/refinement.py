@@ -139,7 +139,7 @@ def refine_item(
     wide_angles = settings.wide_angles
     poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
 
-    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, landmarks=None)
+    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, keypoints=None)
     weights = target.score_weights(exact=True)
     best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
