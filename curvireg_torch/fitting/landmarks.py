@@ -17,11 +17,11 @@ from ..filters.operations import resized
 from ..geometry.cameras import pose_around
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
+from ..pipeline import FitSettings
 from ..utils.rows import Rows
 from ..utils.threads import map_on_threads
 from .least_squares import nearest_rigid
 
-MIN_LANDMARKS = 8  # that must agree on a pose
 # Number of views that landmarks are taken from, and their side in px
 VIEWS = 48
 VIEW_SIZE = 192
@@ -111,7 +111,7 @@ class LandmarkMatches:
     """Features of a photograph that resemble landmarks of a mesh with a ``centre`` (3,) and a
     ``radius``: pixels ``uv`` (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has
     the object: ``centres`` (M,) in px, x + iy, and ``radii`` (M,) in px. ``K`` (3, 3) is the
-    camera."""
+    camera; ``least`` must agree on a pose."""
 
     uv: np.ndarray
     points: np.ndarray
@@ -120,9 +120,10 @@ class LandmarkMatches:
     K: np.ndarray
     centre: np.ndarray
     radius: float
+    least: int
 
     def poses(self) -> list[LandmarkPose]:
-        """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first."""
+        """Poses on which at least ``least`` agree, the largest number first."""
         near = np.abs(self.centres[:, None] - self.centres) < CLUSTER_DISTANCE * np.sqrt(
             self.radii[:, None] * self.radii
         )
@@ -131,7 +132,7 @@ class LandmarkMatches:
         left = np.ones(len(self.uv), dtype=bool)
         for _ in range(MAX_CLUSTERS):
             votes = (near & left).sum(axis=1) * left
-            if not len(votes) or votes.max() < MIN_LANDMARKS:
+            if not len(votes) or votes.max() < self.least:
                 break
             cluster = near[votes.argmax()] & left
             size = float(np.median(self.radii[cluster]))
@@ -140,6 +141,7 @@ class LandmarkMatches:
                 self.uv[cluster],
                 self.K,
                 REPROJECTION_ERROR * size,
+                self.least,
             )
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
@@ -164,9 +166,13 @@ class LandmarkMatches:
 
 
 class Landmarks:
-    """Features of the views of a mesh with colours, with their places on its surface."""
+    """Features of the views of a mesh with colours, with their places on its surface; ``least`` of
+    them must agree on a pose."""
 
-    def __init__(self, describer: ViewDescriber) -> None:
+    def __init__(
+        self, describer: ViewDescriber, *, least: int = FitSettings().min_keypoints
+    ) -> None:
+        self._least = least
         self._centre = describer.centre.numpy()
         self._radius = describer.radius
         R = uniform_views(VIEWS).rotations.double()
@@ -218,7 +224,14 @@ class Landmarks:
         radii = self._radii[landmark] * found.size
         camera = K.double().cpu().numpy()
         return LandmarkMatches(
-            found.uv, self._points[landmark], centres, radii, camera, self._centre, self._radius
+            uv=found.uv,
+            points=self._points[landmark],
+            centres=centres,
+            radii=radii,
+            K=camera,
+            centre=self._centre,
+            radius=self._radius,
+            least=self._least,
         )
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:
@@ -270,9 +283,11 @@ class Landmarks:
         return torch.cat(landmark).numpy(), torch.cat(ratio).numpy()
 
 
-def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> LandmarkPose | None:
+def _pose(
+    points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float, least: int
+) -> LandmarkPose | None:
     """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px;
-    None if few do."""
+    None if fewer than ``least`` do."""
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,
@@ -290,7 +305,7 @@ def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> La
     count = _places(uv[inliers[:, 0]], error)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
-    if count < MIN_LANDMARKS or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
+    if count < least or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
     return LandmarkPose(nearest_rigid(T[None])[0], count)
 

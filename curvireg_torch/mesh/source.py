@@ -25,6 +25,10 @@ class MeshWarning:
     Attributes:
         kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
         text: one sentence, without the name of the file.
+
+    Example:
+        >>> MeshWarning("colours", "the texture 'label.png' is missing").text
+        "the texture 'label.png' is missing"
     """
 
     kind: str

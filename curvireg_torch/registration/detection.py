@@ -68,6 +68,15 @@ def detect(
 
     Raises:
         InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> (found,) = detect(cr.Registrar(bank), [scene.image], scene.camera_matrix)
+        >>> len(found) >= 1
+        True
     """
     items = image_items(images, None, camera_matrices, prior)
     return detect_items(target, items, instances=instances)

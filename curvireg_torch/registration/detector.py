@@ -37,6 +37,12 @@ class Proposals:
             photograph; of boxes that landmarks led to, the number of these.
         views: (P,) int64 view of the bank.
         by_landmarks: how many of the boxes landmarks led to, the first ones.
+
+    Example:
+        >>> box = torch.tensor([[0.0, 0.0, 9.0, 9.0]])
+        >>> found = Proposals(box, torch.tensor([8.0]), torch.tensor([2]))
+        >>> found.boxes.shape
+        torch.Size([1, 4])
     """
 
     boxes: Tensor

@@ -208,6 +208,7 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
         ),
         notes=first.result.notes,
         views=tuple(views),
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 

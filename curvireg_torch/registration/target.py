@@ -71,7 +71,7 @@ class Target:
 
     def score_weights(self, *, exact: bool) -> EvidenceWeights:
         """What evidence counts for with an exact mesh, or with a similar one."""
-        return EvidenceWeights() if exact else RANK_ALONE
+        return self.pipeline.fit.weights if exact else RANK_ALONE
 
     @cached_property
     def telling_symmetries(self) -> TellingSymmetries:
@@ -103,7 +103,7 @@ class Target:
 
     @cached_property
     def _landmarks(self) -> Landmarks:
-        return Landmarks(self.describer)
+        return Landmarks(self.describer, least=self.pipeline.fit.min_keypoints)
 
     @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:

@@ -64,7 +64,13 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
             seen = replace(work, item=replace(item, camera_matrix=camera))
             poses = poses_of_views(target, seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(target.describer, work.crops, of_cameras, least_starts(target))
+        starts = starts_of_fields(
+            target.describer,
+            work.crops,
+            of_cameras,
+            least_starts(target),
+            screening_weight=target.pipeline.fit.screening_weight,
+        )
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, target.bank)

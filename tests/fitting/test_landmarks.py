@@ -9,14 +9,14 @@ from PIL import Image
 
 import curvireg_torch as cr
 from curvireg_torch.fitting import landmarks as landmarks_module
-from curvireg_torch.fitting.landmarks import MIN_LANDMARKS, LandmarkMatches, Landmarks, _pose
+from curvireg_torch.fitting.landmarks import LandmarkMatches, Landmarks, _pose
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import box_iou, camera_matrix, projected_boxes, rotation_error
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, FitSettings
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration import work
 from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, detection_probability
@@ -158,7 +158,7 @@ def test_landmarks_agree_with_the_poses_of_their_object():
         ]
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
-    assert float(counts[:2].min()) >= MIN_LANDMARKS
+    assert float(counts[:2].min()) >= FitSettings().min_keypoints
     assert float(counts[2:].max()) < 0.5 * float(counts[0])
     twice = replace(
         matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0)
@@ -207,11 +207,12 @@ def test_a_pose_needs_enough_landmarks_at_different_places():
     camera = K.numpy()
     seen = (points + np.array([0, 0, 6])) @ camera.T
     uv = seen[:, :2] / seen[:, 2:]
-    assert _pose(points, uv, camera, 2.0).count == 14
-    assert _pose(points[:7], uv[:7], camera, 2.0) is None
+    assert _pose(points, uv, camera, 2.0, 8).count == 14
+    assert _pose(points[:7], uv[:7], camera, 2.0, 8) is None
+    assert _pose(points[:7], uv[:7], camera, 2.0, 7).count == 7
     twice = np.repeat(np.arange(7), 2)
-    assert _pose(points[twice], uv[twice], camera, 2.0) is None
-    assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0) is None
+    assert _pose(points[twice], uv[twice], camera, 2.0, 8) is None
+    assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0, 8) is None
 
 
 def test_origin_of_the_mesh_may_be_far_away():
