@@ -28,7 +28,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "mathml",
 ]
-exclude_patterns = ["_build", "gallery"]
+exclude_patterns = ["_build", "gallery", "notebooks"]
 nitpicky = True
 html_math_renderer = "mathml"  # nothing is fetched from elsewhere
 

@@ -4,15 +4,18 @@ import pytest
 import torch
 
 import curvireg_torch as cr
+from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[10, 40])
 MODULES = [cr.ApparentRidges, cr.AverageShadingGradient, cr.DepthCurvilinearSaliency, cr.EdgeBlur]
 MODULES += [cr.HessianFrobeniusNorm, cr.ImageCurvilinearSaliency, cr.LearnedCurvilinearSaliency]
+MODULES += [cr.ImageGradient, cr.MultiScaleCurvilinearSaliency]
 LAYERS = [
     cr.AnisotropicDiffusion(iterations=3),
     cr.MultiScaleFocusCurves(),
+    torch.nn.Sequential(cr.ImageGradient(), cr.HOG(grid=4)),
     *(make() for make in MODULES),
 ]
 
@@ -47,6 +50,20 @@ def test_registrar_on_a_gpu(detected):
     found = cr.Registrar(truck_bank(), device="cuda")([image.cuda()], boxes, CAMERA)[0]
     assert float(cr.rotation_error(found.rotation.cpu(), expected.rotation)) < 0.5
     assert found.score == pytest.approx(expected.score, abs=0.02)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("preset", ["classical", "paper"])
+def test_presets_on_a_gpu(preset):
+    """Nearly equal views may change places: their scores are compared, and that a pose is found."""
+    image, box, _ = scene(0)
+    bank = cr.ViewBank.build(truck_bank().mesh, pipeline=PRESETS[preset], progress=False)
+    registrar = cr.Registrar(bank, device="cuda")
+    found = registrar([image.cuda()], box[None], CAMERA)[0]
+    assert found.ranking.scores.is_cuda
+    expected = cr.ViewMatcher(bank)(image[None], box[None]).scores
+    torch.testing.assert_close(found.ranking.scores.cpu(), expected, atol=0.05, rtol=0.0)
+    assert float(torch.linalg.det(found.rotation)) == pytest.approx(1.0, abs=1e-4)
 
 
 def test_registrar_ignores_the_default_dtype():

@@ -14,6 +14,7 @@ from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from ..version import __version__
 from .options import (
+    BOXES,
     MESH,
     METHOD,
     PHOTOGRAPH,
@@ -232,7 +233,8 @@ def add_view(commands: Any) -> None:
         metavar="MESH",
         help="a mesh or a bank; both can be added later",
     )
-    add_options(parser, *[name for name in PHOTOGRAPH if name != "mask"], box="in px; can be drawn")
+    options = [name for name in PHOTOGRAPH if name != "mask"]
+    add_options(parser, *options, *BOXES, box="in px; can be drawn")
     add_limits(parser)
     hosts = f"who may connect: {LOCAL}, only this machine (default), or 0.0.0.0 or ::, everyone"
     parser.add_argument("--host", default=LOCAL, help=hosts)

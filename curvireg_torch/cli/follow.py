@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import Empty, Queue
 from typing import TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from ..jobs.options import CAMERA_OPTIONS
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
 from .options import (
+    BOXES,
     PHOTOGRAPH,
     add_command,
     add_limits,
@@ -71,10 +72,13 @@ def add_follow(commands: Any) -> None:
     add_options(
         parser,
         *options,
+        *BOXES,
         "start",
         "start_convention",
         "field",
         box="in px in the first frame; default: the object is detected",
+        boxes="boxes of a detector for frames that are registered, such as the first: as in "
+        "register; of a video's frame 7, VIDEO-000007.txt, or VIDEO_8.txt as YOLO has it",
     )
     add_limits(parser)
     parser.add_argument(
@@ -256,7 +260,7 @@ def _poses(
 
     follow = None
     prior = prior_from_limits(options.limits or {})
-    box: Any = None if options.box is None else list(options.box)  # of the first frame
+    is_first = True
     for name, image in frames:
         begun = time.perf_counter()
         result = None
@@ -264,6 +268,8 @@ def _poses(
             yield name, None, FailedRegistration(image), time.perf_counter() - begun
             continue
         try:
+            box: Any = _box(options, name, image, is_first=is_first)
+            is_first = False
             if isinstance(options.camera, Camera):
                 seen = undistorted(
                     image, options.camera, None if box is None else torch.tensor(box)
@@ -279,12 +285,27 @@ def _poses(
                         pose,
                         confidence=1.0 if start.confidence is None else start.confidence,
                     )
-            first_box = box
-            box = None
-            result = follow(image, first_box)
+            result = follow(image, box)
         except CurviregError as error:
             result = FailedRegistration(error)
         yield name, image, result, time.perf_counter() - begun
+
+
+def _box(
+    options: "RegisterOptions", name: str, image: "Tensor", *, is_first: bool
+) -> list[float] | None:
+    """The given box of the first frame, or a detector's of any; a frame that has none is searched
+    for the object."""
+    from ..data.box_files import pixel_box
+
+    size = (image.shape[-2], image.shape[-1])
+    if options.box is not None:
+        kind = options.box_format or "xyxy"
+        return list(pixel_box(options.box, kind, size)) if is_first else None
+    video, _, number = name.rpartition("-")
+    names = [name, f"{video}_{int(number) + 1}"] if number.isdecimal() else [name]
+    found = (options.detected_box(Path(text), size) for text in names)
+    return next((list(box) for box in found if box is not None), None)
 
 
 def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
@@ -301,7 +322,8 @@ def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
         source = find_photographs(source)[0]
         with suppress(CurviregError, OSError):
             photo = read_photo(source)
-    camera, _ = camera_of(entry_of(source, options), photo)
+    without_box = replace(options, box=None, boxes=None)
+    camera, _ = camera_of(entry_of(source, without_box), photo)
     if camera is None:
         return None
     known = camera.at((image.shape[-2], image.shape[-1]))

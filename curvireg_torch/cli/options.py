@@ -24,6 +24,7 @@ FIELDS = {
 DECLARED: dict[str, dict[str, Any]] = FIELDS | PRIOR_OPTIONS
 METHOD = ("preset", "pipeline", "renderer", "device", "progress")
 MESH = ("unit", "link", "textures", "pose", "up")
+BOXES = ("box_format", "boxes")
 PHOTOGRAPH = ("box", "mask", "camera", "guess", *MESH, "mesh_is", *METHOD)
 """Options of several commands, by the names of their fields."""
 

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInputError, LostObjectError
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
+from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .options import (
+    BOXES,
     PHOTOGRAPH,
     add_command,
     add_limits,
@@ -111,8 +113,7 @@ def add_register(commands: Any) -> None:
     add_options(
         parser,
         *PHOTOGRAPH,
-        "box_format",
-        "boxes",
+        *BOXES,
         "start",
         "start_convention",
         "instances",
@@ -128,8 +129,15 @@ def add_register(commands: Any) -> None:
         f"photographs failed"
     )
     add("--strict", action="store_true", help=strict)
-    ros = "ros: also write DIR/pose.yaml, a geometry_msgs/PoseStamped, in metres"
+    ros = (
+        "ros: also write DIR/pose.yaml, a PoseStamped, DIR/tf.yaml, and, of reliable poses, "
+        "DIR/pose_with_covariance.yaml, in metres"
+    )
     add("--format", choices=("ros",), help=ros)
+    stamp = "with --format ros: when the photograph was taken, in seconds since 1970 (default: 0)"
+    add("--stamp", type=time_stamp, metavar="SECONDS", help=stamp)
+    frame = f"with --format ros: the camera's frame (default: {OPTICAL_FRAME})"
+    add("--frame", metavar="NAME", help=frame)
     add("--json", action="store_true", help="print only the results as JSON; --out is optional")
     add("--out", type=Path, metavar="DIR", help="folder of the results; made if it does not exist")
 
@@ -196,6 +204,9 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return f"--distance: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
         return "--start and --mask are of one photograph; give several masks in a list, column mask"
+    for name in ("stamp", "frame"):
+        if getattr(arguments, name) is not None and not arguments.format:
+            return f"--{name}: of the messages of --format ros; give it too"
     if arguments.format and (arguments.list or arguments.out is None):
         return "--format ros: of one result, in --out DIR"
     if arguments.format and rig is None and without_camera:
@@ -353,10 +364,13 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 
 def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
     """Write the pose in the format of another tool, if one is asked for."""
-    from ..jobs.result_files import write_pose_stamped
+    from ..jobs.ros import write_ros
 
     if arguments.format:
-        write_pose_stamped(arguments.out / "pose.yaml", document)
+        mesh = Path(document.get("mesh") or arguments.meshes[0])
+        chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
+        given = {name: value for name, value in chosen.items() if value is not None}
+        write_ros(arguments.out, document, child=mesh.stem, **given)
 
 
 def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
@@ -468,9 +482,13 @@ def _print_rivals(document: Mapping[str, Any]) -> None:
         return
     poses = zip(document["hypotheses"], document["probabilities"], strict=False)
     rivals = list(poses)[1:]
-    for rival, probability in rivals:
-        if probability >= RIVAL_FRACTION * document["confidence"]:
-            print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
+    least = RIVAL_FRACTION * document["confidence"]
+    likely = [(rival, probability) for rival, probability in rivals if probability >= least]
+    if not likely:
+        print("right up to turns that only a small feature tells apart, which is not in view")
+        return
+    for rival, probability in likely:
+        print(f"could also be: {_angles(rival)}   probability {two_decimals(probability)}")
     words = {
         "half turn": "are flipped by 180 degrees",
         "mirror": "are mirror images",

@@ -96,17 +96,27 @@ class BoxFile:
     def box(self, photo: Path) -> Box:
         """x0, y0, x1, y1 in px of the best box of a photograph; :class:`InvalidInputError` if it
         has none."""
-        found = self._of(photo)
-        if self.label:
-            found = [detection for detection in found if self.label in detection.labels]
-        if not found:
+        found = self.find(photo)
+        if found is None:
             kind = f" of label {self.label!r}" if self.label else ""
             raise InvalidInputError(
                 f"no box{kind} in {self.path}; detect it again, or leave the photograph out"
             )
+        return found
+
+    def find(self, photo: Path, size: tuple[int, int] | None = None) -> Box | None:
+        """:meth:`box`, or None if a photograph has none; of a frame of a video, which is no file,
+        with its ``size`` (H, W)."""
+        found = self._of(photo)
+        if self.label:
+            found = [detection for detection in found if self.label in detection.labels]
+        if not found:
+            return None
         best = max(found, key=lambda detection: detection.score)
         is_relative = best.box_format in ("fractions", "yolo")
-        box = pixel_box(best.numbers, best.box_format, photo_size(photo) if is_relative else None)
+        if is_relative and size is None:
+            size = photo_size(photo)
+        box = pixel_box(best.numbers, best.box_format, size)
         if best.box_format != "xywh":
             return box
         x0, y0, x1, y1 = (value - EDGE for value in box)

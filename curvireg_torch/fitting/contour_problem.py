@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..rendering.contours import ContourPoints, MeshContours
+from ..rendering.contours import ContourPoints, Contours
+from ..utils.rows import Rows
 from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
     Measurements,
@@ -34,7 +35,7 @@ EDGE_DAMPING = 1e-2
 
 
 @dataclass(frozen=True)
-class ContourState:
+class ContourState(Rows):
     """Poses ``T`` (N, 4, 4), nearby ones ``seen`` at which contours were last found, and the
     contour points there."""
 
@@ -42,21 +43,13 @@ class ContourState:
     seen: Tensor
     points: ContourPoints
 
-    def __getitem__(self, index: Tensor) -> "ContourState":
-        return ContourState(self.T[index], self.seen[index], self.points[index])
-
-    @staticmethod
-    def cat(parts: Sequence["ContourState"]) -> "ContourState":
-        T, seen = (torch.cat([getattr(part, name) for part in parts]) for name in ("T", "seen"))
-        return ContourState(T, seen, ContourPoints.cat([part.points for part in parts]))
-
 
 @dataclass(frozen=True)
-class ContourProblem:
+class ContourProblem(Rows):
     """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras
     ``K`` (N, 3, 3); a ``mask`` weights the edges."""
 
-    contours: MeshContours
+    contours: Contours
     edges: EdgeField
     image_index: Tensor
     K: Tensor
@@ -67,7 +60,7 @@ class ContourProblem:
     @classmethod
     def of(
         cls,
-        contours: MeshContours,
+        contours: Contours,
         crops: EdgeCrops,
         K: Tensor,
         image_index: Tensor | None = None,
@@ -76,8 +69,10 @@ class ContourProblem:
     ) -> "ContourProblem":
         """The problem in ``crops`` whose sides are smaller by a ``factor``, with cameras ``K`` (N,
         3, 3) of the whole photographs ``image_index`` (N,), by default the first."""
-        index = torch.zeros(len(K), dtype=torch.long) if image_index is None else image_index
-        shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
+        index = torch.zeros(len(K), dtype=torch.long, device=K.device)
+        index = index if image_index is None else image_index
+        scales = torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=K.dtype, device=K.device)
+        shrink = torch.diag(scales)
         shrink[:2, 2] = 0.5 / factor - 0.5
         K = shrink @ crops.transforms[index] @ K
         return cls(
@@ -94,9 +89,6 @@ class ContourProblem:
     def centre(self) -> Tensor:
         """(3,) of the object, about which poses rotate."""
         return self.contours.centre
-
-    def __getitem__(self, index: Tensor) -> "ContourProblem":
-        return replace(self, image_index=self.image_index[index], K=self.K[index])
 
     def state(self, T: Tensor) -> ContourState:
         """Poses (N, 4, 4) with the mesh's contour points there."""
@@ -123,7 +115,8 @@ class ContourProblem:
         if not bool(stale.any()):
             return state
         new = self[stale.nonzero()[:, 0]].state(state.T[stale])
-        index = torch.where(stale, len(stale) - 1 + stale.cumsum(0), torch.arange(len(stale)))
+        every = torch.arange(len(stale), device=stale.device)
+        index = torch.where(stale, len(stale) - 1 + stale.cumsum(0), every)
         return ContourState.cat([state, new])[index]
 
     def mean_shift(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
@@ -159,7 +152,7 @@ class ContourProblem:
         J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(
-                uv, points, _offsets(radius)[1:-1], self.image_index, self.size
+                uv, points, _offsets(radius, uv.device)[1:-1], self.image_index, self.size
             )
         log = strength.log()
         residual = distance
@@ -191,7 +184,7 @@ class ContourProblem:
     ) -> tuple[Tensor, Tensor]:
         """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a
         step; the strength is 0 where there is no edge."""
-        offsets = _offsets(radius)
+        offsets = _offsets(radius, uv.device)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
         before = profile[..., :-2]
         here = profile[..., 1:-1]
@@ -211,7 +204,7 @@ class ContourProblem:
         what fits are compared by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
-        offsets = torch.arange(-3, 4, dtype=torch.float32)
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
         counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(
             -0.5 * offsets**2
@@ -225,6 +218,15 @@ class ContourProblem:
             min=1
         )
 
+    def strength_near(self, uv: Tensor, normals: Tensor) -> Tensor:
+        """(N, P) float64 strength of the edges within about 1 px of points (N, P, 2) px with
+        ``normals`` (N, P, 2)."""
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
+        near = self.edges.strength(uv, normals, offsets, self.image_index) * torch.exp(
+            -0.5 * offsets**2
+        )
+        return near.amax(dim=-1).double()
+
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""
         points = state.points
@@ -236,7 +238,7 @@ class ContourProblem:
         return Measurements(J, d, W)
 
 
-def _offsets(radius: float) -> Tensor:
+def _offsets(radius: float, device: torch.device) -> Tensor:
     """Offsets in px at which edges are searched within ``radius`` of a predicted position."""
     far = round(1.5 * radius) + 1
-    return torch.arange(-far, far + 1, dtype=torch.float32)
+    return torch.arange(-far, far + 1, dtype=torch.float32, device=device)

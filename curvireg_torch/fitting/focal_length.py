@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..geometry.cameras import rotation_towards, transform
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from .contour_problem import STEPS_PER_ROUND, ContourProblem, ContourState
 from .least_squares import (
     Measurements,
@@ -118,17 +118,17 @@ def scaled_cameras(cameras: Tensor, log_zoom: Tensor) -> Tensor:
 def _moved_away(T: Tensor, log_zoom: Tensor, centre: Tensor) -> Tensor:
     """(N, 4, 4) poses whose images, by cameras with focal lengths longer by factors, have the same
     size and place; the object turns with the ray through its centre."""
-    before = T[:, :3, :3] @ centre + T[:, :3, 3]
+    before = point_in_cameras(T, centre)
     after = before.clone()
     after[:, 2] *= log_zoom.exp()
     R = rotation_towards(after) @ rotation_towards(before).mT @ T[:, :3, :3]
-    return transform(R, after - R @ centre)
+    return pose_around(R, after, centre)
 
 
 def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
     """(N, 6) derivative of :func:`_moved_away`: rotation about the centre in rad, and its
     translation."""
-    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    position = point_in_cameras(T, centre)
     away = position * position.new_tensor([0.0, 0.0, 1.0])
     turn = torch.linalg.cross(position, away) / position.square().sum(dim=1, keepdim=True)
     return torch.cat([turn, away], dim=1)

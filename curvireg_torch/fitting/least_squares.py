@@ -3,16 +3,17 @@ on a pose."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ..calibration import COVARIANCE_SCALE
 from ..geometry import rotation_from_axis_angle
-from ..geometry.cameras import transform
+from ..geometry.cameras import point_in_cameras, pose_around, transform
 from ..geometry.conversions import cross_matrix
 from ..rendering.contours import ContourPoints
+from ..utils.rows import Rows
 
 # Longest step: radians, and fraction of the object's distance
 MAX_ROTATION = 0.2
@@ -24,7 +25,7 @@ POINT_DAMPING = 1e-5
 
 
 @dataclass(frozen=True)
-class Measurements:
+class Measurements(Rows):
     """What N poses are fitted to: derivatives ``J`` (N, P, 6) of distances in px by rotation about
     the object's centre (rad) and translation, these distances and their weights, (N, P, 1)."""
 
@@ -40,13 +41,6 @@ class Measurements:
     def scaled(self, factor: float) -> "Measurements":
         """The same with weights times ``factor``."""
         return Measurements(self.J, self.distance, factor * self.weight)
-
-    @staticmethod
-    def cat(parts: Sequence["Measurements"]) -> "Measurements":
-        """All measurements of the same poses together."""
-        return Measurements(
-            *(torch.cat([getattr(p, f.name) for p in parts], dim=1) for f in fields(Measurements))
-        )
 
 
 @dataclass(frozen=True)
@@ -109,7 +103,7 @@ def least_squares_step(A: Tensor, b: Tensor, T: Tensor, centre: Tensor, damping:
 
 def step_fraction(step: Tensor, T: Tensor, centre: Tensor) -> Tensor:
     """(N,) in [0, 1]: the part of steps (N, 6) of poses that is not too long."""
-    z = (T[:, :3, :3] @ centre + T[:, :3, 3])[:, 2].clamp(min=0.0)
+    z = point_in_cameras(T, centre)[:, 2].clamp(min=0.0)
     w, t = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
     return torch.minimum(MAX_ROTATION / w, MAX_TRANSLATION * z / t).clamp(max=1.0)
 
@@ -132,7 +126,7 @@ def project(
     vectors ``normals`` (N, P, 2) by rotation about and translation of the centre."""
     R = T[:, :3, :3]
     arms = (points - centre) @ R.mT
-    cam = arms + (R @ centre + T[:, :3, 3])[:, None]
+    cam = arms + point_in_cameras(T, centre)[:, None]
     z = cam[..., 2:].clamp(min=1e-9)
     uv = cam @ K[:, :2].mT / z
     by_cam = (normals @ K[:, :2] - (normals * uv).sum(dim=-1, keepdim=True) * K[:, None, 2]) / z
@@ -142,18 +136,16 @@ def project(
 
 def pixels(points: Tensor, T: Tensor, K: Tensor, centre: Tensor) -> Tensor:
     """The pixels of :func:`project` without their derivative."""
-    R = T[:, :3, :3]
-    cam = (points - centre) @ R.mT + (R @ centre + T[:, :3, 3])[:, None]
+    arms = (points - centre) @ T[:, :3, :3].mT
+    cam = arms + point_in_cameras(T, centre)[:, None]
     return cam @ K[:, :2].mT / cam[..., 2:].clamp(min=1e-9)
 
 
 def apply_twist(T: Tensor, step: Tensor, centre: Tensor) -> Tensor:
     """(N, 4, 4) poses, rotated by ``step[:, :3]`` rad about the centre, which is then translated by
     ``step[:, 3:]``."""
-    before = T[:, :3, :3]
-    R = rotation_from_axis_angle(step[:, :3]) @ before
-    position = before @ centre + T[:, :3, 3] + step[:, 3:]
-    return transform(R, position - R @ centre)
+    R = rotation_from_axis_angle(step[:, :3]) @ T[:, :3, :3]
+    return pose_around(R, point_in_cameras(T, centre) + step[:, 3:], centre)
 
 
 def nearest_rigid(T: Tensor) -> Tensor:
@@ -186,7 +178,7 @@ def summed_by_cells(uv: Tensor, values: Tensor) -> Tensor:
     """(N, C, D) sums of values (N, P, D) of points (N, P, 2) over the cells of crops within which
     errors are correlated."""
     cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
-    cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
+    cell = (cell * torch.tensor([1, CELLS_PER_SIDE], device=cell.device)).sum(dim=-1)
     sums = values.new_zeros(len(values), CELLS_PER_SIDE**2, values.shape[-1])
     return sums.scatter_add_(1, cell[..., None].expand_as(values), values)
 
@@ -235,7 +227,8 @@ def pose_covariance(
     n = points.normals
     W = measured.weight
     uv, along = project(points.model, torch.stack([-n[..., 1], n[..., 0]], dim=-1), T, K, centre)
-    cam = (points.model - centre) @ T[:, :3, :3].mT + (T[:, :3, :3] @ centre + T[:, :3, 3])[:, None]
+    position = point_in_cameras(T, centre)
+    cam = (points.model - centre) @ T[:, :3, :3].mT + position[:, None]
     ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
     sight = torch.zeros_like(along)
     sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
@@ -246,7 +239,8 @@ def pose_covariance(
     # Basis of directions in which A + E is the identity and A is diagonal; first normalise the
     # units.
     unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
+    identity = torch.eye(6, dtype=A.dtype, device=A.device)
+    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * identity
     lower = torch.linalg.cholesky(total)
     half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
     fraction, vectors = torch.linalg.eigh(
@@ -260,7 +254,6 @@ def pose_covariance(
     B = g.mT @ g + variance * (measured.J.mT @ (W * W * measured.J))
     inverse = basis * (known / fraction.clamp(min=1e-12))[:, None]
     C = COVARIANCE_SCALE * inverse @ (basis.mT @ B @ basis) @ inverse.mT
-    position = T[:, :3, :3] @ centre + T[:, :3, 3]
     rotation, translation = (
         torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1)
     )
@@ -269,7 +262,7 @@ def pose_covariance(
     unknown = basis * (~known * size)[:, None]
     C = C + unknown @ unknown.mT
     # From the translation e of the centre to that of the origin, e - w x (R centre).
-    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
+    lever = identity.repeat(len(C), 1, 1)
     lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
     C = lever @ C @ lever.mT
     enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT

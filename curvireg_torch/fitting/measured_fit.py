@@ -1,15 +1,17 @@
 """What the edges at fitted poses tell: support, covariance, and the directions that they
 determine."""
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ..rendering.contours import MeshContours
+from ..rendering.contours import Contours
+from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
-from .least_squares import pose_covariance
+from .least_squares import pixels, pose_covariance
 
 FULL_SIZE_RADII = (4.0, 2.0, 2.0)
 """Search radius for edges in px at full size, one a round."""
@@ -19,9 +21,14 @@ GAINED = 0.2
 """Edge support, or gain of it over the start, from which a fit is trusted; chosen on generated
 scenes."""
 
+CHANCE_SHIFT = 10.0
+"""Shift of contour points in px of a crop, in ``CHANCE_DIRECTIONS``, after which they lie on
+edges by chance."""
+CHANCE_DIRECTIONS = 8
+
 
 @dataclass(frozen=True)
-class ContourFit:
+class ContourFit(Rows):
     """N poses fitted to photographs.
 
     Attributes:
@@ -32,6 +39,15 @@ class ContourFit:
         start_support: (N,) edge support of the starts (at half size for starts that are not
             finished).
         observable: (N,) int64, number of the six directions that the contours determine.
+
+    Example:
+        >>> T = torch.eye(4).repeat(2, 1, 1)
+        >>> covariance = torch.zeros(2, 6, 6)
+        >>> support = torch.tensor([0.6, 0.3])
+        >>> observable = torch.tensor([6, 6])
+        >>> fit = ContourFit(T, covariance, support, torch.tensor([0.2, 0.2]), observable)
+        >>> fit.trustworthy.tolist()
+        [True, False]
     """
 
     transform: Tensor
@@ -39,9 +55,6 @@ class ContourFit:
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
-
-    def __getitem__(self, index: Tensor) -> "ContourFit":
-        return ContourFit(*(getattr(self, f.name)[index] for f in fields(ContourFit)))
 
     @property
     def trustworthy(self) -> Tensor:
@@ -67,7 +80,7 @@ def measured_fit(
 
 @torch.no_grad()
 def measure_contours(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> ContourFit:
     """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay
     as they are."""
@@ -79,9 +92,49 @@ def measure_contours(
 
 @torch.no_grad()
 def contour_support(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
     fitted ones."""
     problem = ContourProblem.of(contours, crops, K, image_index)
     return problem.edge_support(problem.state(T))
+
+
+@torch.no_grad()
+def contour_evidence(
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+) -> Tensor:
+    """How far the edges under the contours of poses exceed what chance puts there.
+
+    The mean strength of the edges at the outline, minus that at the same points shifted, plus the
+    same of creases and inner contours, which counts less where there are fewer of them than points
+    of the outline. Unlike edge support, it does not fall with the number of weak inner contours
+    that a pose predicts, as long as they are there.
+
+    Args:
+        contours: of the mesh.
+        crops: of photographs.
+        K: (N, 3, 3) cameras of the poses.
+        T: (N, 4, 4) poses.
+        image_index: (N,) the crop of each pose.
+
+    Returns:
+        (N,) float64, about -0.3 to 1.5; near 0 for a pose that is far off.
+    """
+    problem = ContourProblem.of(contours, crops, K, image_index)
+    points = problem.state(T).points
+    uv = pixels(points.model, T, problem.K, problem.centre)
+    angle = torch.arange(CHANCE_DIRECTIONS) * (2.0 * math.pi / CHANCE_DIRECTIONS)
+    shifts = CHANCE_SHIFT * torch.stack([angle.cos(), angle.sin()], dim=1).to(uv)
+    by_chance = torch.stack(
+        [problem.strength_near(uv + shift, points.normals) for shift in shifts]
+    ).mean(dim=0)
+    counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
+    excess = problem.strength_near(uv, points.normals) - by_chance
+    on_outline = counted & points.outline
+    within = counted & ~points.outline
+    outline_points = on_outline.sum(dim=1)
+    most_points = torch.maximum(outline_points, within.sum(dim=1))
+    of_outline = (excess * on_outline).sum(dim=1) / outline_points.clamp(min=1)
+    of_inner = (excess * within).sum(dim=1) / most_points.clamp(min=1)
+    return of_outline + of_inner

@@ -5,7 +5,7 @@ The contours of a can do not determine its rotation about the axis; its label do
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -117,14 +117,10 @@ def fit_texture(
     seen = torch.ones(1, 2 * count, dtype=torch.bool)
     axes = torch.eye(2, dtype=torch.float64).repeat(count, 1)[None]
     points = ContourPoints(fine.matches.model.repeat_interleave(2, 1), axes, seen, ~seen)
-    joined = ContourPoints(
-        *(
-            torch.cat([getattr(some, f.name) for some in (state.points, points)], dim=1)
-            for f in fields(ContourPoints)
-        )
-    )
+    joined = ContourPoints.cat_within([state.points, points])
     found = fine.matches.measurements(state.T, problem.K, problem.centre, NEAR_ROUND[1][-1])
-    both = Measurements.cat([problem.measured_edges(state, FULL_SIZE_RADII[-1]), found])
+    edges = problem.measured_edges(state, FULL_SIZE_RADII[-1])
+    both = Measurements.cat_within([edges, found])
     covariance, observable = pose_covariance(
         both, joined, state.T, problem.K, problem.centre, radius=problem.contours.radius
     )

@@ -27,6 +27,7 @@ from ..utils.checks import (
     check_rotation,
 )
 from ..utils.choices import UP_AXES
+from ..utils.rows import Rows
 
 
 def rotation_from_viewpoint(
@@ -111,7 +112,12 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def up_rotation(up: str) -> Tensor:
     """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z
-    axis does. glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
+    axis does. glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
+
+    Example:
+        >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0]).double()).tolist()
+        [0.0, 0.0, 1.0]
+    """
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
 
@@ -134,18 +140,47 @@ def rotation_error(R1: Tensor, R2: Tensor) -> Tensor:
     return torch.rad2deg(2.0 * torch.asin(chord.clamp(max=1.0)))
 
 
+def angles_between(R: Tensor, others: Tensor, symmetries: Tensor | None = None) -> Tensor:
+    """(M, N) degrees between all of two lists of rotations, up to symmetries.
+
+    One matrix product for many pairs. Unlike those of :func:`rotation_error`, angles near 0 are
+    only right within about 0.03 degrees in float32.
+
+    Args:
+        R, others: (M, 3, 3) and (N, 3, 3).
+        symmetries: (S, 3, 3) or (S, 4, 4) of the model, the identity among them; None: none.
+
+    Example:
+        >>> half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+        >>> group = torch.stack([torch.eye(3), half_turn])
+        >>> angles_between(torch.eye(3)[None], half_turn[None]).tolist()
+        [[180.0]]
+        >>> angles_between(torch.eye(3)[None], half_turn[None], group).tolist()
+        [[0.0]]
+    """
+    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
+    equivalent = R[:, None] @ group.to(R)
+    traces = (equivalent.flatten(2) @ others.flatten(1).T).amax(dim=1)
+    return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
+
+
 # of a view in units of the object's radius: docs/experiments.md compares others
 DEFAULT_DISTANCE = 5.0
 
 
 @dataclass(frozen=True)
-class ViewSphere:
+class ViewSphere(Rows):
     """N viewpoints in PASCAL3D+ angles.
 
     Attributes:
         azimuth, elevation, theta: (N,) degrees.
         distance: (N,) camera to object centre, in units of the object's radius (half the diagonal
             of its box).
+
+    Example:
+        >>> views = sample_views(azimuth_step=90, elevations=[0, 30])
+        >>> len(views), views[:2].azimuth.tolist()
+        (8, [0.0, 90.0])
     """
 
     azimuth: Tensor
@@ -163,14 +198,6 @@ class ViewSphere:
             raise InvalidInputError(
                 "ViewSphere: expected distances > 1 object radius (the camera outside the object)"
             )
-
-    def __len__(self) -> int:
-        return self.azimuth.numel()
-
-    def __getitem__(self, index: Tensor | slice) -> "ViewSphere":
-        return ViewSphere(
-            self.azimuth[index], self.elevation[index], self.theta[index], self.distance[index]
-        )
 
     @property
     def rotations(self) -> Tensor:

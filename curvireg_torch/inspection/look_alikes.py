@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..geometry import rotation_error, uniform_views, viewpoint_from_rotation
+from ..geometry import uniform_views, viewpoint_from_rotation
 from ..geometry.conversions import axis_angle_from_rotation, rotation_from_axis_angle
-from ..geometry.viewpoint import up_rotation
+from ..geometry.viewpoint import angles_between, up_rotation
 from ..matching import ViewBank, ViewDescriber
 from ..mesh import mesh_up
 
@@ -199,7 +199,7 @@ def print_difference(
 
 def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:
     """(N,) degrees between rotations (N, 3, 3) and one (3, 3), up to a group (S, 3, 3)."""
-    return rotation_error(rotations[:, None], (rotation @ group)[None]).amin(dim=1)
+    return angles_between(rotations, rotation[None], group)[:, 0]
 
 
 def _described(describer: ViewDescriber, rotations: Tensor, distance: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..filters import gaussian_smooth
 from ..geometry import camera_matrix
-from ..geometry.cameras import transform
+from ..geometry.cameras import point_in_cameras, pose_around, transform
 from ..geometry.viewpoint import up_rotation
 from ..matching.describe import view_mesh
 from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_up
@@ -165,13 +165,13 @@ def _random_truth(
     elevations = UPRIGHT if upright else (-90.0, 90.0)
     T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)
     centre = mesh_centre(mesh)
-    position = T[:3, :3] @ centre + T[:3, 3]
+    position = point_in_cameras(T, centre)
     R = T[:3, :3]
     if not upright:
         R = _random_rotation(generator)
     elif mesh_up(mesh) != "z":
         R = R @ up_rotation(mesh_up(mesh)).double()
-    return transform(R, position - R @ centre)
+    return pose_around(R, position, centre)
 
 
 def _random_rotation(generator: torch.Generator) -> Tensor:
@@ -217,7 +217,7 @@ def _with_objects_behind(
     """The background with up to six objects beside and behind the object, as far away as its
     centre or farther."""
     radius = mesh_radius(mesh)
-    centre = truth[:3, :3] @ mesh_centre(mesh) + truth[:3, 3]
+    centre = point_in_cameras(truth, mesh_centre(mesh))
     count = 1 + int(MOST_BESIDE * float(torch.rand((), generator=generator)))
     picture = background
     for _ in range(count):
@@ -241,7 +241,7 @@ def _with_object_in_front(
     """The photograph with something before a side or corner of the object's box, of which it covers
     less than a third."""
     radius = mesh_radius(mesh)
-    centre = truth[:3, :3] @ mesh_centre(mesh) + truth[:3, 3]
+    centre = point_in_cameras(truth, mesh_centre(mesh))
     depth = float(centre[2]) - 1.5 * radius
     if depth < radius:
         return image

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evaluation.metrics import symmetric_rotation_error
 from ..geometry import PosePrior, rotation_from_axis_angle, viewpoint_from_rotation
-from ..geometry.cameras import rotation_towards, transform
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.viewpoint import up_rotation
 from ..matching import cached_bank
 from ..mesh import has_colours, mesh_centre, mesh_up
@@ -226,8 +226,8 @@ class _Setup:
         turn = rotation_from_axis_angle(
             torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
         )
-        centre = photograph.truth[:3, :3] @ mesh_centre(self.mesh) + photograph.truth[:3, 3]
-        move = transform(turn, centre - turn @ centre)
+        centre = point_in_cameras(photograph.truth, mesh_centre(self.mesh))
+        move = pose_around(turn, centre, centre)
         mesh = photographed_mesh(self.mesh)
         generator = _generator(photograph)
         image, box = synthesize_photograph(mesh, move @ photograph.truth, K, SIZE, generator)
@@ -249,7 +249,7 @@ class _Setup:
             return Outcome(photograph, None, 180.0, elevation)
         rotation = result.rotation
         if result.translation is None:
-            centre = truth @ mesh_centre(self.mesh) + photograph.truth[:3, 3]
+            centre = point_in_cameras(photograph.truth, mesh_centre(self.mesh))
             truth = rotation_towards(centre).mT @ truth
             rotation = result.allocentric_rotation
         error = float(symmetric_rotation_error(rotation.double(), truth, self.symmetries))

@@ -305,6 +305,11 @@ class RegisterOptions:
         is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
         return pixel_box(numbers, kind, photo_size(photo) if is_relative else None)
 
+    def detected_box(self, photo: Path, size: tuple[int, int]) -> "Box | None":
+        """The box of a detector for a photograph of (H, W), or for a frame by its name; None where
+        it has none, or there is no detector."""
+        return None if self._box_file is None else self._box_file.find(photo, size)
+
     def read_start(self) -> "PoseFile | None":
         """The pose of the file ``start``, or None."""
         if self.start is None:

@@ -15,11 +15,12 @@ from typing import Any
 
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import check_writable, read_json, write_file
+from . import ros
 from .store import is_one_of_several
 
 MARKER = ".curvireg.json"
 
-ONE_RESULT = ("result.json", "overlay.png", "pose.glb", "pose.yaml")
+ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *ros.FILES)
 ROWS = ("results.jsonl", "results.*-of-*.jsonl", "index.html", "thumbnails")
 FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,

@@ -1,4 +1,4 @@
-"""The files of one result: ``result.json``, ``overlay.png``, ``pose.glb`` and ``pose.yaml``."""
+"""The files of one result: ``result.json``, ``overlay.png`` and ``pose.glb``."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -6,16 +6,15 @@ from typing import Any
 
 from torch import Tensor
 
-from ..errors import InvalidInputError
 from ..registration import Registrar, Registration
 from ..registration.result import SCHEMA
-from ..utils.choices import UNITS
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
+from . import ros
 from .store import to_json
 from .views import View
 
@@ -111,24 +110,6 @@ def _write(
             raise error
 
 
-def write_pose_stamped(path: Path, document: dict[str, Any]) -> None:
-    """Write the pose as a ``geometry_msgs/PoseStamped`` of ROS in YAML: metres, in the camera's
-    optical frame."""
-    if document["translation"] is None:
-        raise InvalidInputError("--format ros: a pose without translation; give a camera")
-    w, x, y, z = document["quaternion"]
-    frame = "world" if document["frame"] == "world" else "camera_optical_frame"
-    px, py, pz = (v * UNITS[document["unit"] or "m"] for v in document["translation"])
-    text = f"""header:
-  stamp: {{sec: 0, nanosec: 0}}
-  frame_id: {frame}
-pose:
-  position: {{x: {px:.9g}, y: {py:.9g}, z: {pz:.9g}}}
-  orientation: {{x: {x:.12g}, y: {y:.12g}, z: {z:.12g}, w: {w:.12g}}}
-"""
-    write_file(path, text.encode())
-
-
 def write_lost(out: Path, message: str) -> None:
     """Write the ``result.json`` of a refinement that lost the object."""
     _remove(out)
@@ -140,5 +121,5 @@ def write_lost(out: Path, message: str) -> None:
 
 def _remove(out: Path) -> None:
     """Remove an older result: none of its files may stay beside those of a new one."""
-    for name in ("result.json", "pose.glb", "overlay.png", "pose.yaml"):
+    for name in ("result.json", "pose.glb", "overlay.png", *ros.FILES):
         (out / name).unlink(missing_ok=True)

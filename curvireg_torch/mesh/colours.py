@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import MAX_IMAGE_PIXELS, MAX_TEXTURE_PIXELS
 from ..utils.pictures import PICTURE_STARTS, open_picture
+from ..utils.rows import Rows
 
 TEXTURE_SIDE = 512  # Textures are reduced to this longer side in px; views are smaller
 SAMPLES = 20_000  # Points of the surface at which colours are compared
@@ -27,7 +28,7 @@ _Textures = dict[int, tuple[Any, NDArray[np.uint8] | None]]
 
 
 @dataclass(frozen=True)
-class SurfaceColours:
+class SurfaceColours(Rows):
     """Colours of F faces, stored by corner: interpolated between the corners and multiplied by a
     texture.
 
@@ -36,20 +37,17 @@ class SurfaceColours:
         uv: (F, 3, 2) float32 texture coordinates; (0, 0) is the bottom left, and textures repeat.
         texture: (F,) int32 index of the texture, -1 for none.
         textures: (h, w, 3) uint8 RGB each.
+
+    Example:
+        >>> red = SurfaceColours.plain(12, (255, 0, 0))
+        >>> len(red), red[:2].corners.shape
+        (12, (2, 3, 3))
     """
 
     corners: NDArray[np.uint8]
     uv: NDArray[np.float32]
     texture: NDArray[np.int32]
     textures: tuple[NDArray[np.uint8], ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.corners)
-
-    def __getitem__(self, faces: Any) -> "SurfaceColours":
-        return SurfaceColours(
-            self.corners[faces], self.uv[faces], self.texture[faces], self.textures
-        )
 
     def check(self, faces: int) -> None:
         """Raise ValueError unless these are valid colours of ``faces`` faces."""
@@ -71,7 +69,7 @@ class SurfaceColours:
         return cls(corners, np.zeros((faces, 3, 2), np.float32), np.full(faces, -1, np.int32))
 
     @classmethod
-    def concatenate(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
+    def cat(cls, parts: Sequence["SurfaceColours"]) -> "SurfaceColours":
         """The colours of a mesh that is made of several, which may share textures."""
         textures = {id(texture): texture for part in parts for texture in part.textures}
         number = {key: k for k, key in enumerate(textures)}
@@ -105,7 +103,13 @@ class SurfaceColours:
 
 def has_colours(mesh: Any) -> bool:
     """Whether a mesh has colours that vary over its surface: one plain material is no print. The
-    only place where it is decided; symmetries, appearance and fits to colours follow it."""
+    only place where it is decided; symmetries, appearance and fits to colours follow it.
+
+    Example:
+        >>> from curvireg_torch.synthetic import example_mesh
+        >>> has_colours(example_mesh()), has_colours(example_mesh(painted=True))
+        (False, True)
+    """
     colours = surface_colours(mesh)
     return colours is not None and _vary(colours, mesh)
 
@@ -152,7 +156,14 @@ def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
 def surface_colours(mesh: Any) -> SurfaceColours | None:
     """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are
     white. They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else
-    from ``mesh.visual``."""
+    from ``mesh.visual``.
+
+    Example:
+        >>> from curvireg_torch.synthetic import example_mesh
+        >>> mesh = example_mesh(painted=True)
+        >>> len(surface_colours(mesh)) == len(mesh.faces)
+        True
+    """
     return _surface_colours(mesh, {})
 
 

@@ -39,4 +39,4 @@ def joined_scene(scene: trimesh.Scene) -> tuple[trimesh.Trimesh | None, SurfaceC
         each or SurfaceColours.plain(len(part.faces))
         for each, part in zip(found, parts, strict=True)
     ]
-    return mesh, SurfaceColours.concatenate(known)
+    return mesh, SurfaceColours.cat(known)

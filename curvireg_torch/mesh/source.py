@@ -25,6 +25,10 @@ class MeshWarning:
     Attributes:
         kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
         text: one sentence, without the name of the file.
+
+    Example:
+        >>> MeshWarning("colours", "the texture 'label.png' is missing").text
+        "the texture 'label.png' is missing"
     """
 
     kind: str
@@ -78,7 +82,7 @@ class ReadMesh:
         colours = None
         if any(part.colours is not None for part in parts):
             known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
-            colours = SurfaceColours.concatenate(known)
+            colours = SurfaceColours.cat(known)
         return cls(vertices, faces, colours, unit, up)
 
 

@@ -33,9 +33,9 @@ ALIGNED_POINTS = 500
 ALIGNED_FRACTION = 0.9
 MAX_TILT = 5.0
 # Distance in radii, and fraction of the surface that a symmetry moves farther off it, from which a
-# feature tells it from the identity: a bump of about 0.1 radii. Scans of symmetric objects have
+# feature tells it from the identity: a bump of about 0.05 radii. Scans of symmetric objects have
 # hardly such a point.
-FEATURE_HEIGHT = 0.06
+FEATURE_HEIGHT = 0.05
 FEATURE_FRACTION = 0.001
 FEATURE_POINTS = 10_000
 ROUND = 36  # Rotations that stand for a body of revolution; steps of 10 degrees are those of a bank

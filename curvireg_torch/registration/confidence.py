@@ -8,27 +8,36 @@ accuracy on others.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
+from ..evidence import Evidence
+from ..geometry.viewpoint import angles_between
 from ..mesh.symmetry import ROUND
-from ..pipeline import BankSettings, Pipeline
+from ..pipeline import BankSettings, FitSettings, Pipeline
 
-# Probability that the object is where landmarks agree on a pose, in a whole photograph: on
+# Probability that the object is where keypoints agree on a pose, in a whole photograph: on
 # generated shelves 84 of 88. It is less where other objects have a similar print
-LANDMARK_PROBABILITY = 0.95
-RELIABLE = 0.9  # Confidence from which a registration is called reliable
+KEYPOINT_PROBABILITY = 0.95
+RELIABLE = FitSettings().reliable  # Confidence from which an answer is called reliable by default
 # the more, the better
-EVIDENCE_FEATURES = ("similarity", "margin", "edge_support", "concentration", "landmarks")
+EVIDENCE_FEATURES = (
+    "similarity",
+    "margin",
+    "edge_support",
+    "contours",
+    "concentration",
+    "landmarks",
+)
 DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
 RIVAL_ANGLE = 30.0  # Degrees beyond which two views are rivals
+ROUNDING = 5e-4  # of these degrees: many views of a bank are 30 degrees apart
 
 Features = Mapping[str, float | None]  # by name; None where there is no rival view to compare with
 
@@ -69,10 +78,10 @@ def model_name(*, exact: bool) -> str:
 
 def is_calibrated(pipeline: Pipeline) -> bool:
     """Whether the models were fitted for such a pipeline: learned field, default terms, contour
-    fit, default views.
+    fit with its default settings, default views.
 
-    The number of hypotheses, the box jitter, the size of the views, their spacing, and how many of
-    them the appearance term compares may differ.
+    The number of hypotheses, the box jitter, the size of the views, their spacing, how many of them
+    the appearance term compares, and from where answers are called reliable may differ.
     """
     default = Pipeline()
     bank = pipeline.bank
@@ -83,8 +92,9 @@ def is_calibrated(pipeline: Pipeline) -> bool:
         ]
         return pipeline.field, pipeline.weights, terms
 
-    usual = bank == BankSettings(image_size=bank.image_size) and pipeline.contours
-    return usual and compared(pipeline) == compared(default)
+    fit = replace(pipeline.fit, reliable=default.fit.reliable)
+    usual = bank == BankSettings(image_size=bank.image_size) and fit == default.fit
+    return usual and pipeline.contours and compared(pipeline) == compared(default)
 
 
 def probability_of_any(features: Features, *, exact: bool) -> float:
@@ -114,7 +124,7 @@ def detection_probability(
     Args:
         response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        rival: where landmarks led to the box, whose number is the response, the largest number at
+        rival: where keypoints led to the box, whose number is the response, the largest number at
             another place.
 
     Example:
@@ -122,7 +132,7 @@ def detection_probability(
         True
     """
     if rival is not None:
-        return LANDMARK_PROBABILITY * response / (response + 0.5 * rival)
+        return KEYPOINT_PROBABILITY * response / (response + 0.5 * rival)
     return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 
 
@@ -132,10 +142,8 @@ def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = No
 
     ``symmetries`` are (K, 4, 4) or (K, 3, 3).
     """
-    group = torch.eye(3)[None] if symmetries is None else symmetries[:, :3, :3]
-    equivalent = rotation.to(rotations) @ group.to(rotations)
-    traces = (equivalent.flatten(1) @ rotations.flatten(1).T).amax(dim=0)
-    return traces >= 1.0 + 2.0 * math.cos(math.radians(RIVAL_ANGLE)) - 1e-5
+    angles = angles_between(rotation[None].to(rotations), rotations, symmetries)[0]
+    return angles <= RIVAL_ANGLE + ROUNDING
 
 
 def concentration(scores: Tensor, near: Tensor) -> float | None:
@@ -172,7 +180,7 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
 
 
 def confidence_features(
-    evidence: Tensor,
+    evidence: Evidence,
     scores: Tensor,
     share: float | None,
     *,
@@ -183,11 +191,11 @@ def confidence_features(
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support, landmarks: of the best hypothesis. margin: its score minus the largest
-    of its rivals, clamped to +-5; None without rivals.
+    similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
+    the largest of its rivals, clamped to +-5; None without rivals.
 
     Args:
-        evidence: (H, F) :data:`.POSE_FEATURES` of the hypotheses, the best first.
+        evidence: of the H hypotheses, the best first.
         scores: (H,) by which they are ordered.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
@@ -196,23 +204,23 @@ def confidence_features(
         focal: standard deviation of the focal length, as a fraction of it; larger ones than 1 count
             as 1.
     """
-    _, similarity, edge_support, _, landmarks, _ = evidence[0].tolist()
+    best = evidence.named(0)
     rivals = scores[1:]
     margin = (
         min(max(float(scores[0] - rivals.max()), -MAX_MARGIN), MAX_MARGIN) if len(rivals) else None
     )
-    values = (
-        similarity,
-        margin,
-        edge_support,
-        share,
-        landmarks,
-        undetermined,
-        outside,
-        border,
-        min(focal, 1.0),
-    )
-    return dict(zip(CONFIDENCE_FEATURES, values, strict=True))
+    return {
+        "similarity": best["similarity"],
+        "margin": margin,
+        "edge_support": best["edge_support"],
+        "contours": best["contours"],
+        "concentration": share,
+        "landmarks": best["landmarks"],
+        "undetermined": undetermined,
+        "outside": outside,
+        "border": border,
+        "focal": min(focal, 1.0),
+    }
 
 
 def resolution(*, exact: bool) -> float:

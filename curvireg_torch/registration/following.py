@@ -13,7 +13,6 @@ from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.threads import map_on_threads
-from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
 from .poses import Poses, hypothesis_of
 from .refinement import refine_item
@@ -79,7 +78,10 @@ class Follower:
         self.camera_matrix = camera_matrix
         self.prior = prior
         describer = self.registrar.describer
-        self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
+        self._reliable = self.registrar.pipeline.fit.reliable
+        self._tracker = Tracker(
+            describer.renderer, describer.contours, describer.hull, reliable=self._reliable
+        )
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
 
@@ -168,7 +170,7 @@ class Follower:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
             return found
-        registered = self._registered(item, image, box, RELIABLE)
+        registered = self._registered(item, image, box, self._reliable)
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined
         )
@@ -196,7 +198,7 @@ class Follower:
         except CurviregError as error:
             return FailedRegistration(error)
         assert self._base is not None
-        bound = 1.0 if _confidence(result) >= RELIABLE else self._base
+        bound = 1.0 if _confidence(result) >= self._reliable else self._base
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
@@ -226,6 +228,7 @@ class Follower:
             warnings=warnings,
             notes=notes,
             camera=item.camera,
+            reliable_from=self._reliable,
         )
 
 

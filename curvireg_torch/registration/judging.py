@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ..evidence import Evidence
 from .confidence import (
     are_near,
     concentration,
@@ -16,7 +17,7 @@ from .confidence import (
     undetermined_axes,
 )
 from .framing import border_sides, outside_fraction, outside_warnings
-from .poses import SCORE_WEIGHTS, Poses, hypothesis_of, named_features, pose_scores
+from .poses import Poses, hypothesis_of
 from .result import FailedRegistration, Registration
 from .target import Target
 from .work import Work
@@ -30,7 +31,7 @@ def judged(
     target: Target,
     work: Work,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     distinct: Tensor,
     outside: Tensor,
 ) -> Registration:
@@ -40,12 +41,12 @@ def judged(
         target: the object.
         work: the photograph.
         poses: H of them.
-        features: (H, F) :data:`.POSE_FEATURES`.
+        evidence: of them.
         distinct: (H,) bool, False of poses that merged with a better one and returned to their
             views.
         outside: (H,) bool, those that lie outside the limits and are not reported.
     """
-    scores = pose_scores(features, exact=work.exact)
+    scores = evidence.scores(target.score_weights(exact=work.exact))
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]
     best = own[:1]
@@ -53,9 +54,9 @@ def judged(
     fraction = _outside_fraction(target, work, poses[best])
     # Poses that merged have no probability of their own.
     rivals = own[distinct[own]]
-    near = are_near(target.bank.rotations, poses.rotation[best[0]], work.symmetries)
+    near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
-        features[rivals],
+        evidence[rivals],
         scores[rivals],
         concentration(work.ranking.scores[0], near),
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
@@ -63,7 +64,7 @@ def judged(
         border=border_sides(work.item.box, work.item.size),
         focal=work.item.focal_deviation,
     )
-    gain = _gain_outside(features, best, order[outside[order]])
+    gain = _gain_outside(target, evidence, best, order[outside[order]])
     # limits that leave no rival do not make a pose uncertain
     if gain is not None and len(rivals) == 1:
         share = measured["concentration"] or 1.0
@@ -76,8 +77,7 @@ def judged(
     item = work.item
     with_camera = item.camera_matrix is not None
     hypotheses = [
-        hypothesis_of(poses, h, named_features(features, h), with_camera=with_camera)
-        for h in reported
+        hypothesis_of(poses, h, evidence.named(h), with_camera=with_camera) for h in reported
     ]
     return Registration(
         tuple(hypotheses),
@@ -89,6 +89,7 @@ def judged(
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
         camera=item.camera,
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 
@@ -97,13 +98,16 @@ def _outside_fraction(target: Target, work: Work, best: Poses) -> float:
     return outside_fraction(target.describer.hull, best.T[0], best.cameras[0], work.item.size)
 
 
-def _gain_outside(features: Tensor, best: Tensor, outside: Tensor) -> float | None:
+def _gain_outside(
+    target: Target, evidence: Evidence, best: Tensor, outside: Tensor
+) -> float | None:
     """Score of the pose outside the limits, minus that of the best one; without the rank, which it
     does not have."""
     if not len(outside):
         return None
-    weights = torch.tensor(SCORE_WEIGHTS[1:]).to(features)
-    return float((features[outside, 1:] - features[best, 1:]) @ weights)
+    weights = replace(target.score_weights(exact=True), rank=0.0)
+    gained = evidence[outside].table - evidence[best].table
+    return float(Evidence.from_table(gained).scores(weights))
 
 
 def _contradiction(target: Target, work: Work, best: Poses, gain: float | None) -> str | None:

@@ -8,21 +8,20 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError
+from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..terms import QueryFeatures
 from .confidence import are_near
+from .described import evidence_of
 from .focal import FINISHED
 from .inputs import ImageItem, check_crop
 from .judging import judged
 from .poses import (
-    FINISHED_FITS,
-    SCREENING_WEIGHT,
     Poses,
     best_views,
     common_score,
     distinct_poses,
     fit_texture_of,
-    pose_scores,
     projected_box,
     with_edge_support,
     with_quick_fit,
@@ -30,7 +29,7 @@ from .poses import (
 from .refits import best_inside, fitted_again
 from .result import Registration
 from .search import search
-from .siblings import with_siblings
+from .siblings import Rival, with_siblings
 from .target import Target
 from .unknown_camera import (
     limits_of,
@@ -40,18 +39,13 @@ from .unknown_camera import (
 )
 from .work import (
     Work,
-    features_of,
     fitted_poses,
-    landmark_poses,
+    keypoint_poses,
     least_starts,
     poses_in_box,
     poses_of_views,
     with_replaced,
 )
-
-SCREENED_VIEWS = 10
-"""Number of the best distinct views of an exact mesh that get a short contour fit, which decides
-with their rank which become hypotheses."""
 
 
 def register_item(target: Target, item: ImageItem) -> Registration:
@@ -63,13 +57,15 @@ def register_item(target: Target, item: ImageItem) -> Registration:
         if item.shows_other_part(box):
             with suppress(CurviregError):
                 again = _register_box(target, replace(item, box=box.float()))
-                if common_score(again.hypotheses[0]) > common_score(result.hypotheses[0]):
+                weights = target.score_weights(exact=True)
+                new = common_score(again.hypotheses[0], weights)
+                if new > common_score(result.hypotheses[0], weights):
                     result = replace(again, corrected_box=box)
     return result
 
 
 def _register_box(target: Target, item: ImageItem) -> Registration:
-    query = target.matcher.query([item.image], item.box[None])
+    query = target.matcher.query_together(item.image, item.box)
     check_crop(query.crops[0])
     return register(target, item, query)
 
@@ -96,27 +92,29 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
             poses = poses.replaced(
                 unknown, with_quick_fit(target.describer, work.crops, poses[unknown])[0]
             )
-        finish = FINISHED_FITS if work.starts is None else FINISHED
+        finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
-    features = features_of(target, work, poses)
-    sibling: tuple[Poses, Tensor] | None = None
+    evidence = evidence_of(target, work, poses)
+    sibling = Rival.none(poses, evidence)
     if work.crops is not None and work.exact:
         if work.item.focal_deviation:
-            poses, features = with_fitted_focal_lengths(
-                target, work, work.crops, poses, features, outside
+            poses, evidence = with_fitted_focal_lengths(
+                target, work, work.crops, poses, evidence, outside
             )
-        poses, features = fitted_again(target, work, work.crops, poses, features, outside)
-        poses, features, sibling = with_siblings(target, work, work.crops, poses, features, outside)
-        poses, features = _with_texture(target, work, work.crops, poses, features, outside)
+        poses, evidence = fitted_again(target, work, work.crops, poses, evidence, outside)
+        poses, evidence, sibling = with_siblings(target, work, work.crops, poses, evidence, outside)
+        poses, evidence = _with_texture(target, work, work.crops, poses, evidence, outside)
     inside = (~outside).nonzero()[:, 0]
-    scores = pose_scores(features[inside], exact=work.exact)
-    distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
+    scores = evidence[inside].scores(target.score_weights(exact=work.exact))
+    angle = target.pipeline.fit.same_pose_angle
+    found = distinct_poses(poses[inside], scores, work.symmetries, angle=angle)
+    distinct = outside.index_copy(0, inside, found)
     # Unlike another view, these started near the pose that they merged with: they are no
     # rivals.
     other = (distinct | ~repeated).nonzero()[:, 0]
     starts = starts[other]
     poses = poses[other]
-    features = features[other]
+    evidence = evidence[other]
     distinct = distinct[other]
     outside = outside[other]
     keep = _kept(target, work, poses, distinct, outside)
@@ -128,36 +126,46 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         if work.crops is not None:
             restored = with_edge_support(target.describer, work.crops, restored)
         poses = poses.replaced(back, restored)
-        features = features.index_copy(0, back, features_of(target, work, restored))
+        evidence = evidence.replaced(back, evidence_of(target, work, restored))
     if work.crops is not None and work.item.focal_deviation:
-        work, poses = with_focal_deviation(target, work, work.crops, poses, features, outside)
-    if sibling is not None:
-        poses = Poses.cat([poses, sibling[0]])
-        features = torch.cat([features, sibling[1]])
-        distinct = F.pad(distinct, (0, 1), value=True)
-        outside = F.pad(outside, (0, 1))
-    return judged(target, work, poses, features, distinct, outside)
+        work, poses = with_focal_deviation(target, work, work.crops, poses, evidence, outside)
+    poses = Poses.cat([poses, sibling.poses])
+    evidence = Evidence.cat([evidence, sibling.evidence])
+    distinct = F.pad(distinct, (0, len(sibling.poses)), value=True)
+    outside = F.pad(outside, (0, len(sibling.poses)))
+    result = judged(target, work, poses, evidence, distinct, outside)
+    return replace(result, feature_is_hidden=sibling.feature_is_hidden)
 
 
 def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     target.report_progress("ranking")
     exact = target.is_exact
     limits = None if item.prior is None else limits_of(target, item)
-    ranking = target.matcher.rank(query, None if limits is None else limits.allowed()[None])
+    ranking = target.matcher.rank_together(
+        query, None if limits is None else limits.allowed()[None]
+    )
     symmetries = target.symmetries_of(exact=exact)
     crops = None
     if target.pipeline.contours:
         mask = target.object_mask(query, [item])
         crops = EdgeCrops.cut([item.image], item.box[None], target.bank.settings.margin, mask)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    descriptor = target.describer.descriptor(query.field)
-    return Work(item, query, ranking, descriptor, limits, exact, symmetries, crops, landmarks)
+    return Work(
+        query=query,
+        ranking=ranking,
+        descriptor=target.describer.descriptor(query.field),
+        crops=crops,
+        keypoints=target.keypoint_matches(item, item.box) if target.uses_keypoints else None,
+        item=item,
+        limits=limits,
+        exact=exact,
+        symmetries=symmetries,
+    )
 
 
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits,
     the last one at most, and which repeats another one: the same view with another camera, or a
-    pose that landmarks agree on, in place of the views near it.
+    pose that keypoints agree on, in place of the views near it.
 
     That outside is the best view there; it is never reported, and tells whether the limits are
     wrong.
@@ -165,7 +173,7 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     poses = _promising(target, work) if work.starts is None else work.starts
     repeated = _are_repeated(poses.view)
     if work.crops is not None and work.exact:
-        found, _ = landmark_poses(target, work.landmarks)
+        found, _ = keypoint_poses(target, work.keypoints)
         found = found if work.limits is None else found[work.limits.keeps(found)]
         if len(found):
             far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)
@@ -189,7 +197,9 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
 def _promising(target: Target, work: Work) -> Poses:
     """Poses of the most promising distinct views."""
     count = least_starts(target)
-    screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
+    screened = count
+    if work.crops is not None and work.exact:
+        screened = max(target.pipeline.fit.screened_views, count)
     view, rank = best_views(work.ranking, target.bank, count=screened, symmetries=work.symmetries)
     poses = poses_of_views(target, work, view, rank)
     if work.limits is not None:
@@ -203,7 +213,7 @@ def _screened(target: Target, crops: EdgeCrops, poses: Poses, count: int) -> Pos
     """The ``count`` poses with the largest sum of rank and weighted edge support after a short
     fit, best first."""
     poses, support = with_quick_fit(target.describer, crops, poses)
-    score = poses.rank + SCREENING_WEIGHT * support
+    score = poses.rank + target.pipeline.fit.screening_weight * support
     return poses[score.argsort(descending=True, stable=True)[:count]]
 
 
@@ -221,18 +231,18 @@ def _searched(target: Target, work: Work) -> Registration:
         poses = work.limits.moved_inside(poses)
     distinct = torch.ones(len(poses), dtype=torch.bool)
     by_rank = replace(work, exact=False)
-    return judged(target, by_rank, poses, features_of(target, work, poses), distinct, ~distinct)
+    return judged(target, by_rank, poses, evidence_of(target, work, poses), distinct, ~distinct)
 
 
 def _with_texture(
-    target: Target, work: Work, crops: EdgeCrops, poses: Poses, features: Tensor, outside: Tensor
-) -> tuple[Poses, Tensor]:
+    target: Target, work: Work, crops: EdgeCrops, poses: Poses, evidence: Evidence, outside: Tensor
+) -> tuple[Poses, Evidence]:
     """Fit the best pose to the mesh's colours as well."""
-    best = best_inside(features, outside)
+    best = best_inside(target, evidence, outside)
     fitted = fit_texture_of(target.describer, crops, poses, int(best))
     if fitted is None:
-        return poses, features
-    return with_replaced(work, poses, features, best, fitted, features_of(target, work, fitted))
+        return poses, evidence
+    return with_replaced(work, poses, evidence, best, fitted, evidence_of(target, work, fitted))
 
 
 def _kept(target: Target, work: Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:

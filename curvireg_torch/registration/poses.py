@@ -2,89 +2,44 @@
 judged."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from ..fitting.contour_fit import fit_to_edges, quick_fit
+from ..evidence import EvidenceWeights
 from ..fitting.contour_problem import ContourProblem
-from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit
 from ..fitting.texture_fit import fit_texture, turned
-from ..geometry.cameras import pose_from_box, projected_boxes, rotation_towards
+from ..fitting.together import fit_together, quick_fit_together, support_together
+from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
-from ..terms import Appearance, QueryFeatures
+from ..pipeline import FitSettings
+from ..utils.rows import Rows
 from .confidence import are_near
 from .result import Hypothesis
-from .target import Target
 
 __all__ = [
-    "POSE_FEATURES",
-    "SCORE_WEIGHTS",
-    "SCREENING_WEIGHT",
     "Poses",
     "best_views",
     "close_rivals",
     "common_score",
-    "compare_with_photograph",
     "distinct_poses",
     "fit_poses",
     "fit_texture_of",
     "hypothesis_of",
-    "landmark_evidence",
-    "named_features",
     "placed",
-    "pose_features",
-    "pose_scores",
     "projected_box",
-    "similarities",
-    "with_details",
     "with_edge_support",
     "with_quick_fit",
 ]
 
-SAME_POSE_ANGLE = 15.0
-"""Degrees within which two fitted hypotheses count as one."""
-
-SCREENING_WEIGHT = 20.0
-"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views
-that are fitted."""
-
-FINISHED_FITS = 2
-"""Hypotheses of a photograph whose contours are fitted at full size."""
-
-CLOSE_SCORE = 2.5
-CLOSE_RIVALS = 2
-"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of
-them are fitted as thoroughly."""
-
-POSE_FEATURES = ("rank", "similarity", "edge_support", "appearance", "landmarks", "details")
-"""Features of a pose: log S of the view it started from, minus that of the best view; normalised
-correlation of the pose's view with the photograph; edge support (0 without the contour fit); log
-appearance score of the pose (0 without that term); log (1 + n) with the number n of landmarks that
-agree with it, beyond ``CHANCE_LANDMARKS`` (0 without colours, camera or contour fit, with a similar
-mesh, and where a given pose is refined); by how much the contours that only this pose or only the
-best one predicts speak for it, see :func:`.compare_details` (0 for poses that score far less than
-the best)."""
-
-CHANCE_LANDMARKS = 2
-"""Landmarks that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses
-have no more."""
-
-SCORE_WEIGHTS = (0.0, 10.0, 10.0, 2.5, 6.0, 1.0)
-RANK_ALONE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Weights of the features in the score of a pose, with an exact mesh and with a similar one
-(docs/experiments.md). The rank does not count where poses are fitted: how near a view of the bank
-was to one is a matter of sampling."""
-
 
 @dataclass(frozen=True)
-class Poses:
+class Poses(Rows):
     """H candidate poses of the object in a photograph.
 
     Attributes:
@@ -151,26 +106,6 @@ class Poses:
         T[:, :3, :3], T[:, :3, 3] = pose_from_box(describer.hull, rotation, boxes, cameras)
         return Poses.at(T, cameras, describer.centre, view, rank)
 
-    def __len__(self) -> int:
-        return len(self.view)
-
-    def __getitem__(self, index: Tensor) -> "Poses":
-        return Poses(*(getattr(self, f.name)[index] for f in fields(Poses)))
-
-    @staticmethod
-    def cat(parts: "Sequence[Poses]") -> "Poses":
-        """Return all poses."""
-        return Poses(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Poses)))
-
-    def replaced(self, index: Tensor, others: "Poses") -> "Poses":
-        """Return these poses with ``others`` in the places ``index``."""
-        return Poses(
-            *(
-                getattr(self, f.name).index_copy(0, index, getattr(others, f.name))
-                for f in fields(Poses)
-            )
-        )
-
     @property
     def fit(self) -> ContourFit:
         """The poses as a fit."""
@@ -180,15 +115,14 @@ class Poses:
 
     def with_fit(self, fit: ContourFit, centre: Tensor) -> "Poses":
         """Return the poses of a fit, for an object with this centre (3,)."""
-        measured = {
-            f.name: getattr(fit, f.name) for f in fields(ContourFit) if f.name != "transform"
-        }
-        return placed(replace(self, **measured), fit.transform, centre)
+        measured = fit.columns()
+        T = measured.pop("transform")
+        return placed(replace(self, **measured), T, centre)
 
 
 def placed(poses: Poses, T: Tensor, centre: Tensor) -> Poses:
     """Return the poses at ``T`` (H, 4, 4), with allocentric rotations and distances to match."""
-    position = T[:, :3, :3] @ centre + T[:, :3, 3]
+    position = point_in_cameras(T, centre)
     rotation = rotation_towards(position).mT @ T[:, :3, :3]
     return replace(
         poses, T=T, rotation=rotation, distance=torch.linalg.vector_norm(position, dim=1)
@@ -203,17 +137,25 @@ def best_views(
     order = ranking.order[0]
     if ranking.allowed is not None:
         order = order[ranking.allowed[0][order]]
-    view = distinct_views(order, bank.rotations, count=count, symmetries=symmetries).cpu()
+    rotations = bank.views.rotations  # on the CPU, in the precision of bank.rotations
+    view = distinct_views(order, rotations, count=count, symmetries=symmetries).cpu()
     log = ranking.scores[0].cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
     return view, log[view] - log.max()
 
 
-def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
+def fit_poses(
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Poses,
+    *,
+    settings: FitSettings = FitSettings(),
+    **options: Any,
+) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
-    return poses.with_fit(
-        fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
-    )
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    finish = options.pop("finish", settings.finished_fits)
+    fit = fit_together(*given, settings=settings, finish=finish, **options)
+    return poses.with_fit(fit, describer.centre)
 
 
 def with_quick_fit(
@@ -221,7 +163,8 @@ def with_quick_fit(
 ) -> tuple[Poses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`quick_fit`."""
-    T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    T, support = quick_fit_together(*given)
     return replace(poses, quick=T), support
 
 
@@ -244,108 +187,39 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Poses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    support = contour_support(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    support = support_together(*given)
     return replace(poses, edge_support=support)
 
 
-def similarities(views: Tensor, descriptors: Tensor) -> Tensor:
-    """(H,) normalised correlations of descriptors (H, D) of views with those (H, D) or (1, D) of
-    photographs."""
-    return (F.normalize(views, dim=1) * F.normalize(descriptors, dim=1)).sum(dim=1).double().cpu()
-
-
-def compare_with_photograph(
-    target: Target,
-    query: QueryFeatures,
-    descriptor: Tensor,
-    ranking: Ranking,
-    rotation: Tensor,
-    distance: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Similarities (H,) of poses, allocentric rotations (H, 3, 3) and distances (H,), with a
-    photograph that is described as ``query`` and, on a grid twice as fine as the bank's, by
-    ``descriptor`` (1, D); and their appearance scores (H,), 0 where its ``ranking`` lacks that
-    term."""
-    if Appearance.name not in ranking.terms:
-        similarity = similarities(target.describer.descriptors(rotation, distance), descriptor)
-        return similarity, torch.zeros_like(similarity)
-    views, pictures = target.describer.described(rotation, distance)
-    return similarities(views, descriptor), target.matcher.appearance_score(
-        query, ranking, pictures
-    )
-
-
-def pose_features(
-    poses: Poses,
-    similarity: Tensor,
-    appearance: Tensor | None = None,
-    landmarks: Tensor | None = None,
-) -> Tensor:
-    """(H, 6) :data:`POSE_FEATURES` without details: the :func:`similarities`, the ``appearance``
-    (H,) where the pipeline has that term, and the evidence of ``landmarks`` (H,) where the mesh has
-    any."""
-    appearance, landmarks = (
-        torch.zeros_like(similarity) if x is None else x for x in (appearance, landmarks)
-    )
-    support = poses.edge_support.nan_to_num(0.0)
-    details = torch.zeros_like(similarity)
-    return torch.stack([poses.rank, similarity, support, appearance, landmarks, details], dim=1)
-
-
-def with_details(
-    describer: ViewDescriber,
-    crops: EdgeCrops,
-    poses: Poses,
-    features: Tensor,
-    best: int,
-    rivals: Tensor,
-) -> Tensor:
-    """Features (H, F) in which ``rivals`` (R,) are compared in detail with the ``best`` pose."""
-    index = torch.cat([torch.tensor([best]), rivals])
-    some = poses[index]
-    scores, _ = compare_details(describer.contours, crops, some.cameras, some.T, some.crop_index)
-    column = POSE_FEATURES.index("details")
-    features = features.clone()
-    features[rivals, column] = features[best, column] + scores[1:, 0].to(features)
-    return features
-
-
-def landmark_evidence(count: Tensor) -> Tensor:
-    """(H,) the last of :data:`POSE_FEATURES`, for numbers of landmarks that agree."""
-    return (count - CHANCE_LANDMARKS).clamp(min=0.0).log1p()
-
-
-def pose_scores(features: Tensor, *, exact: bool) -> Tensor:
-    """(H,) scores that order poses: of all features with an exact mesh, the order of the ranking
-    with a similar one."""
-    return features @ torch.tensor(SCORE_WEIGHTS if exact else RANK_ALONE, dtype=features.dtype)
-
-
-def common_score(hypothesis: Hypothesis) -> float:
+def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:
     """The part of the score that results in different boxes have in common: similarity and
-    landmarks, weighted."""
-    weights = dict(zip(POSE_FEATURES, SCORE_WEIGHTS, strict=True))
-    return sum(weights[name] * hypothesis.evidence[name] for name in ("similarity", "landmarks"))
+    keypoints, weighted."""
+    evidence = hypothesis.evidence
+    similarity = weights.similarity * evidence["similarity"]
+    return similarity + weights.landmarks * evidence["landmarks"]
 
 
-def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher
-    ``score`` (H,)."""
+def distinct_poses(
+    poses: Poses, score: Tensor, symmetries: Tensor | None = None, *, angle: float
+) -> Tensor:
+    """(H,) bool: False where a pose is within ``angle`` degrees of one with a higher ``score``
+    (H,)."""
     order = score.argsort(descending=True, stable=True)
     R = poses.rotation[order].float()
     best_first = torch.arange(len(order))
-    chosen = distinct_views(
-        best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries
-    )
+    chosen = distinct_views(best_first, R, count=len(order), angle=angle, symmetries=symmetries)
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
-def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best
-    first."""
+def close_rivals(
+    poses: Poses, scores: Tensor, symmetries: Tensor | None = None, *, behind: float
+) -> Tensor:
+    """(R,) indices of other poses whose scores (H,) are less than ``behind`` below the best one,
+    best first."""
     best = int(scores.argmax())
     same = are_near(poses.rotation, poses.rotation[best], symmetries)
-    close = ~same & (scores > scores[best] - CLOSE_SCORE)
+    close = ~same & (scores > scores[best] - behind)
     order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
     return order[: int(close.sum())]
 
@@ -382,8 +256,3 @@ def hypothesis_of(
         if with_camera and bool(covariance.isfinite().all())
         else None,
     )
-
-
-def named_features(features: Tensor, h: int) -> dict[str, float]:
-    """Row ``h`` of :func:`pose_features`, by the names of :data:`POSE_FEATURES`."""
-    return dict(zip(POSE_FEATURES, features[h].tolist(), strict=True))

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import mesh_up
@@ -75,17 +75,16 @@ class Limits:
         if not bool((beyond | far).any()):
             return poses
         centre = self._positions(poses.T)
-        T = poses.T.clone()
         if self.prior.distance is not None:
             away = torch.linalg.vector_norm(centre, dim=1, keepdim=True)
             centre = (
                 torch.where(far[:, None], away.clamp(*self.prior.distance) / away, 1.0) * centre
             )
-        R = torch.where(
-            beyond[:, None, None], self.prior.nearest(T[:, :3, :3], self._frame), T[:, :3, :3]
-        )
-        T[:, :3, :3], T[:, :3, 3] = R, centre - R @ self._centre
-        return placed(poses, torch.where((beyond | far)[:, None, None], T, poses.T), self._centre)
+        R = poses.T[:, :3, :3]
+        R = torch.where(beyond[:, None, None], self.prior.nearest(R, self._frame), R)
+        moved = pose_around(R, centre, self._centre)
+        T = torch.where((beyond | far)[:, None, None], moved, poses.T)
+        return placed(poses, T, self._centre)
 
     def keeps(self, poses: Poses) -> Tensor:
         """(H,) bool: whether poses leave the limits by no more than the tolerances."""
@@ -121,4 +120,4 @@ class Limits:
 
     def _positions(self, T: Tensor) -> Tensor:
         """(H, 3) positions of the object's centre in the camera."""
-        return T[:, :3, :3] @ self._centre + T[:, :3, 3]
+        return point_in_cameras(T, self._centre)

@@ -13,6 +13,7 @@ from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
 from .confidence import are_near, is_calibrated, refinement_confidence
+from .described import DescribedPhotograph, evidence_of
 from .focal import focal_covariance
 from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .photograph import register
@@ -22,10 +23,6 @@ from .poses import (
     fit_poses,
     fit_texture_of,
     hypothesis_of,
-    named_features,
-    pose_features,
-    pose_scores,
-    similarities,
 )
 from .result import FailedRegistration, Registration
 from .starts import why_outside
@@ -33,13 +30,8 @@ from .target import Target, nearest_view
 from .tracker import OUTSIDE, boxes_at
 from .work import map_items
 
-# Degrees by which given starts are rotated away, to fit from there too: they may be worse than
-# views of a bank
-WIDE_ANGLES = (14.0, 22.0)
 # Hypotheses of the registration that checks a refined pose, even if fewer are reported
 COMPARED = 5
-# Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
-LOST_CONFIDENCE = 0.35
 
 
 @torch.no_grad()
@@ -74,6 +66,16 @@ def refine(
     Raises:
         InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid
             and finite, or a confidence that is no probability.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> start = scene.truth
+        >>> (found,) = refine(cr.Registrar(bank), [scene.image], scene.camera_matrix, [start])
+        >>> found.ok, len(found.hypotheses)
+        (True, 1)
     """
     check_cameras(images, camera_matrices, "refine")
     items = image_items(images, None, camera_matrices)
@@ -133,28 +135,29 @@ def refine_item(
     poses = replace(poses, crop_index=each, view=views)
     mask = target.object_mask(query, [item] * len(T))
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
-    poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
+    settings = target.pipeline.fit
+    wide_angles = settings.wide_angles
+    poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
 
-    def features_of(poses: Poses) -> Tensor:
-        views = describer.descriptors(poses.rotation, poses.distance)
-        return pose_features(poses, similarities(views, descriptors))
-
-    best = pose_scores(features_of(poses), exact=True).argmax()[None]
+    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, keypoints=None)
+    weights = target.score_weights(exact=True)
+    best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
         poses = poses.replaced(best, fitted)
-    evidence = features_of(poses)
-    scores = pose_scores(evidence, exact=True)
-    distinct = distinct_poses(poses, scores, target.symmetries_of(exact=True))
+    evidence = evidence_of(target, photograph, poses)
+    scores = evidence.scores(weights)
+    symmetries = target.symmetries_of(exact=True)
+    distinct = distinct_poses(poses, scores, symmetries, angle=settings.same_pose_angle)
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     if item.focal_deviation:
         first = torch.tensor(order[:1])
         covariance, deviation = focal_covariance(describer, crops, poses[first], item)
         poses = replace(poses, covariance=poses.covariance.index_copy(0, first, covariance))
         item = replace(item, focal_deviation=deviation)
-    hypotheses = tuple(hypothesis_of(poses, h, named_features(evidence, h)) for h in order)
+    hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
-    if confidence < LOST_CONFIDENCE:
+    if confidence < settings.lost_confidence:
         raise LostObjectError(
             f"the object is not near the start (edge support {features['edge_support']:.2f}, "
             f"similarity "
@@ -171,15 +174,15 @@ def refine_item(
         )
     warnings = item.warnings + target.mesh_warnings
     notes = target.mesh_notes
-    ranking = Ranking.none()
     return Registration(
         hypotheses,
         probabilities,
-        ranking,
+        photograph.ranking,
         dict(features),
         warnings=warnings,
         notes=notes,
         camera=item.camera,
+        reliable_from=settings.reliable,
     )
 
 

@@ -3,15 +3,23 @@
 import torch
 from torch import Tensor
 
+from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
-from .poses import CLOSE_RIVALS, Poses, close_rivals, distinct_poses, pose_scores, with_details
+from .described import evidence_of, with_details
+from .poses import Poses, close_rivals, distinct_poses
 from .target import Target
-from .work import Work, features_of, fitted_poses, with_replaced
+from .work import Work, fitted_poses, with_replaced
 
 
-def best_inside(features: Tensor, outside: Tensor) -> Tensor:
+def scores_inside(target: Target, evidence: Evidence, outside: Tensor) -> Tensor:
+    """(H,) scores with an exact mesh, -inf for poses ``outside`` the limits (H,)."""
+    scores = evidence.scores(target.score_weights(exact=True))
+    return scores.masked_fill(outside, -torch.inf)
+
+
+def best_inside(target: Target, evidence: Evidence, outside: Tensor) -> Tensor:
     """(1,) index of the best pose that is not ``outside`` the limits (H,)."""
-    return pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+    return scores_inside(target, evidence, outside).argmax()[None]
 
 
 def fitted_again(
@@ -19,22 +27,24 @@ def fitted_again(
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     outside: Tensor,
-) -> tuple[Poses, Tensor]:
+) -> tuple[Poses, Evidence]:
     """Fit the best pose again from where it is, then its close rivals: fits that differ in effort
     cannot be compared. Results with a higher score are kept."""
-    best = best_inside(features, outside)
-    poses, features = _refitted(target, work, crops, poses, features, best)
-    scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
-    rivals = close_rivals(poses, scores, work.symmetries)
+    best = best_inside(target, evidence, outside)
+    poses, evidence = _refitted(target, work, crops, poses, evidence, best)
+    scores = scores_inside(target, evidence, outside)
+    settings = target.pipeline.fit
+    rivals = close_rivals(poses, scores, work.symmetries, behind=settings.close_score)
     if not len(rivals):
-        return poses, features
-    different = distinct_poses(poses[rivals], scores[rivals], work.symmetries)
-    poses, features = _refitted(
-        target, work, crops, poses, features, rivals[different][:CLOSE_RIVALS]
+        return poses, evidence
+    different = distinct_poses(
+        poses[rivals], scores[rivals], work.symmetries, angle=settings.same_pose_angle
     )
-    return poses, with_details(target.describer, crops, poses, features, int(best), rivals)
+    fitted = rivals[different][: settings.close_rivals]
+    poses, evidence = _refitted(target, work, crops, poses, evidence, fitted)
+    return poses, with_details(target, crops, poses, evidence, int(best), rivals)
 
 
 def _refitted(
@@ -42,17 +52,18 @@ def _refitted(
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     index: Tensor,
-) -> tuple[Poses, Tensor]:
+) -> tuple[Poses, Evidence]:
     """Fit poses again, and keep the results that have a higher score."""
     fitted = fitted_poses(target, work, crops, poses[index], again=True)
     moved = (poses.T[index] != fitted.T).flatten(1).any(dim=1)
     if not bool(moved.any()):
-        return poses, features
-    new = features_of(target, work, fitted)
-    better = moved & (pose_scores(new, exact=True) > pose_scores(features[index], exact=True))
+        return poses, evidence
+    new = evidence_of(target, work, fitted)
+    weights = target.score_weights(exact=True)
+    better = moved & (new.scores(weights) > evidence[index].scores(weights))
     for k in better.nonzero()[:, 0].tolist():
         one = torch.tensor([k])
-        poses, features = with_replaced(work, poses, features, index[one], fitted[one], new[one])
-    return poses, features
+        poses, evidence = with_replaced(work, poses, evidence, index[one], fitted[one], new[one])
+    return poses, evidence

@@ -10,29 +10,24 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError
+from ..evidence import Evidence
 from ..fitting.contour_fit import FIRST_RADII, QUARTER_SIZE_RADII
 from ..fitting.contour_problem import ContourProblem, ContourState
 from ..fitting.details import compare_details
 from ..fitting.edges import CROP_SIZE, EdgeCrops
-from ..fitting.landmarks import LandmarkMatches
 from ..fitting.least_squares import Measurements, pose_covariance
 from ..fitting.measured_fit import FULL_SIZE_RADII
 from ..geometry import rotation_error
-from ..geometry.cameras import rotation_towards, transform
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
+from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
-from ..terms import QueryFeatures, crop_regions
+from ..terms import crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
+from .described import DescribedPhotograph, evidence_of
 from .inputs import ImageItem
-from .poses import (
-    POSE_FEATURES,
-    RANK_ALONE,
-    SCORE_WEIGHTS,
-    compare_with_photograph,
-    landmark_evidence,
-)
-from .refinement import LOST_CONFIDENCE
+from .poses import Poses
 from .result import Hypothesis, Registration
 from .target import Target, nearest_view
 from .tracker import boxes_at
@@ -42,6 +37,8 @@ from .tracker import boxes_at
 FITTED_CANDIDATES = 6
 JUDGED_CANDIDATES = 4
 FINISHED_CANDIDATES = 2
+# Weight of the edge support, beside log S, in the choice of the candidates that are compared
+SUPPORT_WEIGHT = 10.0
 # Degrees, and shift in object radii, within which two candidates count as one; the best view of the
 # bank so near to a pose stands for it
 SAME_ANGLE = 15.0
@@ -76,10 +73,6 @@ class RigProblem(ContourProblem):
     alone: Tensor
     root: Tensor
 
-    def __getitem__(self, index: Tensor) -> "RigProblem":
-        names = ("image_index", "K", "axes", "group", "alone", "root")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
-
     def step(
         self, points: ContourPoints, T: Tensor, radius: float, others: Sequence[Measurements] = ()
     ) -> Tensor:
@@ -92,7 +85,7 @@ class RigProblem(ContourProblem):
         """(N, 6, 1) from poses to those that the photographs alone found, in standard deviations of
         these."""
         turn = axis_angle_from_rotation(self.alone[:, :3, :3] @ T[:, :3, :3].mT)
-        shift = (self.alone - T)[:, :3, :3] @ self.centre + (self.alone - T)[:, :3, 3]
+        shift = point_in_cameras(self.alone - T, self.centre)
         return self.root @ torch.cat([turn, shift], dim=1)[..., None]
 
     def solution(self, A: Tensor, b: Tensor) -> Tensor:
@@ -116,21 +109,25 @@ def in_frames(axes: Tensor) -> Tensor:
     return torch.kron(torch.eye(2, dtype=axes.dtype), axes)
 
 
-@dataclass(frozen=True)
-class RigPhotograph:
-    """A registered photograph ``index``: its ``camera`` (4, 4) from the world, ``K`` (3, 3) and
-    ``size``; the ``box`` (4,) in which poses are compared, the crops of it, its landmarks, and the
-    registration of it alone."""
+@dataclass(frozen=True, kw_only=True)
+class RigPhotograph(DescribedPhotograph):
+    """A registered photograph.
 
+    Attributes:
+        index: of it among those that were given.
+        camera: (4, 4) from the world.
+        K: (3, 3).
+        size: (H, W).
+        box: (4,) in which poses are compared.
+        result: the registration of it alone.
+    """
+
+    crops: EdgeCrops
     index: int
     camera: Tensor
     K: Tensor
     size: tuple[int, int]
     box: Tensor
-    crops: EdgeCrops
-    query: QueryFeatures
-    descriptor: Tensor
-    landmarks: LandmarkMatches | None
     result: Registration
 
     @staticmethod
@@ -154,8 +151,9 @@ class RigPhotograph:
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
+            ranking=result.ranking,
             descriptor=target.describer.descriptor(query.field),
-            landmarks=target.landmark_matches(item, box) if target.uses_landmarks else None,
+            keypoints=target.keypoint_matches(item, box) if target.uses_keypoints else None,
             result=result,
         )
 
@@ -179,11 +177,11 @@ Found = dict[int, RigPhotograph | CurviregError]
 
 @dataclass(frozen=True)
 class Answer:
-    """M candidate poses in the world, best first, with evidence (V, M, F) and scores (V, M) in V
+    """M candidate poses in the world, best first, with evidence and scores, each (V, M), in V
     photographs, and covariances (M, 6, 6), NaN where unfinished."""
 
     T: Tensor
-    evidence: Tensor
+    evidence: Evidence
     scores: Tensor
     covariance: Tensor
 
@@ -196,6 +194,7 @@ class Rig:
         self.describer = target.describer
         self.photographs = photographs
         self.exact = target.is_exact
+        self.score_weights = target.score_weights(exact=self.exact)
         symmetries = target.symmetries_of(exact=self.exact)
         self.symmetries = (
             torch.eye(3)[None].double() if symmetries is None else symmetries[:, :3, :3].double()
@@ -241,8 +240,7 @@ class Rig:
 
     def centres(self, T: Tensor) -> Tensor:
         """(N, 3) the object's centres of poses (N, 4, 4)."""
-        centres: Tensor = T[:, :3, :3] @ self.describer.centre + T[:, :3, 3]
-        return centres
+        return point_in_cameras(T, self.describer.centre)
 
     @cached_property
     def places(self) -> tuple[Tensor, Tensor]:
@@ -278,8 +276,8 @@ class Rig:
         agree = agree.scatter(1, source[:, None], False)[:, :, None, None].double()
         A = own + (agree * theirs).sum(dim=1)
         b = own @ place[..., None] + (agree * (theirs @ others[..., None])).sum(dim=1)
-        R = T[:, :3, :3]
-        T = transform(R, torch.linalg.solve(A, b)[..., 0] - R @ self.describer.centre)
+        agreed = torch.linalg.solve(A, b)[..., 0]
+        T = pose_around(T[:, :3, :3], agreed, self.describer.centre)
         return T[self.distinct(T, _bounded(self.ranks(T)).sum(dim=0))[:FITTED_CANDIDATES]]
 
     def distinct(self, T: Tensor, score: Tensor) -> Tensor:
@@ -297,10 +295,7 @@ class Rig:
     def angles(self, R: Tensor, others: Tensor) -> Tensor:
         """(M, N) degrees between rotations (M, 3, 3) and (N, 3, 3), or those of poses, up to
         symmetries."""
-        R = R[:, :3, :3]
-        others = others[:, :3, :3]
-        traces = ((R[:, None] @ self.symmetries).flatten(2) @ others.flatten(1).T).amax(dim=1)
-        return torch.rad2deg((0.5 * (traces - 1.0)).clamp(-1.0, 1.0).acos())
+        return angles_between(R[:, :3, :3], others[:, :3, :3], self.symmetries)
 
     def ranks(self, T: Tensor) -> Tensor:
         """(V, M) log S of the best view of the bank near world poses, minus that of the best view
@@ -308,7 +303,7 @@ class Rig:
         ranks = []
         views = self.target.bank.rotations.cpu().double()
         for photograph in self.photographs:
-            scores = photograph.result.ranking.scores[0].cpu().double()
+            scores = photograph.ranking.scores[0].cpu().double()
             log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
             angles = self.angles(self.allocentric(photograph, T)[0], views)
             near = angles <= angles.amin(dim=1, keepdim=True).clamp(min=SAME_ANGLE)
@@ -392,7 +387,7 @@ class Rig:
         # for those that are far off; the others lose by it
         moved, _, _ = self.fitted(quarter, T, QUARTER_SIZE_RADII)
         T, support, _ = self.fitted(half, torch.cat([T, moved]), FIRST_RADII)
-        promising = (SCORE_WEIGHTS[2] * support + _bounded(self.ranks(T))).sum(dim=0)
+        promising = (SUPPORT_WEIGHT * support + _bounded(self.ranks(T))).sum(dim=0)
         chosen = self.distinct(T, promising)[:JUDGED_CANDIDATES]
         T = T[chosen]
         support = support[:, chosen]
@@ -402,20 +397,20 @@ class Rig:
         covariance[:best] = self.covariances(T[:best], state)
         evidence = self.evidence(T, support)
         sees = torch.stack([p.sees(self.describer.hull, T) for p in self.photographs])
-        scores = _bounded(torch.where(sees, self.scores(evidence), -torch.inf))
+        scores = evidence.scores(self.score_weights)
+        scores = _bounded(torch.where(sees, scores, -torch.inf))
         order = (self.weights(T[0]) @ scores).argsort(descending=True, stable=True)
         return Answer(T[order], evidence[:, order], scores[:, order], covariance[order])
 
     def hypotheses_of_one(self) -> Answer:
         (photograph,) = self.photographs
         found = photograph.result.hypotheses
-        evidence = torch.tensor(
-            [[h.evidence[name] for name in POSE_FEATURES] for h in found]
-        ).double()[None]
+        evidence = Evidence.of_hypotheses([h.evidence for h in found])[None]
         P = in_frames(self.cameras[:, :3, :3])
         unknown = torch.full((6, 6), torch.nan).double()
         C = torch.stack([unknown if h.covariance is None else h.covariance for h in found])
-        return Answer(photograph.poses, evidence, self.scores(evidence), P.mT @ C @ P)
+        scores = evidence.scores(self.score_weights)
+        return Answer(photograph.poses, evidence, scores, P.mT @ C @ P)
 
     def covariances(self, T: Tensor, state: ContourState) -> Tensor:
         """(M, 6, 6) of finished world poses, from those of each photograph: its contours', or that
@@ -448,24 +443,23 @@ class Rig:
         angle = torch.rad2deg((side @ side.T).clamp(-1.0, 1.0).acos())
         return 1.0 / (1.0 - angle / SAME_DIRECTION).clamp(min=0.0).fill_diagonal_(1.0).sum(dim=1)
 
-    def evidence(self, T: Tensor, support: Tensor) -> Tensor:
-        """(V, M, F) :data:`POSE_FEATURES` of world poses with edge supports (V, M); details in
-        comparison with the first."""
+    def evidence(self, T: Tensor, support: Tensor) -> Evidence:
+        """(V, M) of world poses with edge supports (V, M); details in comparison with the first."""
         parts = []
-        for photograph in self.photographs:
+        ranks = self.ranks(T)
+        for v, photograph in enumerate(self.photographs):
             R, distance = self.allocentric(photograph, T)
-            given = photograph.query, photograph.descriptor, photograph.result.ranking
-            similarity, appearance = compare_with_photograph(self.target, *given, R, distance)
-            landmarks = torch.zeros_like(similarity)
-            if photograph.landmarks is not None:
-                landmarks = landmark_evidence(photograph.landmarks.agreeing(photograph.camera @ T))
-            parts.append(
-                torch.stack([similarity, appearance, landmarks, self.details(photograph, T)])
+            cameras = photograph.K.expand(len(T), 3, 3)
+            view = torch.zeros(len(T), dtype=torch.long)
+            poses = replace(
+                Poses.at(photograph.camera @ T, cameras, self.describer.centre, view, ranks[v]),
+                rotation=R,
+                distance=distance,
+                edge_support=support[v],
             )
-        similarity, appearance, landmarks, details = torch.stack(parts, dim=1)
-        return torch.stack(
-            [self.ranks(T), similarity, support, appearance, landmarks, details], dim=-1
-        )
+            evidence = evidence_of(self.target, photograph, poses)
+            parts.append(replace(evidence, details=self.details(photograph, T)))
+        return Evidence.stack(parts)
 
     def details(self, photograph: RigPhotograph, T: Tensor) -> Tensor:
         """(M,) how much the details of world poses (M, 4, 4) are better than those of the first in
@@ -477,16 +471,11 @@ class Rig:
         )
         return scores[:, 0]
 
-    def scores(self, evidence: Tensor) -> Tensor:
-        """(V, M) of (V, M, F)."""
-        return evidence @ torch.tensor(
-            SCORE_WEIGHTS if self.exact else RANK_ALONE, dtype=torch.float64
-        )
-
     def lost(self, answer: Answer) -> dict[int, str]:
         """Why photographs do not show the best pose, by their index; {} if none shows it."""
         reasons: dict[int, str] = {}
-        pairs = answer.evidence[:, 0, 1:3].tolist()
+        best = answer.evidence[:, 0]
+        pairs = list(zip(best.similarity.tolist(), best.edge_support.tolist(), strict=True))
         sees = [bool(p.sees(self.describer.hull, answer.T[:1])) for p in self.photographs]
         found = [
             refinement_confidence({"similarity": similarity, "edge_support": support})
@@ -497,30 +486,30 @@ class Rig:
         for v, photograph in enumerate(self.photographs):
             if not sees[v]:
                 reasons[photograph.index] = ELSEWHERE
-            elif found[v] < LOST_CONFIDENCE * max(found):
+            elif found[v] < self.target.pipeline.fit.lost_confidence * max(found):
                 numbers = "similarity {:.2f}, edge support {:.2f}".format(*pairs[v])
                 reasons[photograph.index] = (
                     f"the object is not seen where the other photographs have it ({numbers})"
                 )
         return reasons if len(reasons) < len(self.photographs) else {}
 
-    def hypothesis(self, answer: Answer, m: int, evidence: Tensor) -> Hypothesis:
-        """World pose ``m`` with its mean evidence, as it is reported."""
+    def hypothesis(self, answer: Answer, m: int, mean: Evidence) -> Hypothesis:
+        """World pose ``m`` as it is reported, with ``mean`` evidence of the photographs."""
         first = self.photographs[0]
         T = answer.T[m]
         C = answer.covariance[m]
         (R,), (distance,) = self.allocentric(first, T[None])
-        features = dict(zip(POSE_FEATURES, evidence.tolist(), strict=True))
+        evidence = mean.named(m)
         return Hypothesis(
             rotation=T[:3, :3].clone(),
             translation=T[:3, 3].clone(),
-            score=features["similarity"],
-            evidence=features,
+            score=evidence["similarity"],
+            evidence=evidence,
             allocentric_rotation=R,
             distance=float(distance),
             projection=(first.camera @ T, first.K),
             view=nearest_view(self.target, R),
-            edge_support=features["edge_support"],
+            edge_support=evidence["edge_support"],
             covariance=C.clone() if bool(C.isfinite().all()) else None,
         )
 

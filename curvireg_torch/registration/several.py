@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..evidence import Evidence
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -155,18 +156,16 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
     reasons = {i: one.message for i, one in found.items() if isinstance(one, CurviregError)}
     rig = every = Rig.of(target, found)
     answer = rig.answer()
-    compared = dict(zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True))
+    compared = _evidence_of_best(rig, answer)
     if lost := rig.lost(answer):
         reasons |= lost
         rig = Rig(target, [p for p in rig.photographs if p.index not in lost])
         answer = rig.answer()
-        compared |= dict(
-            zip([p.index for p in rig.photographs], answer.evidence[:, 0], strict=True)
-        )
+        compared |= _evidence_of_best(rig, answer)
     first = rig.photographs[0]
     weights = rig.weights(answer.T[0])
     total = weights @ answer.scores
-    mean = torch.einsum("v,vmk->mk", weights / weights.sum(), answer.evidence)
+    mean = answer.evidence.mean(weights)
     features = _joint_features(rig, mean, total, weights, answer)
     # the hypotheses of all photographs led to the same pose
     if len(total) == 1 and len(rig.photographs) > 1:
@@ -195,11 +194,12 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
             camera @ answer.T[0], failure=reasons.get(i), contribution=contributions.get(i, 0.0)
         )
         if isinstance(one := found[i], RigPhotograph):
-            _, similarity, support, *_ = compared[i].tolist()
+            similarity = compared[i]["similarity"]
+            support = compared[i]["edge_support"]
             view = replace(view, box=one.box, similarity=similarity, edge_support=support)
         views.append(view)
     return Registration(
-        hypotheses=tuple(rig.hypothesis(answer, m, mean[m]) for m in range(min(count, len(total)))),
+        hypotheses=tuple(rig.hypothesis(answer, m, mean) for m in range(min(count, len(total)))),
         probabilities=probabilities[:count],
         ranking=first.result.ranking,
         confidence_features=features,
@@ -208,13 +208,20 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
         ),
         notes=first.result.notes,
         views=tuple(views),
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 
+def _evidence_of_best(rig: Rig, answer: Answer) -> dict[int, dict[str, float]]:
+    """What speaks for the best pose in each photograph, by the photograph's index."""
+    best = answer.evidence[:, 0]
+    return {photograph.index: best.named(v) for v, photograph in enumerate(rig.photographs)}
+
+
 def _joint_features(
-    rig: Rig, mean: Tensor, total: Tensor, weights: Tensor, answer: Answer
+    rig: Rig, mean: Evidence, total: Tensor, weights: Tensor, answer: Answer
 ) -> dict[str, float | None]:
-    """:func:`.confidence_features` of the joint pose: ``mean`` (M, F) evidence, ``total`` (M,)
+    """:func:`.confidence_features` of the joint pose: ``mean`` evidence of M poses, ``total`` (M,)
     scores."""
     measured = [p.result.confidence_features for p in rig.photographs]
     known = [

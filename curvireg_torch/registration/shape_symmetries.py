@@ -1,5 +1,7 @@
 """Symmetries of a mesh's shape that a small feature of it breaks."""
 
+from dataclasses import dataclass
+
 import torch
 import trimesh
 from torch import Tensor
@@ -10,14 +12,35 @@ from ..mesh.symmetry import FEATURE_FRACTION, feature_fractions
 # Symmetries that are compared, the identity among them: every 30 degrees of a body of revolution
 MAX_SIBLINGS = 12
 
+NOTABLE_FRACTION = 0.01
+"""Fraction of the surface from which a feature matters: poses that it tells apart are different
+answers, also where a photograph does not show it. The pull tab of a can has half of it."""
 
-def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> Tensor:
-    """(K, 4, 4) those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from
-    the identity, which is the first; at most ``MAX_SIBLINGS``, far from each other."""
+
+@dataclass(frozen=True)
+class TellingSymmetries:
+    """Symmetries of a mesh's shape that a small feature tells from the identity.
+
+    Attributes:
+        transforms: (K, 4, 4), the identity first.
+        notable: whether the feature has ``NOTABLE_FRACTION`` of the surface.
+    """
+
+    transforms: Tensor
+    notable: bool = False
+
+    def __len__(self) -> int:
+        return len(self.transforms)
+
+
+def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> TellingSymmetries:
+    """Those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the
+    identity; at most ``MAX_SIBLINGS``, far from each other."""
     chosen = spread(symmetries)
-    telling = feature_fractions(mesh, chosen) > FEATURE_FRACTION
+    fractions = feature_fractions(mesh, chosen)
+    telling = fractions > FEATURE_FRACTION
     telling[0] = True
-    return chosen[telling]
+    return TellingSymmetries(chosen[telling], bool(fractions.max() >= NOTABLE_FRACTION))
 
 
 def spread(symmetries: Tensor) -> Tensor:

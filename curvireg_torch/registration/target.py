@@ -11,14 +11,15 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..fitting.landmarks import LandmarkMatches, Landmarks
+from ..evidence import RANK_ALONE, EvidenceWeights
+from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
 from .inputs import ImageItem
-from .shape_symmetries import telling_symmetries
+from .shape_symmetries import TellingSymmetries, telling_symmetries
 
 # Thickness of a mesh, as a fraction of its radius, below which it counts as flat
 FLAT_EXTENT = 1e-3
@@ -68,24 +69,28 @@ class Target:
         with _SHAPE_LOCK:  # photographs share them
             return None if has_colours(self.bank.mesh) else mesh_symmetries(self.bank.mesh)
 
+    def score_weights(self, *, exact: bool) -> EvidenceWeights:
+        """What evidence counts for with an exact mesh, or with a similar one."""
+        return self.pipeline.fit.weights if exact else RANK_ALONE
+
     @cached_property
-    def telling_symmetries(self) -> Tensor:
-        """(K, 4, 4) symmetries of the shape of an exact mesh whose poses are compared; the identity
-        alone if they are given, and trusted."""
+    def telling_symmetries(self) -> TellingSymmetries:
+        """Symmetries of the shape of an exact mesh whose poses are compared; the identity alone if
+        they are given, and trusted."""
         symmetries = self.symmetries_of(exact=True)
         if self.symmetries is not None or symmetries is None:
-            return torch.eye(4, dtype=torch.float64)[None]
+            return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
         return telling_symmetries(self.bank.mesh, symmetries)
 
     @property
-    def uses_landmarks(self) -> bool:
-        """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
+    def uses_keypoints(self) -> bool:
+        """Whether keypoints give starts and evidence: with an exact mesh and the contour fit."""
         return self.is_exact and self.pipeline.contours
 
-    def landmark_matches(
+    def keypoint_matches(
         self, item: ImageItem, box: Tensor | None = None
-    ) -> LandmarkMatches | None:
-        """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
+    ) -> KeypointMatches | None:
+        """Keypoints of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
         colours or a camera matrix.
 
         :meta private:
@@ -93,12 +98,12 @@ class Target:
         if not self.describer.draws_colours or item.camera_matrix is None:
             return None
         with _SHAPE_LOCK:  # photographs share them
-            landmarks = self._landmarks
-        return landmarks.matches(item.image, item.camera_matrix, box)
+            keypoints = self._keypoints
+        return keypoints.matches(item.image, item.camera_matrix, box)
 
     @cached_property
-    def _landmarks(self) -> Landmarks:
-        return Landmarks(self.describer)
+    def _keypoints(self) -> Keypoints:
+        return Keypoints(self.describer, least=self.pipeline.fit.min_keypoints)
 
     @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:

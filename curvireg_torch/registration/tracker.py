@@ -26,7 +26,7 @@ from ..fitting.least_squares import (
 from ..fitting.regions import RegionModel, line_posterior
 from ..fitting.texture_fit import surface_corners
 from ..geometry import rotation_error
-from ..geometry.cameras import projected_boxes, transform
+from ..geometry.cameras import point_in_cameras, pose_around, projected_boxes
 from ..rendering import DepthRenderer
 from ..rendering.contours import MeshContours
 from .confidence import RELIABLE, tracking_confidence
@@ -104,10 +104,18 @@ class Tracker:
     was seen from the most similar direction.
 
     A pose that is found counts as known, to predict and to learn colours from, only after
-    :meth:`accept`.
+    :meth:`accept`. One of confidence ``reliable`` is convincing.
     """
 
-    def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
+    def __init__(
+        self,
+        renderer: DepthRenderer,
+        contours: MeshContours,
+        hull: Tensor,
+        *,
+        reliable: float = RELIABLE,
+    ) -> None:
+        self.reliable = reliable
         self.renderer = renderer
         self.contours = contours
         self.hull = hull.double()
@@ -143,7 +151,7 @@ class Tracker:
             # pixels beside a wrong prediction may be unusable
             with suppress(LostObjectError, ImageError):
                 found.append(self._fit(image, K, T))
-                if found[-1].confidence >= RELIABLE:
+                if found[-1].confidence >= self.reliable:
                     break
         if not found:
             raise LostObjectError("the object has left the photograph")
@@ -175,11 +183,10 @@ class Tracker:
         the last pose."""
         if len(self._poses) < 2:
             return [self.last_pose]
-        (R0, c0), (R1, c1) = (
-            (T[:, :3, :3], T[:, :3, :3] @ self.centre + T[:, :3, 3]) for T in self._poses
-        )
-        R = R1 @ R0.mT @ R1
-        return [transform(R, 2.0 * c1 - c0 - R @ self.centre), self.last_pose]
+        before, last = self._poses
+        R = last[:, :3, :3] @ before[:, :3, :3].mT @ last[:, :3, :3]
+        place = 2.0 * point_in_cameras(last, self.centre) - point_in_cameras(before, self.centre)
+        return [pose_around(R, place, self.centre), self.last_pose]
 
     def _fit(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose around a start (1, 4, 4)."""

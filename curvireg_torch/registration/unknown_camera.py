@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import USUAL_DEVIATION
+from .described import evidence_of
 from .focal import (
     FITTED,
     TRIED_VIEWS,
@@ -20,10 +22,11 @@ from .focal import (
     with_focal_length,
 )
 from .inputs import ImageItem
-from .poses import Poses, best_views, pose_scores
+from .poses import Poses, best_views
 from .priors import Limits
+from .refits import best_inside, scores_inside
 from .target import Target
-from .work import Work, features_of, least_starts, poses_of_views, with_replaced
+from .work import Work, least_starts, poses_of_views, with_replaced
 
 SAME_SCORE = 0.2
 """Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge
@@ -61,12 +64,18 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
             seen = replace(work, item=replace(item, camera_matrix=camera))
             poses = poses_of_views(target, seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(target.describer, work.crops, of_cameras, least_starts(target))
+        starts = starts_of_fields(
+            target.describer,
+            work.crops,
+            of_cameras,
+            least_starts(target),
+            screening_weight=target.pipeline.fit.screening_weight,
+        )
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, target.bank)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
+    keypoints = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+    return replace(work, item=item, limits=limits, keypoints=keypoints, starts=starts)
 
 
 def with_fitted_focal_lengths(
@@ -74,21 +83,22 @@ def with_fitted_focal_lengths(
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     outside: Tensor,
-) -> tuple[Poses, Tensor]:
+) -> tuple[Poses, Evidence]:
     """The best poses fitted together with their focal lengths, where that does not lower their
     scores noticeably: where perspective tells nothing, a usual focal length is better than one of
     those tried."""
-    scores = pose_scores(features, exact=True).masked_fill(outside, -torch.inf)
+    scores = scores_inside(target, evidence, outside)
     count = FITTED if work.starts is not None else 1
+    weights = target.score_weights(exact=True)
     best = scores.topk(min(count, int((~outside).sum()))).indices
     for index in best.split(1):
         fitted = with_focal_length(target.describer, crops, poses[index], work.item)
-        new = features_of(target, work, fitted)
-        if bool(pose_scores(new, exact=True) >= scores[index] - SAME_SCORE):
-            poses, features = with_replaced(work, poses, features, index, fitted, new)
-    return poses, features
+        new = evidence_of(target, work, fitted)
+        if bool(new.scores(weights) >= scores[index] - SAME_SCORE):
+            poses, evidence = with_replaced(work, poses, evidence, index, fitted, new)
+    return poses, evidence
 
 
 def with_focal_deviation(
@@ -96,12 +106,12 @@ def with_focal_deviation(
     work: Work,
     crops: EdgeCrops,
     poses: Poses,
-    features: Tensor,
+    evidence: Evidence,
     outside: Tensor,
 ) -> tuple[Work, Poses]:
     """The photograph with the camera of the best pose and what is known of its focal length, and
     the poses with the covariance that follows; the others have none."""
-    best = pose_scores(features, exact=True).masked_fill(outside, -torch.inf).argmax()[None]
+    best = best_inside(target, evidence, outside)
     covariance, deviation = focal_covariance(target.describer, crops, poses[best], work.item)
     unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
     item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)

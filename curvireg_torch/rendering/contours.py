@@ -1,8 +1,8 @@
 """Contours of a mesh at poses, from its edges and a few hundred rays instead of a rendered
 picture."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
+from ..utils.rows import Rows
 from .embree import RayScene, float32
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
@@ -39,7 +40,7 @@ BEHIND = 16  # Bit of a vertex nearer than that
 
 
 @dataclass(frozen=True)
-class ContourPoints:
+class ContourPoints(Rows):
     """Points (N, P, 3) on the contours of N views, float64 in model units, with unit ``normals``
     (N, P, 2) across the contour in the image; False in ``valid`` (N, P) marks padding. ``outline``
     (N, P) marks points with the background beside them. Normals of occluding contours point
@@ -50,14 +51,24 @@ class ContourPoints:
     valid: Tensor
     outline: Tensor
 
-    def __getitem__(self, index: Tensor) -> "ContourPoints":
-        return ContourPoints(*(getattr(self, f.name)[index] for f in fields(ContourPoints)))
 
-    @staticmethod
-    def cat(parts: Sequence["ContourPoints"]) -> "ContourPoints":
-        return ContourPoints(
-            *(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(ContourPoints))
-        )
+class Contours(Protocol):
+    """Contours of a mesh at any pose: :class:`MeshContours`, and :class:`.DeviceContours`.
+
+    Attributes:
+        device: of its tensors.
+        centre, radius: of the object, (3,) and model units.
+    """
+
+    device: torch.device
+    centre: Tensor
+    radius: float
+
+    def points(
+        self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
+    ) -> ContourPoints:
+        """See :meth:`MeshContours.points`."""
+        ...
 
 
 class _Level:
@@ -239,6 +250,8 @@ class MeshContours:
         [1.0, 1.0, 1.0]
     """
 
+    device = torch.device("cpu")
+
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
@@ -250,6 +263,12 @@ class MeshContours:
                 level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False
             )
 
+    def level_of(self, size: int) -> tuple[int, _Level]:
+        """The largest crop that the simplified mesh for crops of ``size`` px serves, and this
+        mesh."""
+        limit = next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])
+        return limit, self._levels[limit]
+
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
     ) -> ContourPoints:
@@ -257,7 +276,7 @@ class MeshContours:
         3); float64, CPU. ``density`` is a fraction of the usual number of points."""
         T = T_cam_from_model.numpy()
         K = camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
-        level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
+        _, level = self.level_of(size)
         edges = level.edges
         R = T[:, :3, :3]
         position = R @ self.centre.numpy() + T[:, :3, 3]

@@ -79,13 +79,14 @@ class Session:
     def load(self) -> None:
         """Open the files that the options name, and take their box."""
         options = self.options
-        if options.box is not None and not options.photos:
+        given = "box" if options.boxes is None else "boxes"
+        if getattr(options, given) is not None and not options.photos:
             raise InvalidInputError(
-                "--box: needs a photograph; name one, or draw the box on the page"
+                f"--{given}: needs a photograph; name one, or draw the box on the page"
             )
-        self.options = replace(options, photos=(), meshes=(), box=None)
+        self.options = replace(options, photos=(), meshes=(), box=None, boxes=None, box_format=None)
         for path in options.photos:
-            self.open_photo(path, options.box)
+            self.open_photo(path, options.box_of(path))
         for path in options.meshes:
             self.open_mesh(path)
 

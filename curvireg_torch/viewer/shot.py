@@ -13,7 +13,7 @@ from torch import Tensor
 from ..data.images import Photo
 from ..errors import InvalidInputError
 from ..geometry import rotation_error, rotation_from_axis_angle
-from ..geometry.cameras import rotation_towards
+from ..geometry.cameras import point_in_cameras, pose_around, rotation_towards
 from ..jobs.options import RegisterOptions
 from ..jobs.result_files import views_glb, views_picture
 from ..jobs.views import View
@@ -86,7 +86,7 @@ class Result:
 
     def centre(self, T: Tensor) -> Tensor:
         """(3,) of the object in the camera, at a (4, 4) pose."""
-        return T[:3, :3] @ self.registrar.describer.centre + T[:3, 3]
+        return point_in_cameras(T, self.registrar.describer.centre)
 
     def moved(
         self,
@@ -106,10 +106,8 @@ class Result:
         centre = self.centre(T) + describer.radius * shift
         if float(centre[2]) < NEAREST * describer.radius:
             raise InvalidInputError("the object would touch the camera; move it away")
-        T = T.clone()
-        T[:3, :3] = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
-        T[:3, 3] = centre - T[:3, :3] @ describer.centre
-        return T
+        R = rotation_from_axis_angle(torch.deg2rad(angles)) @ T[:3, :3]
+        return pose_around(R, centre, describer.centre)
 
     def dragged(self, T: Tensor, K: Tensor, start: Point, end: Point, *, turns: bool) -> Tensor:
         """Return the pose after a drag: the object's centre follows the mouse or, if it ``turns``,

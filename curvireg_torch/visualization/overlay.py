@@ -49,6 +49,16 @@ def contour_overlay(
 
     Returns:
         (H, W, 3) uint8 RGB.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> contour_overlay(registrar, result, scene.image, scene.box).shape
+        (720, 960, 3)
     """
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
@@ -105,7 +115,18 @@ def side_pictures(
     registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
 ) -> dict[str, np.ndarray]:
     """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
-    :func:`contour_overlay`."""
+    :func:`contour_overlay`.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> sorted(side_pictures(registrar, result, scene.image, scene.box))
+        ['photograph', 'photograph field', 'pose', 'view field']
+    """
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions(
@@ -140,6 +161,16 @@ def registration_sheet(
 
     Returns:
         (H', W', 3) uint8 RGB.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> registration_sheet(registrar, result, scene.image, scene.box).shape[1]
+        960
     """
     item = image_item(image, as_numbers(box, "box"))
     registrar = registrar.of_model(result.model)

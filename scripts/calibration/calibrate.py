@@ -11,7 +11,7 @@ WORK/*.jsonl, of which finished rows are kept, and fits. Everything depends on t
 alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
 scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object,
 so every measure is of kinds that the fit has not seen. --write stores the constants in
-curvireg_torch/registration/calibration.json and their quality in scripts/results/calibration.json.
+curvireg_torch/calibration/calibration.json and their quality in scripts/results/calibration.json.
 """
 
 import argparse
@@ -38,6 +38,7 @@ from tqdm import tqdm
 import curvireg_torch as cr
 from curvireg_torch.data import BOPDataset
 from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.registration import Follower
@@ -48,12 +49,11 @@ from curvireg_torch.registration.confidence import (
     LogisticModel,
 )
 from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
-from curvireg_torch.registration.poses import POSE_FEATURES, RANK_ALONE, SCORE_WEIGHTS
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
 Row: TypeAlias = dict[str, Any]
 
-CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
+CONSTANTS = REPOSITORY / "curvireg_torch" / "calibration" / "calibration.json"
 FURNITURE = ("--kind", "furniture", "--bare", "0.2")
 SHAPES = ("--kind", "shapes")
 PRINTED = ("--kind", "printed")
@@ -187,13 +187,16 @@ def render_sets(
 
 def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
     """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
-    that an exact mesh without colours has for the registrar."""
+    that an exact mesh without colours has for the registrar, unless a notable feature of it tells
+    them apart."""
     listed = sample["model_info"].get("symmetries_discrete", [])
     known = [
         torch.eye(3).double()[None],
         *(torch.tensor(values).view(1, 4, 4)[:, :3, :3].double() for values in listed),
     ]
-    found = None if registrar is None else registrar.symmetries_of(exact=True)
+    found = None
+    if registrar is not None and not registrar.telling_symmetries.notable:
+        found = registrar.symmetries_of(exact=True)
     return torch.cat(known if found is None else [*known, found[:, :3, :3].double()])
 
 
@@ -232,13 +235,11 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         seen = sample | {
             "rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()
         }
-    evidence = torch.tensor(
-        [[h.evidence[name] for name in POSE_FEATURES] for h in result.hypotheses]
-    ).double()
-    weights = torch.tensor(SCORE_WEIGHTS if registrar.is_exact else RANK_ALONE, dtype=torch.float64)
-    row = {"features": dict(result.confidence_features), "scores": (evidence @ weights).tolist()}
+    evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
+    scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
+    row = {"features": dict(result.confidence_features), "scores": scores.tolist()}
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
-    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.tolist()}
+    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.table.tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
@@ -298,7 +299,7 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         lost = not result.ok and isinstance(result.error, LostObjectError)
         found = result.detection if result.ok else result.error.detection if lost else None
-        # not a number of landmarks
+        # not a number of keypoints
         if found is not None and not float(found.response).is_integer():
             query = registrar.matcher.query([shown["image"]], found.box[None].float())
             features = {

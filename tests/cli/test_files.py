@@ -17,8 +17,8 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.jobs import ros
 from curvireg_torch.jobs.outputs import MARKER
-from curvireg_torch.jobs.result_files import write_pose_stamped
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
 
@@ -73,25 +73,11 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     # For a mesh that is too large, none is written and an older one is removed.
     monkeypatch.setattr("curvireg_torch.jobs.result_files.MAX_GLB_FACES", 10)
     assert register(*words, "--format", "ros") == 0
-    assert {"pose.yaml"} == {"pose.glb", "pose.yaml"} & {
-        path.name for path in (tmp_path / "out").iterdir()
-    }
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names & {"pose.glb", *ros.FILES} >= {"pose.yaml", "tf.yaml"}
+    assert "pose.glb" not in names
     assert register(*words) == 0
-    assert not {"pose.glb", "pose.yaml"} & {path.name for path in (tmp_path / "out").iterdir()}
-
-
-def test_pose_for_ros_is_in_metres(tmp_path):
-    document = {
-        "translation": [1000.0, -2000.0, 500.0],
-        "quaternion": [0.5, 0.1, 0.2, 0.3],
-        "unit": "mm",
-        "frame": "camera",
-    }
-    write_pose_stamped(tmp_path / "pose.yaml", document)
-    text = (tmp_path / "pose.yaml").read_text()
-    assert "position: {x: 1, y: -2, z: 0.5}" in text
-    assert "orientation: {x: 0.1, y: 0.2, z: 0.3, w: 0.5}" in text
-    assert "frame_id: camera_optical_frame" in text
+    assert not {"pose.glb", *ros.FILES} & {path.name for path in (tmp_path / "out").iterdir()}
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

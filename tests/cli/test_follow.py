@@ -104,6 +104,34 @@ def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
     ]
 
 
+def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, tmp_path, monkeypatch):
+    scenes = frames[1]
+    boxes = []
+    call = Follower.__call__
+    monkeypatch.setattr(
+        Follower, "__call__", lambda self, image, box: boxes.append(box) or call(self, image, box)
+    )
+    x0, y0, x1, y1 = (
+        (v + 0.5) / side for v, side in zip(scenes[0][1], (240, 180) * 2, strict=True)
+    )
+    yolo = f"0 {(x0 + x1) / 2} {(y0 + y1) / 2} {x1 - x0} {y1 - y0}\n"
+    labels = tmp_path / "labels"
+    labels.mkdir()
+    (labels / "turn_1.txt").write_text(yolo)  # as ultralytics counts
+    (labels / "turn-000002.txt").write_text("0 0.5 0.5 0.5 0.5\n")
+    words = ["--camera", *CAMERA, "--boxes", labels, "--out", tmp_path / "out"]
+    assert follow(*words, source="turn.avi", box=False) == 0
+    assert boxes[0] == pytest.approx(scenes[0][1].tolist(), abs=1e-3)
+    assert boxes[1:] == [None, [59.5, 44.5, 179.5, 134.5]]
+    check_pose(table(tmp_path / "out")[0], scenes[0][2], 4.0, 0.04)
+    numbers = yolo.split()[1:]
+    more = ["--box", *numbers, "--box-format", "yolo", "--out", tmp_path / "more"]
+    boxes.clear()
+    assert follow("--camera", *CAMERA, *more, source="turn.avi", box=False) == 0
+    assert boxes[0] == pytest.approx(scenes[0][1].tolist(), abs=1e-3)
+    assert boxes[1:] == [None, None]
+
+
 @pytest.mark.parametrize("source", ["0", "rtsp://camera/stream"])
 def test_follow_live_drops_frames_that_are_late(frames, follow, tmp_path, monkeypatch, source):
     """A video file in the place of a camera, which delivers as fast as it can."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
+from curvireg_torch.jobs.ros import FILES
 from tests._support.lists import CAMERA, box_of, lines, table, written
 from tests._support.scenes import scene
 
@@ -73,7 +74,7 @@ def test_frames_are_in_the_order_of_their_numbers(folder, register, tmp_path):
     ]
 
 
-THEIRS = ("result.json", "overlay.png", "pose.glb", "pose.yaml")
+THEIRS = ("result.json", "overlay.png", "pose.glb", *FILES)
 LISTS = ("results.csv", "results.jsonl", "index.html")
 
 

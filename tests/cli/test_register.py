@@ -8,7 +8,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.register import _advice
+from curvireg_torch.cli.register import _advice, _print_rivals
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
@@ -314,3 +314,26 @@ def test_advice_names_what_was_measured_or_says_less():
         ({"confidence_features": {"border": 0, "undetermined": 1.2}}, "rotation open"),
     ):
         assert words in _advice({**document, **change})
+
+
+def test_rivals_and_hidden_features_are_named(capsys):
+    viewpoint = {"azimuth": 30.0, "elevation": 10.0, "theta": 0.0}
+    tied = {
+        "ambiguous": "half turn",
+        "confidence": 0.45,
+        "no_match_probability": 0.1,
+        "hypotheses": [{"viewpoint": viewpoint}] * 3,
+        "probabilities": [0.45, 0.44, 0.01],
+    }
+    _print_rivals(tied)
+    printed = capsys.readouterr().out
+    assert printed.count("could also be") == 1
+    assert "flipped by 180 degrees" in printed
+    certain = {"confidence": 0.95, "probabilities": [0.95, 0.01, 0.01]}
+    _print_rivals(tied | certain | {"ambiguous": "several"})
+    printed = capsys.readouterr().out
+    assert (
+        printed == "right up to turns that only a small feature tells apart, which is not in view\n"
+    )
+    _print_rivals(tied | {"ambiguous": None})
+    assert capsys.readouterr().out == ""

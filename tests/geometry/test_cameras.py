@@ -5,6 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from curvireg_torch import geometry as g
+from curvireg_torch.geometry.cameras import point_in_cameras, pose_around
 from curvireg_torch.mesh import mesh_centre, mesh_radius
 from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.synthetic import example_mesh
@@ -55,3 +56,14 @@ def test_pose_from_box_keeps_the_object_in_front_of_the_camera() -> None:
     assert float(straight[2]) == pytest.approx(nearest, rel=1e-6)
     rotated = g.rotation_from_viewpoint(20.0, 30.0, 10.0).double()
     assert float(g.pose_from_box(cube, rotated, box, K)[1][2]) > nearest - 1e-6
+
+
+def test_a_pose_around_a_point_has_it_at_the_place():
+    R = g.rotation_from_viewpoint(torch.tensor([30.0, 80.0]).double(), 20.0, 5.0)
+    point = torch.tensor([0.3, -0.2, 0.5]).double()
+    places = torch.tensor([[0.1, 0.2, 3.0], [-0.4, 0.0, 5.0]]).double()
+    T = pose_around(R, places, point)
+    torch.testing.assert_close(point_in_cameras(T, point), places)
+    torch.testing.assert_close(point_in_cameras(T[1], point), places[1])
+    homogeneous = torch.cat([point, torch.ones(1).double()])
+    torch.testing.assert_close((T @ homogeneous)[:, :3], places)

@@ -15,6 +15,7 @@ from curvireg_torch.geometry import (
     uniform_views,
     up_rotation,
 )
+from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
 
 
@@ -48,6 +49,18 @@ def test_viewpoint_from_rotation_is_accurate_in_float32_near_the_poles(
     back = g.rotation_from_viewpoint(*g.viewpoint_from_rotation(rounded))
     assert back.shape == rounded.shape
     assert math.radians(float(g.rotation_error(back.double(), rounded.double()).max())) < 5e-5
+
+
+def test_angles_of_all_pairs_are_those_of_the_nearest_symmetry() -> None:
+    R = torch.from_numpy(Rotation.random(5, random_state=1).as_matrix())
+    others = torch.from_numpy(Rotation.random(7, random_state=2).as_matrix())
+    group = torch.from_numpy(Rotation.create_group("C4").as_matrix())
+    plain = rotation_error(R[:, None], others[None])
+    torch.testing.assert_close(angles_between(R, others), plain)
+    nearest = rotation_error(R[:, None, None] @ group, others[None, :, None]).amin(dim=2)
+    torch.testing.assert_close(angles_between(R, others, group), nearest)
+    transforms = g.transform(group, torch.ones(4, 3).double())
+    torch.testing.assert_close(angles_between(R, others, transforms), nearest)
 
 
 def test_rotation_error_agrees_with_scipy() -> None:

@@ -132,6 +132,29 @@ def test_matcher_ranks_on_a_gpu_and_back(small_bank: ViewBank) -> None:
     torch.testing.assert_close(scores(matcher.to("cpu")), expected, atol=1e-3, rtol=0.0)
 
 
+@pytest.mark.cuda
+def test_matcher_on_a_gpu_refuses_half_and_ignores_autocast(small_bank: ViewBank) -> None:
+    matcher = ViewMatcher(small_bank).to("cuda")
+    expected = scores(matcher)
+    with pytest.raises(InvalidInputError, match="float32"):
+        matcher.half()
+    with torch.autocast("cuda", dtype=torch.float16):
+        torch.testing.assert_close(scores(matcher), expected, atol=1e-4, rtol=0.0)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize(
+    "copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))]
+)
+def test_copies_of_a_matcher_stay_on_the_gpu(
+    small_bank: ViewBank, copied: Callable[[ViewMatcher], ViewMatcher]
+) -> None:
+    matcher = ViewMatcher(small_bank).to("cuda")
+    other = copied(matcher)
+    assert other.bank.device.type == "cuda"
+    torch.testing.assert_close(scores(other), scores(matcher), atol=1e-4, rtol=0.0)
+
+
 @pytest.mark.parametrize(
     "copied", [copy.deepcopy, lambda matcher: pickle.loads(pickle.dumps(matcher))]
 )

@@ -7,12 +7,12 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
+from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_support
 from curvireg_torch.mesh import mesh_symmetries
-from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
-from curvireg_torch.registration.poses import RANK_ALONE, SCORE_WEIGHTS
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import (
     CAMERA,
@@ -92,6 +92,7 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
         "similarity": 0.7,
         "margin": 0.0,
         "edge_support": 0.5,
+        "contours": 0.4,
         "concentration": 0.3,
         "landmarks": 1.0,
     }
@@ -104,19 +105,22 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
 
 
 def test_confidence_features():
-    evidence = torch.tensor(
-        [
-            [0.0, 0.7, 0.4, 1.0, 2.0, 0.5],
-            [-1.0, 0.6, 0.5, 0.4, 0.0, 0.0],
-            [-2.0, 0.5, 0.1, 0.8, 3.0, 0.0],
-        ]
-    ).double()
+    evidence = Evidence(
+        rank=torch.tensor([0.0, -1.0, -2.0]).double(),
+        similarity=torch.tensor([0.7, 0.6, 0.5]).double(),
+        edge_support=torch.tensor([0.4, 0.5, 0.1]).double(),
+        appearance=torch.tensor([1.0, 0.4, 0.8]).double(),
+        landmarks=torch.tensor([2.0, 0.0, 3.0]).double(),
+        details=torch.tensor([0.5, 0.0, 0.0]).double(),
+        contours=torch.tensor([0.9, 0.8, 1.0]).double(),
+    )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
     expected = {
         "similarity": 0.7,
         "margin": 2.5,
         "edge_support": 0.4,
+        "contours": 0.9,
         "concentration": 0.3,
         "landmarks": 2.0,
         **doubts,
@@ -152,6 +156,9 @@ def test_only_the_default_pipeline_is_calibrated():
         (replace(Pipeline(), contours=False), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
+        (replace(Pipeline(), fit=FitSettings(reliable=0.5)), True),
+        (replace(Pipeline(), fit=FitSettings(screened_views=20)), False),
+        (replace(Pipeline(), fit=FitSettings(weights=EvidenceWeights(details=2.0))), False),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),
     ):
         assert confidence.is_calibrated(pipeline) == calibrated
@@ -180,10 +187,9 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     )
     result = registrar([image], box[None], camera)[0]
     any_right = confidence.probability_of_any(result.confidence_features, exact=camera is not None)
-    weights = SCORE_WEIGHTS if camera is not None else RANK_ALONE
+    weights = vars(registrar.score_weights(exact=camera is not None))
     scores = [
-        sum(w * v for w, v in zip(weights, h.evidence.values(), strict=True))
-        for h in result.hypotheses
+        sum(weights[name] * value for name, value in h.evidence.items()) for h in result.hypotheses
     ]
     expected = confidence.hypothesis_probabilities(
         any_right, torch.tensor(scores), exact=camera is not None

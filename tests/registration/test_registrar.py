@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import pytest
 import torch
-import torch.nn.functional as F
 import trimesh
 
 from curvireg_torch import (
@@ -17,15 +16,21 @@ from curvireg_torch import (
     sample_views,
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
-from curvireg_torch.fitting import contour_fit
+from curvireg_torch.evidence import Evidence
+from curvireg_torch.fitting import contour_fit, together
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.pipeline import PRESETS
-from curvireg_torch.registration import FailedRegistration, Follower, photograph, refits, work
-from curvireg_torch.registration import poses as poses_module
+from curvireg_torch.pipeline import PRESETS, FitSettings
+from curvireg_torch.registration import (
+    FailedRegistration,
+    Follower,
+    photograph,
+    refits,
+    work,
+)
+from curvireg_torch.registration import described as described_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.inputs import ImageItem, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
@@ -126,9 +131,9 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
     assert counts == [3, 1], "the best is fitted twice"
 
 
-@pytest.mark.parametrize("weight", [0.0, photograph.SCREENING_WEIGHT])
+@pytest.mark.parametrize("weight", [0.0, FitSettings().screening_weight])
 def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight):
-    registrar = truck_registrar()
+    registrar = truck_registrar(fit=FitSettings(screening_weight=weight))
     item = ImageItem(IMAGE, BOX, CAMERA)
     query = registrar.matcher.query([IMAGE], BOX[None])
     ranking = registrar.matcher.rank(query)
@@ -139,7 +144,6 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
     lowered = replace(
         ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True)
     )
-    monkeypatch.setattr(photograph, "SCREENING_WEIGHT", weight)
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
     result = photograph.register(registrar, item, query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == (weight > 0)
@@ -148,9 +152,9 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(monkeypatch, weight)
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    features = F.pad(similarity[:, None], (1, 4))
+    evidence = replace(Evidence.zeros(4), similarity=similarity)
     outside = torch.tensor([False, False, True, False])
-    assert refits.best_inside(features, outside).tolist() == [1]
+    assert refits.best_inside(truck_registrar(), evidence, outside).tolist() == [1]
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
@@ -163,22 +167,22 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
     quick_fit = contour_fit.quick_fit
     fits = []
     described = []
-    compare = work.compare_with_photograph
+    measure = Evidence.of
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return quick_fit(contours, crops, K, T, *index)
 
-    def compared(*given):
-        described.append(len(given[-1]))
-        return compare(*given)
+    def measured(seen):
+        described.append(len(seen.rank))
+        return measure(seen)
 
-    for module in (contour_fit, poses_module):
+    for module in (contour_fit, together):
         monkeypatch.setattr(module, "quick_fit", counted)
-    monkeypatch.setattr(work, "compare_with_photograph", compared)
+    monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
-    assert fits == [photograph.SCREENED_VIEWS, 1]
+    assert fits == [FitSettings().screened_views, 1]
     assert len(described) == calls
 
 
@@ -193,7 +197,13 @@ def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch,
         )
         return other if options.get("again") else fitted
 
+    def contours(compared):
+        mine = compared.poses.edge_support == support
+        return torch.where(mine, 2.0 * support, measure(compared))
+
+    measure = described_module.ComparedPoses.contours.fget
     monkeypatch.setattr(work, "fit_poses", pretended)
+    monkeypatch.setattr(described_module.ComparedPoses, "contours", property(contours))
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 
@@ -277,10 +287,11 @@ def test_registrar_uses_and_records_a_custom_field():
     assert registrar([IMAGE], BOX[None])[0].ranking.scores.equal(gradient.scores)
 
 
-@pytest.mark.parametrize("limit", [0.0, 1.01])
-def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
-    monkeypatch.setattr(result_module, "RELIABLE", limit)
-    registrar = learned_registrar()
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+def test_covariance_needs_a_reliable_result_and_a_camera(limit):
+    bank = learned_registrar().bank
+    pipeline = replace(bank.pipeline, fit=FitSettings(reliable=limit))
+    registrar = Registrar(bank, pipeline=pipeline)
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
     assert result.reliable == (limit == 0.0)
     assert (

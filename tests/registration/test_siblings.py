@@ -5,13 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
-from curvireg_torch.registration.poses import POSE_FEATURES, Poses
+from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.siblings import Siblings
 from tests._support.scenes import CAMERA
 
 
-def four(features: list[list[float]], compare: list[list[float]], angles: list[float]) -> Siblings:
+def four(similarity: list[float], compare: list[list[float]], angles: list[float]) -> Siblings:
     """Siblings turned about z by ``angles``, the first of which has the highest score; all look
     different from the others."""
     R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in angles])
@@ -20,18 +21,17 @@ def four(features: list[list[float]], compare: list[list[float]], angles: list[f
     rank = torch.zeros(len(T), dtype=torch.float64)
     poses = Poses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
     different = ~torch.eye(len(T), dtype=torch.bool)
-    rows = torch.tensor(features, dtype=torch.float64)
-    return Siblings(poses, rows, torch.tensor(compare, dtype=torch.float64), different)
+    details = torch.tensor(compare, dtype=torch.float64)
+    return Siblings(poses, evidence(*similarity), details, different, EvidenceWeights())
 
 
-def evidence(similarity: float) -> list[float]:
-    values = dict.fromkeys(POSE_FEATURES, 0.0)
-    values["similarity"] = similarity
-    return list(values.values())
+def evidence(*similarity: float) -> Evidence:
+    nothing = Evidence.zeros(len(similarity))
+    return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
-    rows = [evidence(s) for s in (0.80, 0.79, 0.70)]
+    rows = [0.80, 0.79, 0.70]
     equal = [[0.0] * 3] * 3
     assert four(rows, equal, [0, 90, 180]).best() == 0
     assert four(rows, [[0, 0, 0], [0.15, 0, 0], [0, 0, 0]], [0, 90, 180]).best() == 0
@@ -41,20 +41,31 @@ def test_a_sibling_is_better_by_its_score_and_by_details():
 
 
 def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
-    rows = [evidence(s) for s in (0.80, 0.79, 0.70, 0.60)]
+    rows = [0.80, 0.79, 0.70, 0.60]
     equal = [[0.0] * 4] * 4
     family = four(rows, equal, [0, 20, 100, 200])
-    fitted = torch.tensor([evidence(0.9)], dtype=torch.float64)
-    column = POSE_FEATURES.index("similarity")
-    poses, features = family.rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[2]), "the nearer one is no rival"
-    assert float(features[0, column]) == pytest.approx(0.8)
+    fitted = evidence(0.9)
+    rival = family.rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
+    assert float(rival.evidence.similarity) == pytest.approx(0.8)
+    assert not rival.feature_is_hidden
     alike = family.look_different.clone()
     alike[0, 2] = False
-    poses, features = replace(family, look_different=alike).rival(0, fitted)
-    assert torch.equal(poses.T[0], family.poses.T[3])
-    assert float(features[0, column]) == pytest.approx(0.7)
-    assert replace(family, look_different=torch.zeros(4, 4) > 0).rival(0, fitted) is None
+    rival = replace(family, look_different=alike).rival(0, fitted, notable=False)
+    assert torch.equal(rival.poses.T[0], family.poses.T[3])
+    assert float(rival.evidence.similarity) == pytest.approx(0.7)
+    assert rival.feature_is_hidden
     told = [[0.0] * 4, [0.0] * 4, [-0.5, 0, 0, 0], [-2.0, 0, 0, 0]]
-    _, features = four(rows, told, [0, 20, 100, 200]).rival(0, fitted)
-    assert float(features[0, POSE_FEATURES.index("details")]) == -0.5
+    rival = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
+    assert float(rival.evidence.details) == -0.5
+
+
+def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
+    family = four([0.80, 0.79, 0.70], [[0.0] * 3] * 3, [0, 20, 100])
+    family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
+    small = family.rival(0, evidence(0.9), notable=False)
+    assert len(small.poses) == len(small.evidence) == 0
+    assert small.feature_is_hidden
+    notable = family.rival(0, evidence(0.9), notable=True)
+    assert torch.equal(notable.poses.T[0], family.poses.T[2])
+    assert notable.feature_is_hidden

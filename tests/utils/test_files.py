@@ -1,6 +1,5 @@
 import csv
 import os
-import resource
 import signal
 import sys
 from pathlib import Path
@@ -38,6 +37,7 @@ def test_write_file_replaces_files_and_targets_of_links(tmp_path: Path) -> None:
 
 
 def test_write_file_keeps_the_old_content_if_writing_fails(path: Path) -> None:
+    resource = pytest.importorskip("resource", reason="limits of files are those of Unix")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:

@@ -290,6 +290,23 @@ def test_a_registrar_serves_requests_with_the_same_mesh_and_method(folder, monke
         assert session.open_registrar(changed, report) == (changed.pose, changed.meshes)
 
 
+def test_the_box_of_a_detector_is_on_the_page(folder):
+    (folder / "boxes.json").write_text('[{"image_id": "photo", "bbox": [60, 50, 80, 70]}]')
+    session = new_session("photo.png", "truck.ply", "--boxes", "boxes.json")
+    session.load()
+    assert session.shot.box == (59.5, 49.5, 139.5, 119.5)
+    assert session.request().boxes is None
+    assert "--boxes" not in session.command(), "the command names the numbers"
+    box = ["--box", "0.25", "0.25", "0.75", "0.5", "--box-format", "fractions"]
+    session = new_session("photo.png", "truck.ply", *box)
+    session.load()
+    assert session.shot.box == (59.5, 44.5, 179.5, 89.5)
+    assert session.request().box_format is None
+    session = new_session("--boxes", "boxes.json")
+    with pytest.raises(InvalidInputError, match="--boxes: needs a photograph"):
+        session.load()
+
+
 def test_distortion_is_removed_from_all_photographs(folder):
     K = torch.tensor([[500.0, 0, 239.5], [0, 500.0, 179.5], [0, 0, 1]])
     session = new_session("photo.png", "truck.ply", "--pipeline", "small.json")  # 240 x 180 px

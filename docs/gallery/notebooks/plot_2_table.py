@@ -3,8 +3,8 @@ A row for my table
 ==================
 
 You have a folder of photographs of one thing, and want a table: where it was seen from, and how
-sure that is. No camera is known, so there is no distance. The photographs are generated here; one
-of them is damaged, as in real folders.
+sure that is. No camera is known: it is estimated in each photograph. The photographs are generated
+here; one of them is damaged, as in real folders.
 """
 
 import csv

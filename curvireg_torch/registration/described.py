@@ -1,0 +1,134 @@
+"""A photograph as poses are compared with it, and the poses beside it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..evidence import Evidence
+from ..fitting.edges import EdgeCrops
+from ..fitting.keypoints import KeypointMatches
+from ..fitting.together import details_together, evidence_together
+from ..matching import Ranking
+from ..terms import Appearance, QueryFeatures
+from ..utils.company import by_key, compute_together
+from .poses import Poses
+from .target import Target
+
+
+@dataclass(frozen=True)
+class DescribedPhotograph:
+    """A photograph as poses are compared with it.
+
+    Attributes:
+        query: its box, described by the matcher.
+        ranking: of the views of the bank.
+        descriptor: (1, D) on a grid twice as fine as the bank's, or (H, D) if each pose has its own
+            box.
+        crops: of the box, for contour fits; None without them.
+        keypoints: those found in the box; None where they do not count.
+    """
+
+    query: QueryFeatures
+    ranking: Ranking
+    descriptor: Tensor
+    crops: EdgeCrops | None
+    keypoints: KeypointMatches | None
+
+
+@dataclass(frozen=True)
+class ComparedPoses:
+    """H ``poses`` beside a ``photograph``: a :class:`.SeenPoses`."""
+
+    target: Target
+    photograph: DescribedPhotograph
+    poses: Poses
+
+    @property
+    def rank(self) -> Tensor:
+        return self.poses.rank
+
+    @property
+    def edge_support(self) -> Tensor:
+        return self.poses.edge_support
+
+    @property
+    def similarity(self) -> Tensor:
+        views, _ = self._views
+        descriptor = self.photograph.descriptor
+        products = F.normalize(views, dim=1) * F.normalize(descriptor, dim=1)
+        return products.sum(dim=1).double().cpu()
+
+    @property
+    def appearance(self) -> Tensor:
+        _, features = self._views
+        if features is None:
+            return torch.zeros(len(self.poses), dtype=torch.float64)
+        photograph = self.photograph
+        return self.target.matcher.appearance_score(photograph.query, photograph.ranking, features)
+
+    @property
+    def keypoints(self) -> Tensor:
+        keypoints = self.photograph.keypoints
+        if keypoints is None:
+            return torch.zeros(len(self.poses), dtype=torch.float64)
+        count = keypoints.agreeing(self.poses.T, self.poses.cameras)
+        return (count - self.target.pipeline.fit.chance_keypoints).clamp(min=0.0)
+
+    @property
+    def contours(self) -> Tensor:
+        crops = self.photograph.crops
+        poses = self.poses
+        if crops is None:
+            return torch.zeros(len(poses), dtype=torch.float64)
+        contours = self.target.describer.device_contours
+        return evidence_together(contours, crops, poses.cameras, poses.T, poses.crop_index)
+
+    @cached_property
+    def _views(self) -> tuple[Tensor, Tensor | None]:
+        """(H, D) descriptors of the poses' views, and the features (H, F) of their pictures where
+        the appearance counts."""
+        return compute_together(_views_of, self)
+
+    @property
+    def views_key(self) -> tuple[int, bool]:
+        """What poses have in common whose views are drawn together."""
+        return id(self.target.describer), Appearance.name in self.photograph.ranking.terms
+
+
+def _views_of(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
+    return by_key(requests, lambda request: request.views_key, _views_of_one_mesh)
+
+
+def _views_of_one_mesh(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
+    target = requests[0].target
+    counts = [len(request.poses) for request in requests]
+    rotation = torch.cat([request.poses.rotation for request in requests])
+    distance = torch.cat([request.poses.distance for request in requests])
+    if Appearance.name not in requests[0].photograph.ranking.terms:
+        views = target.describer.descriptors(rotation, distance)
+        return [(part, None) for part in views.split(counts)]
+    views, pictures = target.describer.described(rotation, distance)
+    features = target.matcher.appearance_of(pictures)
+    return list(zip(views.split(counts), features.split(counts), strict=True))
+
+
+def evidence_of(target: Target, photograph: DescribedPhotograph, poses: Poses) -> Evidence:
+    """The evidence of poses in a photograph, without details."""
+    return Evidence.of(ComparedPoses(target, photograph, poses))
+
+
+def with_details(
+    target: Target, crops: EdgeCrops, poses: Poses, evidence: Evidence, best: int, rivals: Tensor
+) -> Evidence:
+    """The evidence of poses, ``rivals`` (R,) of which are compared in detail with the ``best``."""
+    index = torch.cat([torch.tensor([best]), rivals])
+    some = poses[index]
+    contours = target.describer.device_contours
+    scores, _ = details_together(contours, crops, some.cameras, some.T, some.crop_index)
+    details = evidence.details.clone()
+    details[rivals] = details[best] + scores[1:, 0].to(details)
+    return replace(evidence, details=details)

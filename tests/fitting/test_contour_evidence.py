@@ -1,0 +1,103 @@
+"""Contours by what exceeds chance: closed cases of a plate and a roof, and a rendered box."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from curvireg_torch.fitting.edges import CROP_SIZE, EdgeCrops
+from curvireg_torch.fitting.measured_fit import contour_evidence, contour_support
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.rendering.contours import MeshContours
+
+K = torch.tensor([[4000.0, 0.0, 99.5], [0.0, 4000.0, 99.5], [0.0, 0.0, 1.0]]).double()
+FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, 40.0]).double())
+BOX = torch.tensor([[40.0, 40.0, 160.0, 160.0]])
+
+
+def plate() -> trimesh.Trimesh:
+    return trimesh.creation.box((1.0, 1.0, 0.02))
+
+
+def roof(*, ridges: int = 1) -> trimesh.Trimesh:
+    """The plate with ridges towards the camera, which are creases within the outline."""
+    x = np.linspace(-0.5, 0.5, 2 * ridges + 1)
+    z = np.where(np.arange(len(x)) % 2 == 1, -0.4 / ridges, 0.0)
+    rows = [np.stack([x, np.full_like(x, y), z], axis=1) for y in (-0.5, 0.5)]
+    n = len(x)
+    faces = [face for k in range(n - 1) for face in ((k, n + k, k + 1), (k + 1, n + k, n + k + 1))]
+    return trimesh.Trimesh(np.concatenate(rows), faces, process=False)
+
+
+def photograph(*, line: float = 0.0, noise: float = 0.0) -> Tensor:
+    """(3, 200, 200) a bright square where the plate is, its right half darker by ``line``."""
+    image = torch.full((3, 200, 200), 0.2)
+    image[:, 50:150, 50:150] = 0.8
+    image[:, 50:150, 100:150] -= line
+    generator = torch.Generator().manual_seed(0)
+    return (image + noise * torch.randn(image.shape, generator=generator)).clamp(0.0, 1.0)
+
+
+def measured(mesh: trimesh.Trimesh, image: Tensor, *T: Tensor) -> tuple[Tensor, Tensor]:
+    """Evidence and support of poses, by default that in front of the camera."""
+    poses = torch.stack(T or (FRONT,))
+    crops = EdgeCrops.cut([image], BOX, 0.1)
+    index = torch.zeros(len(poses), dtype=torch.long)
+    given = MeshContours(mesh), crops, K.expand(len(poses), 3, 3), poses, index
+    return contour_evidence(*given), contour_support(*given)
+
+
+def test_the_outline_counts_by_its_strength_minus_that_beside_it():
+    evidence, support = measured(plate(), photograph())
+    # Shifted by 10 px, in px of the crop, in eight directions: two stay on their edge.
+    assert float(evidence) == pytest.approx(0.75 * float(support), rel=0.05)
+    assert float(support) > 0.7
+
+
+@pytest.mark.parametrize("line", [0.02, 0.04])
+def test_a_weak_crease_that_is_there_raises_the_evidence_and_lowers_the_support(line):
+    image = photograph(line=line)
+    outline, support_of_outline = measured(plate(), image)
+    both, support_of_both = measured(roof(), image)
+    assert float(support_of_both) < float(support_of_outline) - 0.05
+    assert float(both) > float(outline) + 0.02
+
+
+def test_creases_that_are_not_there_neither_raise_nor_lower_it():
+    image = photograph(noise=0.01)
+    outline, _ = measured(plate(), image)
+    more, _ = measured(roof(ridges=3), image)
+    assert float(more) == pytest.approx(float(outline), abs=0.05)
+
+
+def test_few_points_within_count_by_their_number():
+    """A crease as strong as the outline, of half as many points."""
+    image = photograph(line=0.5)
+    outline, _ = measured(plate(), image)
+    both, _ = measured(roof(), image)
+    strongest = 0.75 * 0.77  # of an edge, minus chance
+    assert 0.4 * strongest < float(both - outline) < 0.6 * strongest
+
+
+def test_a_pose_beside_the_object_has_about_none():
+    beside = FRONT.clone()
+    beside[0, 3] += 0.25
+    beside[1, 3] -= 0.25
+    evidence, _ = measured(plate(), photograph(), FRONT, beside)
+    assert abs(float(evidence[1])) < 0.15 * float(evidence[0])
+    turned = FRONT.clone()
+    turned[:3, :3] = rotation_from_viewpoint(40.0, 50.0, 30.0).double()
+    evidence, _ = measured(plate(), photograph(), turned)
+    assert abs(float(evidence)) < 0.15
+
+
+def test_points_outside_the_photograph_do_not_count():
+    """A plate of which the right half is outside: what is seen has the same evidence."""
+    whole, _ = measured(plate(), photograph())
+    image = photograph()[:, :, :110]
+    crops = EdgeCrops.cut([image], BOX, 0.1)
+    index = torch.zeros(1, dtype=torch.long)
+    seen = contour_evidence(MeshContours(plate()), crops, K[None], FRONT[None], index)
+    assert float(seen) == pytest.approx(float(whole), rel=0.1)
+    assert CROP_SIZE > 110

@@ -1,0 +1,85 @@
+"""Messages of ROS: what is read back is the pose, in metres, with the covariance in ROS's order."""
+
+import argparse
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from curvireg_torch.data.pose_files import read_pose
+from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.jobs.ros import FILES, ros_covariance, time_stamp, write_ros
+
+DOCUMENT = {
+    "translation": [1000.0, -2000.0, 500.0],
+    "quaternion": [0.5, 0.5, 0.5, 0.5],
+    "unit": "mm",
+    "frame": "camera",
+    "covariance": None,
+}
+
+
+def written(folder, **changes):
+    options = {name: changes.pop(name) for name in ("stamp", "frame", "child") if name in changes}
+    write_ros(folder, {**DOCUMENT, **changes}, **options)
+    files = {name: folder / name for name in FILES}
+    return {name: yaml.safe_load(f.read_text()) for name, f in files.items() if f.exists()}
+
+
+def test_pose_and_transform_are_in_metres_at_a_time(tmp_path):
+    found = written(tmp_path, stamp=(1700000000, 5), frame="cam: 1", child="part 7")
+    header = {"stamp": {"sec": 1700000000, "nanosec": 5}, "frame_id": "cam: 1"}
+    position = {"x": 1, "y": -2, "z": 0.5}
+    orientation = dict.fromkeys("xyzw", 0.5)
+    assert found["pose.yaml"] == {
+        "header": header,
+        "pose": {"position": position, "orientation": orientation},
+    }
+    (one,) = found["tf.yaml"]["transforms"]
+    assert one == {
+        "header": header,
+        "child_frame_id": "part_7",
+        "transform": {"translation": position, "rotation": orientation},
+    }
+    assert set(found) == {"pose.yaml", "tf.yaml"}, "no covariance is invented"
+
+
+def test_several_photographs_are_in_the_world(tmp_path):
+    write_ros(tmp_path, {**DOCUMENT, "frame": "world"}, frame="camera_7")
+    assert yaml.safe_load((tmp_path / "pose.yaml").read_text())["header"]["frame_id"] == "world"
+
+
+def test_the_covariance_is_that_of_disturbed_poses(tmp_path):
+    """Of positions in m first, then of rotations about fixed axes: measured on samples."""
+    generator = torch.Generator().manual_seed(0)
+    factor = torch.randn(6, 6, dtype=torch.float64, generator=generator) * 0.01
+    factor[3:] *= 100.0  # mm
+    ours = factor @ factor.T
+    found = written(tmp_path, covariance=ours.tolist())["pose_with_covariance.yaml"]
+    covariance = np.array(found["pose"]["covariance"]).reshape(6, 6)
+    noise = torch.randn(40_000, 6, dtype=torch.float64, generator=generator) @ factor.T
+    t = (torch.tensor(DOCUMENT["translation"]) + noise[:, 3:]) / 1000.0
+    R = rotation_from_axis_angle(torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64))
+    turned = rotation_from_axis_angle(noise[:, :3]) @ R
+    skew = turned @ R.T
+    turns = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=1)
+    samples = torch.cat([t, turns], dim=1)
+    measured = torch.cov(samples.T).numpy()
+    scale = np.sqrt(np.outer(measured.diagonal(), measured.diagonal()))
+    assert np.abs((covariance - measured) / scale).max() < 0.03
+    assert read_pose(tmp_path / "pose_with_covariance.yaml").T[:3, 3].tolist() == [1.0, -2.0, 0.5]
+
+
+def test_units_scale_positions_and_their_correlations():
+    ours = [[float(6 * i + j) for j in range(6)] for i in range(6)]
+    found = ros_covariance(ours, 0.5)
+    assert found[0] == [0.25 * 21, 0.25 * 22, 0.25 * 23, 0.5 * 18, 0.5 * 19, 0.5 * 20]
+    assert found[3] == [0.5 * 3, 0.5 * 4, 0.5 * 5, 0, 1, 2]
+
+
+@pytest.mark.parametrize("text", ["-1", "now", "1e9", "3000000000", ""])
+def test_stamps_are_seconds(text):
+    assert time_stamp("1700000000.123456789") == (1700000000, 123456789)
+    with pytest.raises(argparse.ArgumentTypeError, match="seconds since 1970"):
+        time_stamp(text)

@@ -1,0 +1,77 @@
+"""Evidence: what its kinds are read from, and what they count for."""
+
+from dataclasses import fields
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evidence import RANK_ALONE, Evidence, EvidenceWeights
+
+NAMES = [field.name for field in fields(Evidence)]
+
+
+def evidence(count: int = 3, **columns: list[float]) -> Evidence:
+    values = {name: torch.tensor(column).double() for name, column in columns.items()}
+    nothing = torch.zeros(count, dtype=torch.float64)
+    return Evidence(**{name: values.get(name, nothing) for name in NAMES})
+
+
+def test_every_kind_has_a_weight_of_its_name():
+    assert [field.name for field in fields(EvidenceWeights)] == NAMES
+    with pytest.raises(InvalidInputError, match="details"):
+        EvidenceWeights(details=float("nan"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_score_is_the_weighted_sum(name):
+    weights = EvidenceWeights(**dict.fromkeys(NAMES, 0.0) | {name: 2.0})
+    assert evidence(**{name: [0.5, -1.0, 3.0]}).scores(weights).tolist() == [1.0, -2.0, 6.0]
+
+
+def test_a_similar_mesh_keeps_the_order_of_the_ranking():
+    seen = evidence(rank=[-1.0, -2.0, 0.0], **{name: [5.0, 4.0, 3.0] for name in NAMES[1:]})
+    assert seen.scores(RANK_ALONE).tolist() == [-1.0, -2.0, 0.0]
+
+
+def test_evidence_is_read_from_poses():
+    seen = SimpleNamespace(
+        rank=torch.tensor([0.0, -1.0]).double(),
+        similarity=torch.tensor([0.7, 0.6]).double(),
+        edge_support=torch.tensor([0.4, torch.nan]).double(),
+        appearance=torch.tensor([0.5, -0.5]).double(),
+        keypoints=torch.tensor([0.0, 20.0]).double(),
+        contours=torch.tensor([0.3, 0.0]).double(),
+    )
+    read = Evidence.of(seen)
+    assert read.edge_support.tolist() == pytest.approx([0.4, 0.0])
+    assert read.landmarks.expm1().tolist() == pytest.approx([0.0, 20.0])
+    assert read.details.tolist() == [0.0, 0.0]
+    assert read.contours.tolist() == pytest.approx([0.3, 0.0])
+    assert list(read.named(1)) == NAMES
+    assert read.named(1)["appearance"] == -0.5
+    again = Evidence.of_hypotheses([read.named(0), read.named(1)])
+    assert torch.equal(again.table, read.table)
+
+
+def test_photographs_are_averaged_by_weight():
+    both = Evidence.stack([evidence(1, details=[1.0]), evidence(1, details=[4.0])])
+    mean = both.mean(torch.tensor([2.0, 1.0]).double())
+    assert mean.details.tolist() == [2.0]
+    assert mean.rank.tolist() == [0.0]
+
+
+def test_many_keypoints_outweigh_what_an_occluder_takes_away_and_one_does_not():
+    similarity = [0.4, 0.1, 0.8, 0.6]
+    contours = [0.3, 0.1, 0.5, 0.3]
+    keypoints = torch.tensor([0.0, 20.0, 0.0, 1.0]).log1p().tolist()
+    four = evidence(
+        4,
+        similarity=similarity,
+        contours=contours,
+        appearance=[0.0, -4.0, 0.0, -0.5],
+        landmarks=keypoints,
+    )
+    order = four.scores(EvidenceWeights()).argsort(descending=True)
+    assert order.tolist() == [2, 3, 1, 0]
