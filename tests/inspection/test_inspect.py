@@ -27,7 +27,7 @@ from curvireg_torch.inspection.photographs import (
 )
 from curvireg_torch.inspection.report import Inspection
 from curvireg_torch.inspection.surface import look_symmetries
-from curvireg_torch.inspection.trial import Expected, Outcome
+from curvireg_torch.inspection.trial import Expected, Outcome, run_trial
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh import has_colours
 from curvireg_torch.mesh.mesh import as_mesh
@@ -363,3 +363,16 @@ def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
         sides[name] = print_difference(describer, view, view @ half_turn, distance)
     assert sides["print"] > 0.5
     assert sides["stripe"] < 0.01
+
+
+@pytest.mark.slow
+def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
+    printed = as_mesh(with_print(trimesh.creation.cylinder(0.033, 0.12)))
+    views = cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60])
+    generate = PhotographGenerator(printed, 2, upright=True)
+    right = {}
+    for name, mesh in (("texture", printed), ("grey", without_colours(printed))):
+        bank = ViewBank.build(mesh, views, progress=False)
+        registrar = Registrar(bank, mesh_is="exact", symmetries=torch.eye(4)[None].double())
+        right[name] = run_trial(registrar, generate, 6, compare=False).expected.right
+    assert right["texture"] > right["grey"] + 0.3
