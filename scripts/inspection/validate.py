@@ -26,6 +26,7 @@ import torch
 from scipy.stats import binomtest
 
 import curvireg_torch as cr
+from curvireg_torch.calibration import CALIBRATION
 from curvireg_torch.inspection.photographs import Photograph, PhotographGenerator
 from curvireg_torch.inspection.trial import RIGHT_DEGREES, Outcome, run_trial
 from curvireg_torch.registration.confidence import RELIABLE, probability_of_any, shares
@@ -38,7 +39,6 @@ from scripts.scenes.scene import simulate_camera, single
 Row: TypeAlias = dict[str, Any]
 
 PAGE = REPOSITORY / "docs" / "guides" / "inspect.md"
-CALIBRATION = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
 SIZE = (480, 640)
 SEED = 4001  # of meshes and scenes: no other script has it
 OCCLUDED = 0.3  # of the scenes have something in front of the object
@@ -313,7 +313,7 @@ def of_real(options: argparse.Namespace) -> Row:
 
 def calibration() -> str:
     """Digest of the constants of confidence, on which the share of reliable answers depends."""
-    return hashlib.sha256(CALIBRATION.read_bytes()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(CALIBRATION, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def share_cell(entry: Row, name: str) -> str:
