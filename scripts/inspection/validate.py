@@ -27,10 +27,10 @@ from scipy.stats import binomtest
 
 import curvireg_torch as cr
 from curvireg_torch.calibration import CALIBRATION
+from curvireg_torch.evidence import Evidence
 from curvireg_torch.inspection.photographs import Photograph, PhotographGenerator
 from curvireg_torch.inspection.trial import RIGHT_DEGREES, Outcome, run_trial
 from curvireg_torch.registration.confidence import RELIABLE, probability_of_any, shares
-from curvireg_torch.registration.poses import POSE_FEATURES, SCORE_WEIGHTS
 from curvireg_torch.utils.threads import one_torch_thread
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 from scripts.benchmark.make import Furniture, Packages, Shapes, Tied
@@ -44,7 +44,7 @@ SEED = 4001  # of meshes and scenes: no other script has it
 OCCLUDED = 0.3  # of the scenes have something in front of the object
 MIN_PIXELS = 400  # of a visible object
 MIN_VISIBLE = 0.4  # fraction of its silhouette
-MOST_OBJECTS = 6  # of a real set
+MOST_OBJECTS = 3  # of a real set
 SETS = ("dino", "buddha", "lm", "hope28", "hope_print", "ycbv_mini")
 # meshes of each kind, also those without their print; together 30
 COUNTS = {"shapes": 8, "tied": 5, "printed": 4, "printed, grey": 4, "furniture": 9}
@@ -144,10 +144,10 @@ def generated_meshes(furniture: Path | None) -> list[GeneratedMesh]:
         if kind in ("shapes", "tied"):  # one of each family after the other
             chosen = np.asarray(objects.ids)
         first = COUNTS["printed"] if kind == "printed, grey" else 0
-        meshes += [
-            GeneratedMesh(kind, objects, int(k)) for k in chosen[first : first + COUNTS[kind]]
-        ]
-    return meshes
+        some = chosen[first : first + COUNTS[kind]]
+        meshes += [(k, GeneratedMesh(kind, objects, int(n))) for k, n in enumerate(some)]
+    # kinds in turn, so that a part of them has all
+    return [mesh for _, mesh in sorted(meshes, key=lambda entry: entry[0])]
 
 
 def registrar_of(path: Path, *, grey: bool = False) -> cr.Registrar:
@@ -161,10 +161,10 @@ def answers(registrar: cr.Registrar, generate: Callable[[int], Photograph], n: i
     """What became of n photographs: error, and what the confidence depends on."""
     with one_torch_thread():
         outcomes = run_trial(registrar, generate, n, compare=False).outcomes
-    return [answer(outcome) for outcome in outcomes]
+    return [answer(outcome, registrar) for outcome in outcomes]
 
 
-def answer(outcome: Outcome) -> Row:
+def answer(outcome: Outcome, registrar: cr.Registrar) -> Row:
     result = outcome.result
     if result is None or result.confidence_features is None:
         return {"error": outcome.error_deg, "confidence": 0.0}
@@ -174,8 +174,8 @@ def answer(outcome: Outcome) -> Row:
         for each, probability in zip(result.hypotheses, result.probabilities, strict=True)
         if probability > 0.0
     ]
-    evidence = np.array([[each.evidence[name] for name in POSE_FEATURES] for each in own])
-    scores = (evidence.astype(float) @ np.array(SCORE_WEIGHTS)).tolist()
+    evidence = Evidence.of_hypotheses([each.evidence for each in own])
+    scores = evidence.scores(registrar.score_weights(exact=True)).tolist()
     features = dict(result.confidence_features)
     said = {"confidence": result.confidence}
     return {"error": outcome.error_deg, "features": features, "scores": scores, **said}
