@@ -124,6 +124,10 @@ class MissingDependencyError(CurviregError, ImportError):
     """An optional package is required for this call."""
 
 
+class WorkerError(CurviregError, RuntimeError):
+    """A process that registers photographs ended before it was done."""
+
+
 class RenderingError(CurviregError, RuntimeError):
     """No renderer works on this machine, or the selected one failed."""
 
