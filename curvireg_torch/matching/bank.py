@@ -37,6 +37,7 @@ from ..terms import Precision, Whitening, ledoit_wolf
 from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
 from ..utils.choices import UNITS, UP_AXES
 from ..utils.files import tensor_digest, write_tensors
+from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
@@ -158,7 +159,7 @@ class ViewBank:
     @classmethod
     def build(
         cls,
-        mesh: Any,
+        mesh: MeshLike,
         views: ViewSphere | None = None,
         *,
         image_size: int | None = None,
