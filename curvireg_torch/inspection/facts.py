@@ -201,7 +201,7 @@ def _size_warnings(size: float, unit: str | None) -> list[str]:
     if unit is None:
         fitting = [name for name in ("mm", "cm", "m") if SMALLEST < size * METRES[name] < LARGEST]
         guess = " or ".join(fitting) or "none that is usual"
-        return [f"its unit is unknown: {size:.4g} across, which suggests {guess}; give --unit"]
+        return [f"its unit is unknown: {size:.4g} across, which suggests {guess}; give the unit"]
     metres = size * METRES.get(unit, 1.0)
     if SMALLEST < metres < LARGEST:
         return []
