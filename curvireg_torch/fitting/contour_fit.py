@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
+from ..pipeline import FitSettings
 from ..rendering.contours import Contours
 from ..utils.checks import (
     as_boxes,
@@ -17,6 +17,7 @@ from ..utils.checks import (
     check_pose,
     check_tensor,
 )
+from ..utils.likes import BoxesLike, CameraLike
 from .contour_problem import COARSE_DENSITY, ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import apply_twist
@@ -28,26 +29,16 @@ SECOND_RADII = (3.0, 2.0)
 """Search radius for edges in px, one a round: at a quarter of the size, and at half size from all
 starts and then from the best."""
 
-KEPT_STARTS = 3
-"""Starts of a pose that continue after the first round, those with the most support."""
-
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
-
-START_ANGLE = 8.0
-START_ROLL = 6.0
-FAR_ANGLE = 16.0
-"""Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for
-further starts: about half the spacing of a bank's views. ``FAR_ANGLE``: more starts of a pose that
-is fitted again."""
 
 
 @torch.no_grad()
 def fit_contours(
     contours: Contours,
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     starts: Tensor,
     *,
     image_index: Tensor | None = None,
@@ -140,6 +131,7 @@ def fit_to_edges(
     wide_angles: Sequence[float] = (),
     quick: Tensor | None = None,
     again: bool = False,
+    settings: FitSettings = FitSettings(),
 ) -> ContourFit:
     """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras
     ``K`` (N, 3, 3). ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there
@@ -154,10 +146,9 @@ def fit_to_edges(
         wide = _turned(T0, half.centre, wide_angles)
         every = rows.repeat_interleave(wide.shape[1])
         quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
-    angles = (START_ANGLE, FAR_ANGLE) if again else (START_ANGLE,)
-    around = torch.cat(
-        [_turned(T0, half.centre, angles, roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1
-    )
+    angles = (settings.start_angle, settings.far_angle) if again else (settings.start_angle,)
+    turned = _turned(T0, half.centre, angles, roll=settings.start_roll)
+    around = torch.cat([turned, quick.view(N, -1, 4, 4)], dim=1)
     M = around.shape[1]
     every = rows.repeat_interleave(M)
     begun = half.state(T0)
@@ -167,7 +158,7 @@ def fit_to_edges(
     kept = (
         coarse.supports(fits)[1]
         .view(N, M)
-        .argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+        .argsort(dim=1, descending=True, stable=True)[:, : settings.kept_starts]
     )
     T = fits.T[(kept + M * rows[:, None]).flatten()]
     M = kept.shape[1]
@@ -280,8 +271,8 @@ def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
 
 def _checked(
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     poses: Tensor,
     image_index: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:

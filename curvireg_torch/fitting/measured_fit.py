@@ -39,6 +39,15 @@ class ContourFit(Rows):
         start_support: (N,) edge support of the starts (at half size for starts that are not
             finished).
         observable: (N,) int64, number of the six directions that the contours determine.
+
+    Example:
+        >>> T = torch.eye(4).repeat(2, 1, 1)
+        >>> covariance = torch.zeros(2, 6, 6)
+        >>> support = torch.tensor([0.6, 0.3])
+        >>> observable = torch.tensor([6, 6])
+        >>> fit = ContourFit(T, covariance, support, torch.tensor([0.2, 0.2]), observable)
+        >>> fit.trustworthy.tolist()
+        [True, False]
     """
 
     transform: Tensor

@@ -40,7 +40,7 @@ FILES: dict[str, tuple[str, ...]] = {
 }
 """Names, or patterns of names, that each command may write into the folder of its results."""
 
-ELSEWHERE = "choose another --out"
+ELSEWHERE = "choose another folder"
 
 
 @contextmanager
@@ -82,9 +82,10 @@ def output_folder(
     lost = [name for name in before.get("source", ()) if name not in source]
     if lost and source and in_the_way:
         raise InvalidInputError(
-            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}"
+            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}",
+            kind="out",
         )
-    check_writable(folder, "--out")
+    check_writable(folder)
     kept = list(source or before.get("source", ()))
     _mark(folder, command, names, kept)
     try:
@@ -104,9 +105,9 @@ def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> Non
         _check_inputs([path], inputs)
         if not path.is_file() or mark not in path.read_bytes():
             raise InvalidInputError(
-                f"{path}: exists, and this command did not write it; {ELSEWHERE}"
+                f"{path}: exists, and this command did not write it; {ELSEWHERE}", kind="out"
             )
-    check_writable(path.parent, "--out")
+    check_writable(path.parent)
 
 
 def _existing(folder: Path, names: Iterable[str]) -> list[Path]:
@@ -125,7 +126,8 @@ def _check_inputs(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
     for path in inputs:
         if path.exists() and _identity(path) in identities:
             raise InvalidInputError(
-                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}"
+                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}",
+                kind="out",
             )
 
 
@@ -147,8 +149,12 @@ def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
     if command in owners:
         return
     if owners:
-        raise InvalidInputError(f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}")
-    raise InvalidInputError(f"{path}: not written by this command; move it away, or {ELSEWHERE}")
+        raise InvalidInputError(
+            f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}", kind="out"
+        )
+    raise InvalidInputError(
+        f"{path}: not written by this command; move it away, or {ELSEWHERE}", kind="out"
+    )
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -159,7 +165,7 @@ def _read(folder: Path) -> dict[str, Any]:
     content = read_json(path, dict, "docs/results.md")
     runs = content.get("commands")
     if not isinstance(runs, dict) or not all(map(_is_run, runs.values())):
-        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}")
+        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}", kind="out")
     return runs
 
 

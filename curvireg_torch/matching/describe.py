@@ -61,7 +61,15 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see
     :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of at most
-    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
+    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> describer = ViewDescriber(cr.synthetic.example_mesh(), cr.BankSettings(image_size=64))
+        >>> R = cr.rotation_from_viewpoint(torch.tensor([0.0, 90.0]), 20.0)
+        >>> describer.fields(R, torch.full((2,), 5.0 * describer.radius)).shape
+        torch.Size([2, 2, 64, 64])
+    """
 
     def __init__(
         self,

@@ -30,6 +30,7 @@ from ..terms import (
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.company import by_key, compute_together
+from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import VIEWS_AT_A_TIME, ViewBank, packed
@@ -58,6 +59,15 @@ class Ranking:
             aspect ratios in [0, 1], best view 1.
         allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,)
             the best of the others more than 30 degrees from the best view, or -1.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> ranking = cr.ViewMatcher(bank)([scene.image], [scene.box])
+        >>> ranking.scores.shape, ranking.top(2).shape
+        (torch.Size([1, 6]), torch.Size([1, 2]))
     """
 
     scores: Tensor
@@ -121,6 +131,12 @@ def distinct_views(
 
     Returns:
         (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> R = rotation_from_viewpoint(torch.tensor([0.0, 10.0, 90.0]), 0.0)
+        >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
+        [1, 2]
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
@@ -241,7 +257,7 @@ class ViewMatcher(nn.Module):
         built."""
         map_on_threads(lambda _: self._prepare(), [0])
 
-    def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
+    def forward(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> Ranking:
         """Rank all views.
 
         Args:
@@ -257,12 +273,14 @@ class ViewMatcher(nn.Module):
         return self.rank(self.query(images, boxes))
 
     @in_full_precision
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
+    def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
         return self.describe(*self._regions(images, boxes))
 
-    def _regions(self, images: Tensor | Sequence[Tensor], boxes: Any) -> tuple[Tensor, Tensor]:
+    def _regions(
+        self, images: Tensor | Sequence[Tensor], boxes: BoxesLike
+    ) -> tuple[Tensor, Tensor]:
         """Crops (B, K, C, S, S) of the boxes, jittered, and their shapes (B,)."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)

@@ -89,6 +89,7 @@ def judged(
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
         camera=item.camera,
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 

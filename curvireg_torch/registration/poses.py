@@ -17,12 +17,12 @@ from ..fitting.texture_fit import fit_texture, turned
 from ..fitting.together import fit_together, quick_fit_together, support_together
 from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
+from ..pipeline import FitSettings
 from ..utils.rows import Rows
 from .confidence import are_near
 from .result import Hypothesis
 
 __all__ = [
-    "SCREENING_WEIGHT",
     "Poses",
     "best_views",
     "close_rivals",
@@ -36,21 +36,6 @@ __all__ = [
     "with_edge_support",
     "with_quick_fit",
 ]
-
-SAME_POSE_ANGLE = 15.0
-"""Degrees within which two fitted hypotheses count as one."""
-
-SCREENING_WEIGHT = 20.0
-"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views
-that are fitted."""
-
-FINISHED_FITS = 2
-"""Hypotheses of a photograph whose contours are fitted at full size."""
-
-CLOSE_SCORE = 2.5
-CLOSE_RIVALS = 2
-"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of
-them are fitted as thoroughly."""
 
 
 @dataclass(frozen=True)
@@ -158,12 +143,19 @@ def best_views(
     return view, log[view] - log.max()
 
 
-def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
+def fit_poses(
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Poses,
+    *,
+    settings: FitSettings = FitSettings(),
+    **options: Any,
+) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
     given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
-    return poses.with_fit(
-        fit_together(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
-    )
+    finish = options.pop("finish", settings.finished_fits)
+    fit = fit_together(*given, settings=settings, finish=finish, **options)
+    return poses.with_fit(fit, describer.centre)
 
 
 def with_quick_fit(
@@ -208,24 +200,26 @@ def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:
     return similarity + weights.landmarks * evidence["landmarks"]
 
 
-def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher
-    ``score`` (H,)."""
+def distinct_poses(
+    poses: Poses, score: Tensor, symmetries: Tensor | None = None, *, angle: float
+) -> Tensor:
+    """(H,) bool: False where a pose is within ``angle`` degrees of one with a higher ``score``
+    (H,)."""
     order = score.argsort(descending=True, stable=True)
     R = poses.rotation[order].float()
     best_first = torch.arange(len(order))
-    chosen = distinct_views(
-        best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries
-    )
+    chosen = distinct_views(best_first, R, count=len(order), angle=angle, symmetries=symmetries)
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
-def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best
-    first."""
+def close_rivals(
+    poses: Poses, scores: Tensor, symmetries: Tensor | None = None, *, behind: float
+) -> Tensor:
+    """(R,) indices of other poses whose scores (H,) are less than ``behind`` below the best one,
+    best first."""
     best = int(scores.argmax())
     same = are_near(poses.rotation, poses.rotation[best], symmetries)
-    close = ~same & (scores > scores[best] - CLOSE_SCORE)
+    close = ~same & (scores > scores[best] - behind)
     order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
     return order[: int(close.sum())]
 

@@ -17,6 +17,7 @@ from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..utils.checks import check_device, check_integer, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .detection import detect_item
@@ -163,12 +164,12 @@ class Registrar(Target):
     @in_full_precision
     def __call__(
         self,
-        images: Tensor | Sequence[Any],
-        boxes: Any | None = None,
-        camera_matrices: Any | None = None,
+        images: ImagesLike,
+        boxes: BoxesLike | None = None,
+        camera_matrices: CameraLike | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
-        masks: Any | None = None,
+        masks: Sequence[MaskLike | None] | Tensor | None = None,
     ) -> Results:
         """Register a batch.
 
@@ -247,13 +248,19 @@ class Registrar(Target):
         return self.others[model - 1] if model else self
 
     @in_full_precision
-    def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
+    def refine(
+        self, images: ImagesLike, camera_matrices: CameraLike | None, poses: ArrayLike
+    ) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
     @in_full_precision
     def register_views(
-        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+        self,
+        images: ImagesLike,
+        boxes: BoxesLike | None,
+        camera_matrices: CameraLike | None,
+        T_cam_from_world: ArrayLike,
     ) -> Registration:
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""
