@@ -185,7 +185,8 @@ def _size_warnings(size: float, unit: str | None) -> list[str]:
     guess = " or ".join(f"{name} ({metres:.2g} m)" for name, metres in usual.items())
     if unit is None:
         suggested = guess or "none that is usual"
-        return [f"its unit is unknown: {size:.4g} across, which suggests {suggested}; give --unit"]
+        across = f"{size:.4g} across, which suggests {suggested}"
+        return [f"its unit is unknown: {across}; give the unit"]
     metres = size * METRES.get(unit, 1.0)
     if SMALLEST < metres < LARGEST:
         return []

@@ -17,6 +17,7 @@ from ..mesh.mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
 from ..utils.checks import check_integer
+from ..utils.likes import MeshLike
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, confused_sides, look_alikes
@@ -154,7 +155,7 @@ class Inspection:
 
 
 def inspect(
-    mesh: Any,
+    mesh: MeshLike,
     *,
     n: int = 60,
     seed: int = 0,

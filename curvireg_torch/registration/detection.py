@@ -7,7 +7,6 @@ are registered.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +16,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.crops import box_iou, non_maximum_suppression
 from ..geometry.pose_prior import PosePrior
 from ..terms import QueryFeatures
+from ..utils.likes import CameraLike, ImagesLike
 from .confidence import detection_probability
 from .detector import Proposals
 from .focal import usual_camera
@@ -45,8 +45,8 @@ Results = list[Registration | FailedRegistration]
 @torch.no_grad()
 def detect(
     target: Target,
-    images: Tensor | Sequence[Any],
-    camera_matrices: Any | None = None,
+    images: ImagesLike,
+    camera_matrices: CameraLike | None = None,
     *,
     instances: int = 1,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,

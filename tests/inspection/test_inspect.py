@@ -95,7 +95,7 @@ def test_open_doubled_and_loose_faces_are_counted():
 @pytest.mark.parametrize(
     ("size", "unit", "text"),
     [
-        (80.0, None, "suggests mm (0.11 m) or cm (1.1 m); give --unit"),
+        (80.0, None, "suggests mm (0.11 m) or cm (1.1 m); give the unit"),
         (
             80.0,
             "m",
