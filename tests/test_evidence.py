@@ -41,7 +41,7 @@ def test_evidence_is_read_from_poses():
         similarity=torch.tensor([0.7, 0.6]).double(),
         edge_support=torch.tensor([0.4, torch.nan]).double(),
         appearance=torch.tensor([0.5, -0.5]).double(),
-        keypoints=torch.tensor([1.0, 22.0]).double(),
+        keypoints=torch.tensor([0.0, 20.0]).double(),
         contours=torch.tensor([0.3, 0.0]).double(),
     )
     read = Evidence.of(seen)

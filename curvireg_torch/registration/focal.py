@@ -29,7 +29,7 @@ from ..geometry.cameras import camera_matrix
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
 from .inputs import ImageItem
-from .poses import SCREENING_WEIGHT, Poses, placed, with_quick_fit
+from .poses import Poses, placed, with_quick_fit
 
 FIELDS_OF_VIEW = (12.0, 25.0, 45.0, 65.0, 85.0)
 """Degrees across the longer side of the photograph that are tried: factors of about 2 between focal
@@ -75,13 +75,18 @@ def _camera(size: tuple[int, int], focal: float) -> Tensor:
 
 
 def starts_of_fields(
-    describer: ViewDescriber, crops: EdgeCrops, starts: Sequence[Poses], count: int
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    starts: Sequence[Poses],
+    count: int,
+    *,
+    screening_weight: float,
 ) -> Poses:
     """Of ``starts``, the same views with each of several cameras, those that are fitted, with their
     quick fits and the most evidence first: the best view with each camera, and at least ``count``
     views with their best camera."""
     poses, support = with_quick_fit(describer, crops, Poses.cat(starts))
-    evidence = (poses.rank + SCREENING_WEIGHT * support).view(len(starts), -1)
+    evidence = (poses.rank + screening_weight * support).view(len(starts), -1)
     views = evidence.shape[1]
     of_field = evidence.argmax(dim=1) + views * torch.arange(len(starts))
     best, field = evidence.max(dim=0)

@@ -69,12 +69,18 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
             seen = replace(work, item=replace(item, camera_matrix=camera))
             poses = poses_of_views(target, seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(target.describer, work.crops, of_cameras, least_starts(target))
+        starts = starts_of_fields(
+            target.describer,
+            work.crops,
+            of_cameras,
+            least_starts(target),
+            screening_weight=target.pipeline.fit.screening_weight,
+        )
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, target.bank)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
+    keypoints = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+    return replace(work, item=item, limits=limits, keypoints=keypoints, starts=starts)
 
 
 def with_fitted_focal_lengths(

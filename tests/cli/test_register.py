@@ -9,7 +9,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.register import _advice, print_result
+from curvireg_torch.cli.register import _advice, _print_rivals, print_result
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
@@ -155,11 +155,12 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
-        "mm.safetensors: built with --unit mm, not with --unit m",
+        "mm.safetensors: built in unit mm, not in m; leave the unit out, or build it again "
+        "(leave --unit out, or curvireg bank)",
     )
     refused(
         register_one("--up=-x", "--no-refine", **bank),
-        "mm.safetensors: built with --up=z, not with --up=-x",
+        "mm.safetensors: built with z up, not -x",
     )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
     assert register_one(*words, **bank) == 0
@@ -356,3 +357,26 @@ PRINTED = {
 def test_the_command_says_what_numbers_mean(capsys, changes, expected):
     print_result({**PRINTED, **changes}, Path("out"))
     assert expected in capsys.readouterr().out
+
+
+def test_rivals_and_hidden_features_are_named(capsys):
+    viewpoint = {"azimuth": 30.0, "elevation": 10.0, "theta": 0.0}
+    tied = {
+        "ambiguous": "half turn",
+        "confidence": 0.45,
+        "no_match_probability": 0.1,
+        "hypotheses": [{"viewpoint": viewpoint}] * 3,
+        "probabilities": [0.45, 0.44, 0.01],
+    }
+    _print_rivals(tied)
+    printed = capsys.readouterr().out
+    assert printed.count("could also be") == 1
+    assert "flipped by 180 degrees" in printed
+    certain = {"confidence": 0.95, "probabilities": [0.95, 0.01, 0.01]}
+    _print_rivals(tied | certain | {"ambiguous": "several"})
+    printed = capsys.readouterr().out
+    assert (
+        printed == "right up to turns that only a small feature tells apart, which is not in view\n"
+    )
+    _print_rivals(tied | {"ambiguous": None})
+    assert capsys.readouterr().out == ""

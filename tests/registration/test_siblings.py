@@ -1,6 +1,6 @@
 """Siblings of a pose in closed cases: which is better, and which is a rival."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -26,9 +26,8 @@ def four(similarity: list[float], compare: list[list[float]], angles: list[float
 
 
 def evidence(*similarity: float) -> Evidence:
-    nothing = torch.zeros(len(similarity), dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
+    nothing = Evidence.zeros(len(similarity))
+    return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
