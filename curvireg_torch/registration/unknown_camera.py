@@ -95,7 +95,8 @@ def with_fitted_focal_lengths(
     does not lower its score noticeably: where perspective tells nothing, a usual focal length is
     better than one of those tried."""
     scores = scores_inside(target, evidence, outside)
-    chosen = _to_be_fitted(work, poses, scores, int((~outside).sum()))
+    behind = target.pipeline.fit.close_score
+    chosen = _to_be_fitted(work, poses, scores, int((~outside).sum()), behind=behind)
     index, focal = _focal_starts(chosen, poses.cameras[:, 0, 0])
     starts = zoomed(poses[index], focal, target.describer.centre)
     fitted = with_focal_length(target.describer, crops, starts, work.item)
@@ -124,13 +125,16 @@ def _focal_starts(chosen: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
     return index, starts
 
 
-def _to_be_fitted(work: Work, poses: Poses, scores: Tensor, inside: int) -> Tensor:
+def _to_be_fitted(
+    work: Work, poses: Poses, scores: Tensor, inside: int, *, behind: float
+) -> Tensor:
     """(R,) indices of the best poses and, of an unknown camera, of a rival that differs from them
-    and could be better with another focal length; ``inside`` poses may be chosen."""
+    and, as its score is less than ``behind`` below, could be better with another focal length;
+    ``inside`` poses may be chosen."""
     if work.starts is None:
         return scores.topk(min(1, inside)).indices
     best = scores.topk(min(FITTED, inside)).indices
-    rivals = close_rivals(poses, scores, work.symmetries)
+    rivals = close_rivals(poses, scores, work.symmetries, behind=behind)
     for index in best:
         rivals = rivals[~are_near(poses.rotation[rivals], poses.rotation[index], work.symmetries)]
     return torch.cat([best, rivals[:1]])
