@@ -20,7 +20,15 @@ from .store import is_one_of_several
 
 MARKER = ".curvireg.json"
 
-ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *ros.FILES)
+M3T_FILES = ("object.obj", "object.yaml", "object_detector.yaml")
+"""The mesh in its own unit, M3T's body and its static detector, whose world is the camera."""
+
+VISP_FILES = ("object.cao", "object.init", "object.pos")
+"""The mesh, points of it with the pixels where they are (``initFromPoints``), and the pose
+(``initFromPose``)."""
+
+FOR_TOOLS = (*ros.FILES, *M3T_FILES, *VISP_FILES)
+ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
 ROWS = ("results.jsonl", "results.*-of-*.jsonl", "index.html", "thumbnails")
 FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,
