@@ -155,7 +155,7 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
-        "mm.safetensors: built in unit mm, not in m; leave the unit out, or build it again "
+        "mm.safetensors: built with unit mm, not m; leave the unit out, or build it again "
         "(leave --unit out, or curvireg bank)",
     )
     refused(
