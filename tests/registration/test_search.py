@@ -10,7 +10,7 @@ from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.fitting.landmarks import LandmarkMatches
+from curvireg_torch.fitting.keypoints import KeypointMatches
 from curvireg_torch.geometry import (
     PosePrior,
     paper_views,
@@ -206,7 +206,7 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     ):
         monkeypatch.setattr(module, name, refused)
     monkeypatch.setattr(poses, "fit_to_edges", refused)
-    monkeypatch.setattr(LandmarkMatches, "agreeing", refused)
+    monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
     stages: list[str] = []
