@@ -115,8 +115,8 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
     if len(mesh.faces) > MANY_FACES:
         warnings.append(
-            f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}, and so do generated "
-            f"photographs of a grey mesh; simplify it to {MANY_FACES:,}, and it loads faster"
+            f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}, and generated photographs "
+            f"show it simplified; simplify it to {MANY_FACES:,}, and it loads faster"
         )
     if doubled_faces:
         warnings.append(

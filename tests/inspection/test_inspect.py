@@ -21,6 +21,7 @@ from curvireg_torch.inspection.photographs import (
     SIZE,
     Photograph,
     PhotographGenerator,
+    photographed_mesh,
     trial_camera,
     with_print,
     without_colours,
@@ -245,6 +246,28 @@ def test_a_print_varies_over_the_surface_and_leaves_the_shape():
     assert not has_colours(without_colours(printed))
 
 
+@pytest.mark.parametrize("is_coloured", [False, True])
+def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_coloured):
+    fine = trimesh.creation.icosphere(5, 2.0)
+    assert photographed_mesh(fine) is fine
+    fine = fine.copy()
+    if is_coloured:
+        colours = np.where(fine.triangles_center[:, :1] > 0.0, (250, 0, 0, 255), (0, 0, 250, 255))
+        fine.visual.face_colors = colours
+    fine.units = "cm"
+    fine = as_mesh(fine)
+    for name, value in (("MANY_FACES", 9_000), ("COLOURED_FACES", 2_000)):
+        monkeypatch.setattr(f"curvireg_torch.inspection.photographs.{name}", value)
+    simple = photographed_mesh(fine)
+    assert len(simple.faces) <= (2_000 if is_coloured else 8_000)
+    assert simple.bounds == pytest.approx(fine.bounds, abs=0.05)
+    assert has_colours(simple) == is_coloured
+    if is_coloured:
+        reds = simple.visual.vertex_colors[:, 0] > 125
+        sides = simple.vertices[:, 0]
+        assert (reds == (sides > 0.0))[np.abs(sides) > 0.1].all()
+
+
 def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(registrar):
     calls = []
     report = cr.inspect(
@@ -281,6 +304,14 @@ def test_expected_shares():
 def test_number_below_zero_is_refused():
     with pytest.raises(InvalidInputError, match="n"):
         cr.inspect(trimesh.creation.box((1, 2, 3)), n=-1)
+
+
+def test_page_groups_symmetries_by_their_turn():
+    can = mesh_facts(trimesh.creation.cylinder(0.3, 1.0, sections=72))
+    page = report_page(Inspection(can), None, title="can")
+    assert page.count("<tr><td>180°</td><td>37</td>") == 1
+    assert page.count("<tr><td>10°</td><td>2</td>") == 1
+    assert "in 1 part, closed" in page
 
 
 def test_page_escapes_names(registrar):
