@@ -530,6 +530,8 @@ def _advice(document: Mapping[str, Any]) -> str:
         return "correct what the warning names"
     if document["ambiguous"] is not None:
         return "more than one pose fits"
+    if document.get("confidence", 0.0) is None:
+        return "look at the overlay, or leave --preset and other settings out to have a confidence"
     if "distance" in document.get("prior", {}):
         return f"check --distance, --camera, and {mesh}"
     if "detection" in document:
