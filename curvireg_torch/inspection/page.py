@@ -13,7 +13,7 @@ from ..matching import ViewDescriber
 from ..registration import Registrar
 from ..visualization.contours import close_up, draw_window
 from ..visualization.encoding import jpeg, to_uint8
-from .facts import MeshFacts
+from .facts import CONTINUOUS_TURN, MeshFacts
 from .look_alikes import LookAlike
 from .report import ELEVATIONS, PIXELS_ACROSS, Inspection
 from .trial import Expected, Outcome
@@ -96,13 +96,16 @@ def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
         ("faces", f"{facts.faces:,} in {facts.parts:,} part{'s' * (facts.parts > 1)}, {closed}"),
         ("colours", colours),
         ("thin parts", f"{100 * facts.thin:.0f} % of the surface, thinner than 1 % of the size"),
-        (
-            "symmetries",
-            f"{len(facts.symmetries) + 1} orientations look the same"
-            if facts.symmetries
-            else "none",
-        ),
+        ("symmetries", _symmetries_in_words(facts)),
     ]
+
+
+def _symmetries_in_words(facts: MeshFacts) -> str:
+    if not facts.symmetries:
+        return "none"
+    if min(symmetry.angle for symmetry in facts.symmetries) < CONTINUOUS_TURN:
+        return "any turn about an axis leaves the shape; steps of 10 degrees stand for them"
+    return f"{len(facts.symmetries) + 1} orientations have the same shape"
 
 
 def _table(rows: Sequence[tuple[Any, ...]]) -> str:
