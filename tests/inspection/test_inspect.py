@@ -423,7 +423,7 @@ def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
 def test_clutter_differs_from_photograph_to_photograph(monkeypatch):
     radii = []
 
-    def recorded(radius, generator):
+    def recorded(radius, _generator):
         radii.append(round(radius, 6))
         return trimesh.creation.icosphere(1, radius)
 
