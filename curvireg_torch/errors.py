@@ -172,6 +172,10 @@ class MissingDependencyError(CurviregError, ImportError):
     """
 
 
+class WorkerError(CurviregError, RuntimeError):
+    """A process that registers photographs ended before it was done."""
+
+
 class RenderingError(CurviregError, RuntimeError):
     """No renderer works on this machine, or the selected one failed.
 

@@ -37,6 +37,8 @@ MAX_FAILURES = 10
 # exit codes of ``--strict``
 NONE_RELIABLE = 3
 SOME_FAILED = 4
+TRACKERS = ("m3t", "visp")
+FORMATS = ("ros", *TRACKERS)
 OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
 
 STAGES = {
@@ -129,11 +131,12 @@ def add_register(commands: Any) -> None:
         f"photographs failed"
     )
     add("--strict", action="store_true", help=strict)
-    ros = (
+    formats = (
         "ros: also write DIR/pose.yaml, a PoseStamped, DIR/tf.yaml, and, of reliable poses, "
-        "DIR/pose_with_covariance.yaml, in metres"
+        "DIR/pose_with_covariance.yaml, in metres; m3t, visp: a start pose and the mesh for these "
+        "trackers, DIR/object.yaml and others, or DIR/object.cao, object.init and object.pos"
     )
-    add("--format", choices=("ros",), help=ros)
+    add("--format", choices=FORMATS, help=formats)
     stamp = "with --format ros: when the photograph was taken, in seconds since 1970 (default: 0)"
     add("--stamp", type=time_stamp, metavar="SECONDS", help=stamp)
     frame = f"with --format ros: the camera's frame (default: {OPTICAL_FRAME})"
@@ -205,12 +208,15 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
         return "--start and --mask are of one photograph; give several masks in a list, column mask"
     for name in ("stamp", "frame"):
-        if getattr(arguments, name) is not None and not arguments.format:
+        if getattr(arguments, name) is not None and arguments.format != "ros":
             return f"--{name}: of the messages of --format ros; give it too"
     if arguments.format and (arguments.list or arguments.out is None):
-        return "--format ros: of one result, in --out DIR"
+        return f"--format {arguments.format}: of one result, in --out DIR"
+    if arguments.format in TRACKERS and rig is not None:
+        return f"--format {arguments.format}: a tracker starts in one camera, not in a rig's world"
     if arguments.format and rig is None and without_camera:
-        return f"--format ros: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
+        wanted = f"needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
+        return f"--format {arguments.format}: {wanted}"
     return None
 
 
@@ -321,7 +327,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
                 raise
         if out is not None:
             found.write(out)
-        _write_pose(arguments, found.document)
+        _write_pose(arguments, found.document, found.registrar.of_model(found.model))
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photo.notes, *camera_in_words(found.document)]
@@ -353,7 +359,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         document["mesh"] = str(options.meshes[result.model])
         if out is not None:
             write_views(out, document, registrar, result, photographs)
-        _write_pose(arguments, document)
+        _write_pose(arguments, document, registrar.of_model(result.model))
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["photographs"]:
@@ -362,11 +368,18 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     return result.reliable
 
 
-def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+def _write_pose(
+    arguments: argparse.Namespace, document: dict[str, Any], registrar: "Registrar"
+) -> None:
     """Write the pose in the format of another tool, if one is asked for."""
     from ..jobs.ros import write_ros
 
-    if arguments.format:
+    if arguments.format in TRACKERS:
+        from ..jobs import trackers
+
+        write = trackers.write_m3t if arguments.format == "m3t" else trackers.write_visp
+        write(arguments.out, registrar.bank.mesh, document)
+    elif arguments.format:
         mesh = Path(document.get("mesh") or arguments.meshes[0])
         chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
         given = {name: value for name, value in chosen.items() if value is not None}

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from ..utils.checks import (
     check_pose,
     check_tensor,
 )
+from ..utils.likes import BoxesLike, CameraLike
 from .contour_problem import COARSE_DENSITY, ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import apply_twist
@@ -37,8 +37,8 @@ SAME_POSE_SHIFT = 0.5
 def fit_contours(
     contours: Contours,
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     starts: Tensor,
     *,
     image_index: Tensor | None = None,
@@ -271,8 +271,8 @@ def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
 
 def _checked(
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     poses: Tensor,
     image_index: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import MAX_BOX_COORDINATE, InvalidInputError
 from ..utils.checks import as_boxes, check_integer, check_positive, check_tensor
+from ..utils.likes import BoxesLike
 
 SAMPLES_AT_A_TIME = 64  # of a matrix product: fewer are slow, more multiply by many zeros
 
@@ -118,7 +118,7 @@ def _scale_and_shift(scale: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 
 def crop_images(
-    images: Tensor | Sequence[Tensor], boxes: Any, *, size: int = 256, margin: float = 0.1
+    images: Tensor | Sequence[Tensor], boxes: BoxesLike, *, size: int = 256, margin: float = 0.1
 ) -> tuple[Tensor, Tensor]:
     """Square crops around boxes, resampled bilinearly, with a wider triangle filter (no aliasing)
     when shrinking.

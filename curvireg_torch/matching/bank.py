@@ -37,6 +37,7 @@ from ..terms import Precision, Whitening, ledoit_wolf
 from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
 from ..utils.choices import UNITS, UP_AXES
 from ..utils.files import tensor_digest, write_tensors
+from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
@@ -46,7 +47,7 @@ VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x im
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
 PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
-REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
+REBUILD = "build it again"
 
 
 class ViewBank:
@@ -158,7 +159,7 @@ class ViewBank:
     @classmethod
     def build(
         cls,
-        mesh: Any,
+        mesh: MeshLike,
         views: ViewSphere | None = None,
         *,
         image_size: int | None = None,
@@ -293,26 +294,27 @@ class ViewBank:
         """
         path = Path(path)
         if not path.is_file():
-            raise MissingFileError(
-                f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path
-            )
+            raise MissingFileError("no such bank; build one", subject=path, kind="bank")
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
                 if metadata.get("format") != FORMAT:
                     raise BankError(
-                        "not a view bank; build one with 'curvireg bank MESH --out FILE'",
+                        "not a view bank; build one",
                         subject=path,
+                        kind="bank",
                     )
                 if (version := metadata.get("version")) != str(FORMAT_VERSION):
                     message = (
                         f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
                     )
-                    raise BankError(message, subject=path)
+                    raise BankError(message, subject=path, kind="bank")
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
             if metadata["checksum"] != tensor_digest(tensors, size=16):
                 raise BankError(
-                    f"changed since it was written (its checksum differs); {REBUILD}", subject=path
+                    f"changed since it was written (its checksum differs); {REBUILD}",
+                    subject=path,
+                    kind="bank",
                 )
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
@@ -327,12 +329,16 @@ class ViewBank:
             raise
         except (SafetensorError, OSError) as error:
             raise BankError(
-                f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path
+                f"truncated or not a safetensors file ({error}); {REBUILD}",
+                subject=path,
+                kind="bank",
             ) from error
         except Exception as error:  # a file may hold anything
             reason = str(error) if isinstance(error, CurviregError) else repr(error)
             reason = reason.partition("\n")[0][:200]
-            raise BankError(f"incomplete bank ({reason}); {REBUILD}", subject=path) from error
+            raise BankError(
+                f"incomplete bank ({reason}); {REBUILD}", subject=path, kind="bank"
+            ) from error
         return cls(mesh, views, pipeline, tensors).to(device)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from ..mesh.mesh import as_mesh, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, text_digest
+from ..utils.likes import MeshLike
 from ..utils.sources import import_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
@@ -107,7 +108,7 @@ def bank_key(
 
 
 def cached_bank(
-    mesh: Any,
+    mesh: MeshLike,
     views: ViewSphere | None = None,
     *,
     pipeline: Pipeline | None = None,

@@ -30,6 +30,7 @@ from ..terms import (
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
 from ..utils.company import by_key, compute_together
+from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import VIEWS_AT_A_TIME, ViewBank, packed
@@ -256,7 +257,7 @@ class ViewMatcher(nn.Module):
         built."""
         map_on_threads(lambda _: self._prepare(), [0])
 
-    def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
+    def forward(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> Ranking:
         """Rank all views.
 
         Args:
@@ -272,12 +273,14 @@ class ViewMatcher(nn.Module):
         return self.rank(self.query(images, boxes))
 
     @in_full_precision
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
+    def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
         return self.describe(*self._regions(images, boxes))
 
-    def _regions(self, images: Tensor | Sequence[Tensor], boxes: Any) -> tuple[Tensor, Tensor]:
+    def _regions(
+        self, images: Tensor | Sequence[Tensor], boxes: BoxesLike
+    ) -> tuple[Tensor, Tensor]:
         """Crops (B, K, C, S, S) of the boxes, jittered, and their shapes (B,)."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from ..errors import (
 )
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
+from ..utils.likes import MeshLike
 from .colours import colours_of_parts
 from .files import read_source
 from .health import precision_warning, stray_faces, stray_warning
@@ -119,7 +120,7 @@ def load_mesh(
     return mesh
 
 
-def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
+def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
     """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as
     :func:`load_mesh`.
 

@@ -19,9 +19,9 @@ from ..geometry.viewpoint import angles_between
 from ..mesh.symmetry import ROUND
 from ..pipeline import BankSettings, FitSettings, Pipeline
 
-# Probability that the object is where landmarks agree on a pose, in a whole photograph: on
+# Probability that the object is where keypoints agree on a pose, in a whole photograph: on
 # generated shelves 84 of 88. It is less where other objects have a similar print
-LANDMARK_PROBABILITY = 0.95
+KEYPOINT_PROBABILITY = 0.95
 RELIABLE = FitSettings().reliable  # Confidence from which an answer is called reliable by default
 # the more, the better
 EVIDENCE_FEATURES = (
@@ -124,7 +124,7 @@ def detection_probability(
     Args:
         response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        rival: where landmarks led to the box, whose number is the response, the largest number at
+        rival: where keypoints led to the box, whose number is the response, the largest number at
             another place.
 
     Example:
@@ -132,7 +132,7 @@ def detection_probability(
         True
     """
     if rival is not None:
-        return LANDMARK_PROBABILITY * response / (response + 0.5 * rival)
+        return KEYPOINT_PROBABILITY * response / (response + 0.5 * rival)
     return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import LandmarkMatches
+from ..fitting.keypoints import KeypointMatches
 from ..fitting.together import details_together, evidence_together
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
@@ -29,14 +29,14 @@ class DescribedPhotograph:
         descriptor: (1, D) on a grid twice as fine as the bank's, or (H, D) if each pose has its own
             box.
         crops: of the box, for contour fits; None without them.
-        landmarks: those found in the box; None where they do not count.
+        keypoints: those found in the box; None where they do not count.
     """
 
     query: QueryFeatures
     ranking: Ranking
     descriptor: Tensor
     crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
+    keypoints: KeypointMatches | None
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class ComparedPoses:
 
     @property
     def keypoints(self) -> Tensor:
-        landmarks = self.photograph.landmarks
-        if landmarks is None:
+        keypoints = self.photograph.keypoints
+        if keypoints is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
-        count = landmarks.agreeing(self.poses.T, self.poses.cameras)
+        count = keypoints.agreeing(self.poses.T, self.poses.cameras)
         return (count - self.target.pipeline.fit.chance_keypoints).clamp(min=0.0)
 
     @property

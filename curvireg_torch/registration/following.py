@@ -12,6 +12,7 @@ from ..geometry.calibration import Camera
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
+from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
 from .inputs import ImageItem, image_items
 from .poses import Poses, hypothesis_of
@@ -94,7 +95,7 @@ class Follower:
         )
 
     @torch.no_grad()
-    def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
+    def start(self, image: ImageLike, pose: ArrayLike, *, confidence: float = 1.0) -> None:
         """Begin from a known pose, in place of registering the first frame.
 
         Args:
@@ -125,7 +126,9 @@ class Follower:
         self._base = confidence
 
     @torch.no_grad()
-    def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
+    def __call__(
+        self, image: ImageLike, box: BoxLike | None = None
+    ) -> Registration | FailedRegistration:
         """The pose in the next frame, or why there is none.
 
         Args:
@@ -137,7 +140,7 @@ class Follower:
         # with it.
         return map_on_threads(lambda image: self._next(image, box), [image])[0]
 
-    def _next(self, image: Any, box: Any) -> Registration | FailedRegistration:
+    def _next(self, image: ImageLike, box: BoxLike | None) -> Registration | FailedRegistration:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
@@ -176,7 +179,7 @@ class Follower:
         )
 
     def _registered(
-        self, item: ImageItem, image: Any, box: Any, least: float
+        self, item: ImageItem, image: ImageLike, box: BoxLike | None, least: float
     ) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of
         ``least``."""

@@ -40,7 +40,7 @@ from .unknown_camera import (
 from .work import (
     Work,
     fitted_poses,
-    landmark_poses,
+    keypoint_poses,
     least_starts,
     poses_in_box,
     poses_of_views,
@@ -154,7 +154,7 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
         ranking=ranking,
         descriptor=target.describer.descriptor(query.field),
         crops=crops,
-        landmarks=target.landmark_matches(item, item.box) if target.uses_landmarks else None,
+        keypoints=target.keypoint_matches(item, item.box) if target.uses_keypoints else None,
         item=item,
         limits=limits,
         exact=exact,
@@ -165,7 +165,7 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits,
     the last one at most, and which repeats another one: the same view with another camera, or a
-    pose that landmarks agree on, in place of the views near it.
+    pose that keypoints agree on, in place of the views near it.
 
     That outside is the best view there; it is never reported, and tells whether the limits are
     wrong.
@@ -173,7 +173,7 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     poses = _promising(target, work) if work.starts is None else work.starts
     repeated = _are_repeated(poses.view)
     if work.crops is not None and work.exact:
-        found, _ = landmark_poses(target, work.landmarks)
+        found, _ = keypoint_poses(target, work.keypoints)
         found = found if work.limits is None else found[work.limits.keeps(found)]
         if len(found):
             far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)

@@ -3,7 +3,6 @@ checks them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
+from ..utils.likes import ArrayLike, CameraLike, ImagesLike
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .described import DescribedPhotograph, evidence_of
 from .focal import focal_covariance
@@ -37,9 +37,9 @@ COMPARED = 5
 @torch.no_grad()
 def refine(
     target: Target,
-    images: Tensor | Sequence[Any],
-    camera_matrices: Any,
-    poses: Any,
+    images: ImagesLike,
+    camera_matrices: CameraLike | None,
+    poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
 ) -> list[Registration | FailedRegistration]:
@@ -86,7 +86,7 @@ def refine(
 def refine_items(
     target: Target,
     items: Sequence[ImageItem | CurviregError],
-    poses: Any,
+    poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
 ) -> list[Registration | FailedRegistration]:
@@ -139,7 +139,7 @@ def refine_item(
     wide_angles = settings.wide_angles
     poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
 
-    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, landmarks=None)
+    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, keypoints=None)
     weights = target.score_weights(exact=True)
     best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -14,8 +15,9 @@ from ..geometry.viewpoint import ViewSphere
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..utils.checks import check_device, check_option, check_symmetries
+from ..utils.checks import check_device, check_integer, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .detection import detect_item
@@ -27,6 +29,7 @@ from .result import FailedRegistration, Registration
 from .several import register_views
 from .target import Target
 from .work import map_items
+from .workers import Workers
 
 __all__ = ["Registrar"]
 
@@ -59,6 +62,9 @@ class Registrar(Target):
             an exact mesh without colours, see :func:`curvireg_torch.mesh.mesh_symmetries`;
             ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
+        workers: processes that register photographs side by side on a CPU, from the first call on;
+            1: this one, on several threads, which share Python's interpreter lock. A script starts
+            processes within ``if __name__ == "__main__":``. They show no progress.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "detection"
             (without a box), "bank", "ranking", "search" and "contours"; to cancel, it may raise
             what is no :class:`CurviregError`. On a CPU photographs are registered in parallel:
@@ -89,8 +95,10 @@ class Registrar(Target):
         mesh_is: str | None = None,
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
+        workers: int = 1,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
+        check_integer(workers, "workers")
         if device is not None:
             check_device(device)
         if mesh_is is not None:
@@ -146,17 +154,22 @@ class Registrar(Target):
             # Built on one thread, so that rounding does not depend on the number of threads.
             matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
         super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
+        self.workers = workers
+        if workers > 1 and self.bank.device.type != "cpu":
+            raise InvalidInputError(
+                "workers: processes are for the CPU; a GPU registers photographs together"
+            )
 
     @torch.no_grad()
     @in_full_precision
     def __call__(
         self,
-        images: Tensor | Sequence[Any],
-        boxes: Any | None = None,
-        camera_matrices: Any | None = None,
+        images: ImagesLike,
+        boxes: BoxesLike | None = None,
+        camera_matrices: CameraLike | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
-        masks: Any | None = None,
+        masks: Sequence[MaskLike | None] | Tensor | None = None,
     ) -> Results:
         """Register a batch.
 
@@ -195,6 +208,10 @@ class Registrar(Target):
 
         :meta private:
         """
+        if self.workers > 1 and len(items) > 1:
+            if not self._workers.are_open:
+                del self._workers
+            return self._workers.register(items, detects=detects)
         for other in self.others:
             other.share()
 
@@ -210,6 +227,10 @@ class Registrar(Target):
                 _ = target.detector  # created once, before threads use it
         results: Results = map_items(self, items, register)
         return results
+
+    @cached_property
+    def _workers(self) -> Workers:
+        return Workers(self, self.workers)
 
     def _result_of(
         self, item: ImageItem, index: int, *, detects: bool
@@ -227,13 +248,19 @@ class Registrar(Target):
         return self.others[model - 1] if model else self
 
     @in_full_precision
-    def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
+    def refine(
+        self, images: ImagesLike, camera_matrices: CameraLike | None, poses: ArrayLike
+    ) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
     @in_full_precision
     def register_views(
-        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+        self,
+        images: ImagesLike,
+        boxes: BoxesLike | None,
+        camera_matrices: CameraLike | None,
+        T_cam_from_world: ArrayLike,
     ) -> Registration:
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""

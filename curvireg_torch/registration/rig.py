@@ -153,7 +153,7 @@ class RigPhotograph(DescribedPhotograph):
             query=query,
             ranking=result.ranking,
             descriptor=target.describer.descriptor(query.field),
-            landmarks=target.landmark_matches(item, box) if target.uses_landmarks else None,
+            keypoints=target.keypoint_matches(item, box) if target.uses_keypoints else None,
             result=result,
         )
 

@@ -74,8 +74,8 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, target.bank)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
+    keypoints = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+    return replace(work, item=item, limits=limits, keypoints=keypoints, starts=starts)
 
 
 def with_fitted_focal_lengths(

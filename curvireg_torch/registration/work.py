@@ -11,7 +11,7 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import LandmarkMatches
+from ..fitting.keypoints import KeypointMatches
 from ..fitting.measured_fit import measure_contours
 from ..utils.company import map_in_company
 from ..utils.precision import exact_convolutions
@@ -91,8 +91,8 @@ def poses_in_box(target: Target, work: Work, *poses: Tensor) -> Poses:
     return Poses.in_box(target.describer, work.item.box, work.item.camera_matrix, *poses)
 
 
-def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
-    """Poses on which landmarks agree, as promising as the best view, and how many, the largest
+def keypoint_poses(target: Target, matches: KeypointMatches | None) -> tuple[Poses, Tensor]:
+    """Poses on which keypoints agree, as promising as the best view, and how many, the largest
     number first.
 
     :meta private:
@@ -113,13 +113,13 @@ def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Pos
 def fitted_poses(
     target: Target, work: Work, crops: EdgeCrops, starts: Poses, **options: Any
 ) -> Poses:
-    """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that
+    """Fit the contours of ``starts``; one keeps its pose if the fit leaves the keypoints that
     agree with it."""
     settings = target.pipeline.fit
     poses = fit_poses(target.describer, crops, starts, settings=settings, **options)
-    if work.landmarks is not None:
-        before = work.landmarks.agreeing(starts.T, starts.cameras)
-        after = work.landmarks.agreeing(poses.T, poses.cameras)
+    if work.keypoints is not None:
+        before = work.keypoints.agreeing(starts.T, starts.cameras)
+        after = work.keypoints.agreeing(poses.T, poses.cameras)
         is_left = (before >= settings.min_keypoints) & (after < settings.kept_keypoints * before)
         left = is_left.nonzero()[:, 0]
         if len(left):

@@ -3,7 +3,6 @@ was found."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from ..registration.inputs import ImageItem, image_item
 from ..registration.result import pose_in_words, two_decimals
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
+from ..utils.likes import BoxLike, ImageLike
 from .contours import close_up, draw_window
 from .encoding import to_uint8
 
@@ -36,7 +36,7 @@ LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. Whit
 
 
 def contour_overlay(
-    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
 ) -> np.ndarray:
     """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the
     box (white).
@@ -112,7 +112,7 @@ def _paste_tiles(
 
 @torch.no_grad()
 def side_pictures(
-    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
 ) -> dict[str, np.ndarray]:
     """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
     :func:`contour_overlay`.
@@ -151,7 +151,7 @@ def _field_picture(field: Tensor) -> np.ndarray:
 
 @torch.no_grad()
 def registration_sheet(
-    registrar: Registrar, result: Registration, image: Any, box: Any, *, note: str = ""
+    registrar: Registrar, result: Registration, image: ImageLike, box: BoxLike, *, note: str = ""
 ) -> np.ndarray:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared
     fields and the rivals.

@@ -154,11 +154,12 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
-        "mm.safetensors: built with --unit mm, not with --unit m",
+        "mm.safetensors: built in unit mm, not in m; leave the unit out, or build it again "
+        "(leave --unit out, or curvireg bank)",
     )
     refused(
         register_one("--up=-x", "--no-refine", **bank),
-        "mm.safetensors: built with --up=z, not with --up=-x",
+        "mm.safetensors: built with z up, not -x",
     )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
     assert register_one(*words, **bank) == 0

@@ -15,6 +15,6 @@ def test_keypoints_that_agree_by_chance_do_not_count(chance, expected):
     counts = torch.tensor([0.0, 2.0, 3.0, 22.0]).double()
     pipeline = Pipeline(fit=FitSettings(chance_keypoints=chance))
     poses = SimpleNamespace(T=torch.zeros(4, 4, 4), cameras=torch.zeros(4, 3, 3))
-    found = SimpleNamespace(landmarks=SimpleNamespace(agreeing=lambda *_: counts))
+    found = SimpleNamespace(keypoints=SimpleNamespace(agreeing=lambda *_: counts))
     compared = ComparedPoses(SimpleNamespace(pipeline=pipeline), found, poses)
     assert compared.keypoints.tolist() == expected

@@ -17,7 +17,7 @@ from curvireg_torch import (
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.evidence import Evidence
-from curvireg_torch.fitting import contour_fit
+from curvireg_torch.fitting import contour_fit, together
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -30,7 +30,6 @@ from curvireg_torch.registration import (
     work,
 )
 from curvireg_torch.registration import described as described_module
-from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
 from curvireg_torch.registration.inputs import ImageItem, check_crop
 from curvireg_torch.rendering import make_renderer
@@ -178,7 +177,7 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
         described.append(len(seen.rank))
         return measure(seen)
 
-    for module in (contour_fit, poses_module):
+    for module in (contour_fit, together):
         monkeypatch.setattr(module, "quick_fit", counted)
     monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
