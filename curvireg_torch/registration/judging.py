@@ -51,7 +51,8 @@ def judged(
         siblings: how many of the last poses a symmetry of the shape makes of the best one, which a
             feature of the mesh tells apart.
     """
-    scores = evidence.scores(target.score_weights(exact=work.exact))
+    weights = target.score_weights(exact=work.exact)
+    scores = evidence.scores(weights)
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]
     best = own[:1]
@@ -68,7 +69,7 @@ def judged(
     near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
         evidence[compared],
-        scores[compared],
+        evidence[compared].scores(replace(weights, landmarks=0.0)),
         concentration(work.ranking.scores[0], near),
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,

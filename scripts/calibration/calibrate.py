@@ -87,14 +87,14 @@ ESTIMATED = {
 SCENES_PER_MESH = 2.0
 
 SHARES = {
-    "tied": 0.1,
+    "tied": 0.05,
     "cut": 0.1,
     "cut_packages": 0.05,
-    "print": 0.05,
-    "mirrored": 0.02,
-    "wrong": 0.08,
+    "print": 0.03,
+    "mirrored": 0.01,
+    "wrong": 0.03,
+    "estimated_wrong": 0.03,
 }
-SHARES |= {"estimated_wrong": 0.08}
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each
 the same weight."""
 
