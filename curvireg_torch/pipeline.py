@@ -4,10 +4,9 @@ file."""
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from dataclasses import field as dataclass_field
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,16 +16,8 @@ from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
 from .evidence import EvidenceWeights
-from .features.learned_field import SHA256, LearnedCurvilinearSaliency
-from .filters import (
-    ApparentRidges,
-    AverageShadingGradient,
-    DepthCurvilinearSaliency,
-    HessianFrobeniusNorm,
-    ImageGradient,
-    MultiScaleCurvilinearSaliency,
-    MultiScaleFocusCurves,
-)
+from .features.fields import DEPTH_FIELDS, FIELDS
+from .features.learned_field import SHA256
 from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
@@ -46,25 +37,6 @@ __all__ = [
 ]
 VERSION = 2  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
-
-FIELDS: dict[str, Callable[[], nn.Module]] = {
-    "learned": LearnedCurvilinearSaliency,
-    "focus": MultiScaleFocusCurves,
-    "MFC": partial(MultiScaleFocusCurves, mode="reblur-saliency", saliency_weight=0.0),
-    "saliency": MultiScaleCurvilinearSaliency,
-    "gradient": ImageGradient,
-}
-"""Photograph filters by name: modules that are built without arguments. "MFC" is the paper's,
-"focus" the same weighted by CS, with the exact formula of the blur."""
-
-DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
-    "CS": DepthCurvilinearSaliency,
-    "ASG": AverageShadingGradient,
-    "HFN": HessianFrobeniusNorm,
-    "AR": ApparentRidges,
-}
-"""Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without
-arguments."""
 
 Settings = TypeVar("Settings")
 

@@ -37,6 +37,7 @@ MAX_FAILURES = 10
 # exit codes of ``--strict``
 NONE_RELIABLE = 3
 SOME_FAILED = 4
+NOT_CALIBRATED = "not calibrated for other terms, fields or views than the default ones"
 TRACKERS = ("m3t", "visp")
 FORMATS = ("ros", *TRACKERS)
 OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
@@ -78,9 +79,8 @@ def add_register(commands: Any) -> None:
         nargs="*",
         metavar="PHOTO... MESH",
         help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj "
-        ".ply .stl .off .glb "
-        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh "
-        "without colours is grey",
+        ".ply .stl .off .glb .gltf .3mf .urdf; with extras .step .iges .dae .usdz) or a bank. "
+        "Textures and colours are compared too; a mesh without colours is grey",
     )
     candidates = "a candidate mesh; repeat the option, and the best of them is reported"
     add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
@@ -443,11 +443,13 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     its files."""
     from ..registration.result import corners, remarks, two_decimals
 
-    confidence = (
-        "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
-    )
+    confidence = NOT_CALIBRATED
+    if document["confidence"] is not None:
+        confidence = two_decimals(document["confidence"])
+    kind = " (as seen by a camera that looks straight at it)"
+    of_camera = "" if document["translation"] is not None else kind
     print(
-        f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence "
+        f"viewpoint: {_angles(document)}{of_camera}   score {document['score']:.3f}   confidence "
         f"{confidence}, {document['verdict']}"
     )
     if not document["reliable"]:
@@ -460,7 +462,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     for instance in document.get("detection", {}).get("instances", []):
         print(
             f"found in box {corners(instance['box'])}: there with probability "
-            f"{two_decimals(instance['score'])}"
+            f"{two_decimals(instance['score'])}; {_angles(instance)}{_place(instance, document)}"
         )
     if document["translation"] is not None:
         print(
@@ -479,6 +481,13 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "
         f"{out}/overlay.png"
     )
+
+
+def _place(pose: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    """The translation of an instance, behind its angles; "" without a camera."""
+    if pose["translation"] is None:
+        return ""
+    return f", at {', '.join(f'{v:.4g}' for v in pose['translation'])} {document['unit']}"
 
 
 def _angles(pose: Mapping[str, Any]) -> str:

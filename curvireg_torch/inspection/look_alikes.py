@@ -131,11 +131,11 @@ def look_alikes(
         if report_progress is not None:
             report_progress(row, len(directions))
         angle = _angle(views, direction, group)
-        scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + STEPS[0], -torch.inf)
+        scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + sum(STEPS), -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
         half_turns = direction @ HALF_TURNS
         candidates = torch.cat([views[best[scores[best].isfinite()]], half_turns])
-        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + STEPS[0]]
+        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + sum(STEPS)]
         if not len(candidates):
             continue
         rival, score = _nearest(describer, candidates, distance, descriptors[row])

@@ -2,6 +2,7 @@
 
 import base64
 import html
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ from .report import ELEVATIONS, PIXELS_ACROSS, Inspection
 from .trial import Expected, Outcome
 
 MOST_PAIRS = 6
+FEW_PAIRS = 2  # where none is alike
 MOST_CONFUSIONS = 6
 PICTURE_SIDE = 224  # px
 
@@ -26,8 +28,8 @@ _PAGE = """<!DOCTYPE html>
 <title>curvireg inspect: {title}</title><style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
 table {{ border-collapse: collapse }} td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left }}
-figure {{ display: inline-block; margin: .5rem; vertical-align: top; max-width: 29rem }}
-img {{ height: 14rem; background: #eee }} .warning {{ border-left: 4px solid #d90; padding-left: .6rem }}
+figure {{ display: inline-block; margin: .5rem; vertical-align: top; max-width: 26rem }}
+img {{ height: 12rem; background: #eee }} .warning {{ border-left: 4px solid #d90; padding-left: .6rem }}
 </style></head><body><h1>{title}</h1>
 {body}
 </body></html>
@@ -91,7 +93,7 @@ def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
     )
     return [
         ("size", f"{sides} {unit}"),
-        ("faces", f"{facts.faces:,} in {facts.parts:,} parts, {closed}"),
+        ("faces", f"{facts.faces:,} in {facts.parts:,} part{'s' * (facts.parts > 1)}, {closed}"),
         ("colours", colours),
         ("thin parts", f"{100 * facts.thin:.0f} % of the surface, thinner than 1 % of the size"),
         (
@@ -113,15 +115,19 @@ def _warnings(warnings: Sequence[str]) -> str:
 
 
 def _symmetry_table(facts: MeshFacts) -> str:
-    shown = sorted(facts.symmetries, key=lambda symmetry: symmetry.angle, reverse=True)[:12]
-    rows = [("turn", "surface moves by, % of the diameter", "colours")]
+    groups = defaultdict[tuple[int, bool], list[float]](list)
+    for symmetry in facts.symmetries:
+        turn = round(symmetry.angle), symmetry.has_same_colours
+        groups[turn].append(symmetry.deviation_percent)
+    rows = [("turn", "axes and directions", "surface moves by, % of the diameter", "colours")]
     rows += [
         (
-            f"{symmetry.angle:.0f}°",
-            f"{symmetry.deviation_percent:.2f}",
-            "the same" if symmetry.has_same_colours else "differ",
+            f"{angle}°",
+            str(len(deviations)),
+            f"{max(deviations):.2f}",
+            "the same" if is_same else "differ",
         )
-        for symmetry in shown
+        for (angle, is_same), deviations in sorted(groups.items(), reverse=True)
     ]
     return _table(rows)
 
@@ -139,7 +145,8 @@ def _pairs(report: Inspection, registrar: Registrar | None) -> str:
     ]
     if registrar is None:
         return lines[0]
-    for pair in report.pairs[:MOST_PAIRS]:
+    shown = report.pairs[: MOST_PAIRS if report.alike else FEW_PAIRS]
+    for pair in shown:
         lines.append(_pair_figure(registrar.describer, registrar, pair))
     return "\n".join(lines)
 

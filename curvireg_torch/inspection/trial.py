@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import torch
+import torch.nn.functional as F
 import trimesh
 from scipy.stats import binomtest
 from torch import Tensor
@@ -37,7 +38,8 @@ from .surface import look_symmetries
 RIGHT_DEGREES = 30.0  # within which an answer is right, as confidence understands it
 FINE_DEGREES = 5.0
 COMPARED_FRACTION = 0.2  # of the photographs, with which other conditions are tried
-HINT_DEGREES = 45.0  # by which the hint may be off, and which it allows
+HINT_DEGREES = 45.0  # around a hint, within which the pose lies, as those of the viewer's
+HINT_ERROR = 30.0  # Degrees by which hints are off, at most
 SECOND_CAMERA = 60.0  # Degrees about the object between two photographs
 IDENTITY = torch.eye(3, dtype=torch.float64)[None]
 
@@ -215,10 +217,12 @@ class _Setup:
         return self.outcome(photograph, found if isinstance(found, Registration) else None)
 
     def register_with_hint(self, photograph: Photograph) -> Outcome:
-        error = HINT_DEGREES * (2.0 * float(torch.rand((), generator=_generator(photograph))) - 1.0)
-        middle = float(viewpoint_of(self.mesh, photograph.truth[:3, :3])[0]) + error
-        azimuth = (middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0
-        return self.register(photograph, prior=PosePrior(azimuth=azimuth))
+        """The outcome with a pose that a user has set by hand, some degrees off."""
+        generator = _generator(photograph)
+        axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        angle = math.radians(HINT_ERROR) * float(torch.rand((), generator=generator))
+        rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
+        return self.register(photograph, prior=PosePrior(rotation=rotation, within=HINT_DEGREES))
 
     def register_with_second(self, photograph: Photograph) -> Outcome:
         """The outcome of a photograph and a second one, of a camera to its side."""
@@ -265,9 +269,7 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
     other = replace(setup, with_camera=not is_known)
     conditions = [
         _Condition("without a camera" if is_known else "with a camera", other.register),
-        _Condition(
-            f"with a pose prior: azimuth within {HINT_DEGREES:g} degrees", setup.register_with_hint
-        ),
+        _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hint),
         _Condition("with a second photograph from another side", setup.register_with_second),
     ]
     if has_colours(setup.mesh):

@@ -71,8 +71,8 @@ def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None
     built_unit = mesh_unit(bank.mesh)
     built_up = mesh_up(bank.mesh)
     if unit not in (None, built_unit):
-        built = f"in unit {built_unit}" if built_unit else "without a unit"
-        message = f"built {built}, not in {unit}; leave the unit out, or build it again"
+        built = f"with unit {built_unit}" if built_unit else "without a unit"
+        message = f"built {built}, not {unit}; leave the unit out, or build it again"
         raise BankError(message, subject=path, kind="bank unit")
     if up not in (None, built_up):
         message = f"built with {built_up} up, not {up}; leave the axis out, or build it again"

@@ -27,6 +27,7 @@ from ..registration.detection import detect_items
 from ..registration.inputs import image_item
 from ..registration.poses import projected_box
 from ..registration.refinement import refine_items
+from ..registration.registrar import ObjectLike
 from ..registration.result import detection_document, result_document
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
@@ -97,7 +98,7 @@ class RegisteredPhotograph(Registration):
 
 def register(
     image: ImageLike,
-    mesh: Any,
+    mesh: ObjectLike | Registrar,
     *,
     box: BoxLike | None = None,
     camera: CameraLike | str | PathLike[str] | None = None,

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +17,7 @@ from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..utils.checks import check_device, check_integer, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
-from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike
+from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .detection import detect_item
@@ -34,6 +34,7 @@ from .workers import Workers
 __all__ = ["Registrar"]
 
 Results = list[Registration | FailedRegistration]
+ObjectLike: TypeAlias = MeshLike | ViewBank | ViewMatcher
 
 
 class Registrar(Target):
@@ -85,7 +86,7 @@ class Registrar(Target):
 
     def __init__(
         self,
-        bank_or_mesh: Any,
+        bank_or_mesh: ObjectLike | Sequence[ObjectLike],
         *,
         pipeline: Pipeline | None = None,
         views: ViewSphere | None = None,
@@ -105,9 +106,10 @@ class Registrar(Target):
             check_option(mesh_is, MESH_KINDS, "mesh_is")
         if symmetries is not None:
             check_symmetries(symmetries)
+        source: Any = bank_or_mesh
         self.others = []
-        if isinstance(bank_or_mesh, list | tuple):
-            meshes = list(bank_or_mesh)
+        if isinstance(source, list | tuple):
+            meshes = list(source)
             if not meshes:
                 raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
             if len(meshes) > 1 and not isinstance(renderer, str):
@@ -127,15 +129,15 @@ class Registrar(Target):
                 "device": device,
             }
             self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
-            bank_or_mesh = meshes[0]
-        matcher: ViewMatcher = bank_or_mesh
-        if isinstance(bank_or_mesh, ViewMatcher):
+            source = meshes[0]
+        matcher: ViewMatcher = source
+        if isinstance(source, ViewMatcher):
             if any(value is not None for value in (pipeline, field, views, settings)):
                 raise InvalidInputError(
                     "Registrar: pipeline, field, views and settings belong to the matcher"
                 )
         else:
-            if not isinstance(bank := bank_or_mesh, ViewBank):
+            if not isinstance(bank := source, ViewBank):
                 pipeline = pipeline or Pipeline()
                 pipeline = replace(pipeline, bank=settings or pipeline.bank)
                 built: dict[str, Any] = {
@@ -144,7 +146,7 @@ class Registrar(Target):
                     "progress": progress,
                     "device": device or "cpu",
                 }
-                bank = cached_bank(bank_or_mesh, views, **built)
+                bank = cached_bank(source, views, **built)
             elif views is not None or settings is not None:
                 raise InvalidInputError(
                     "Registrar: views and settings belong to the bank; give them with a mesh only"
