@@ -81,27 +81,61 @@ class CurviregError(_SubjectError):
 
 class CurviregWarning(_SubjectError, UserWarning):  # noqa: N818
     """A file is usable, but perhaps not what the user means; fields as of
-    :class:`CurviregError`."""
+    :class:`CurviregError`.
+
+    Example:
+        >>> import warnings
+        >>> with warnings.catch_warnings(record=True) as seen:
+        ...     warnings.simplefilter("always")
+        ...     warnings.warn(CurviregWarning("small", subject="the box"), stacklevel=1)
+        >>> str(seen[0].message)
+        'the box: small'
+    """
 
 
 class InvalidInputError(CurviregError, ValueError):
-    """An argument has the wrong shape, dtype, device, range or option name."""
+    """An argument has the wrong shape, dtype, device, range or option name.
+
+    Example:
+        >>> issubclass(InvalidInputError, ValueError)
+        True
+    """
 
 
 class ImageError(CurviregError, ValueError):
-    """A photograph cannot be read, or shows nothing to register."""
+    """A photograph cannot be read, or shows nothing to register.
+
+    Example:
+        >>> issubclass(ImageError, ValueError)
+        True
+    """
 
 
 class MeshError(CurviregError, ValueError):
-    """A mesh cannot be read, is empty, or has unusable vertices or faces."""
+    """A mesh cannot be read, is empty, or has unusable vertices or faces.
+
+    Example:
+        >>> issubclass(MeshError, ValueError)
+        True
+    """
 
 
 class BankError(CurviregError, ValueError):
-    """A bank file is truncated, of another version, or does not fit the request."""
+    """A bank file is truncated, of another version, or does not fit the request.
+
+    Example:
+        >>> issubclass(BankError, ValueError)
+        True
+    """
 
 
 class MissingFileError(CurviregError, FileNotFoundError):
-    """A file or folder does not exist."""
+    """A file or folder does not exist.
+
+    Example:
+        >>> issubclass(MissingFileError, FileNotFoundError)
+        True
+    """
 
 
 class LostObjectError(CurviregError, ValueError):
@@ -111,21 +145,44 @@ class LostObjectError(CurviregError, ValueError):
     Attributes:
         detection: the :class:`.Detection` of the most likely place, with all proposals, in a
             photograph without a box.
+
+    Example:
+        >>> issubclass(LostObjectError, ValueError)
+        True
     """
 
     detection: Any = None
 
 
 class OutputError(InvalidInputError, OSError):
-    """A file or folder cannot be written."""
+    """A file or folder cannot be written.
+
+    Example:
+        >>> issubclass(OutputError, OSError)
+        True
+    """
 
 
 class MissingDependencyError(CurviregError, ImportError):
-    """An optional package is required for this call."""
+    """An optional package is required for this call.
+
+    Example:
+        >>> issubclass(MissingDependencyError, ImportError)
+        True
+    """
+
+
+class WorkerError(CurviregError, RuntimeError):
+    """A process that registers photographs ended before it was done."""
 
 
 class RenderingError(CurviregError, RuntimeError):
-    """No renderer works on this machine, or the selected one failed."""
+    """No renderer works on this machine, or the selected one failed.
+
+    Example:
+        >>> issubclass(RenderingError, RuntimeError)
+        True
+    """
 
 
 MAX_IMAGE_BYTES = 1 << 28  #: Bytes of an image file

@@ -12,10 +12,6 @@ from .utils.rows import Rows
 
 __all__ = ["Evidence", "EvidenceWeights", "SeenPoses"]
 
-CHANCE_KEYPOINTS = 2
-"""Keypoints that agree with a wrong pose by chance: on generated shelves, 96 % of wrong hypotheses
-have no more."""
-
 
 @dataclass(frozen=True)
 class EvidenceWeights:
@@ -43,13 +39,27 @@ class EvidenceWeights:
         for name, weight in vars(self).items():
             check_number(weight, name)
 
+    @classmethod
+    def only(cls, **weights: float) -> "EvidenceWeights":
+        """Weights of some kinds, the others 0."""
+        return cls(**{**dict.fromkeys((field.name for field in fields(cls)), 0.0), **weights})
 
-RANK_ALONE = EvidenceWeights(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+RANK_ALONE = EvidenceWeights.only(rank=1.0)
 """Weights with the mesh of a similar object: poses keep the order of the ranking."""
 
 
 class SeenPoses(Protocol):
-    """H poses of an object beside a photograph: what evidence is read from, each (H,) float64."""
+    """H poses of an object beside a photograph: what evidence is read from, each (H,) float64.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> one = torch.ones(1, dtype=torch.float64)
+        >>> names = ("rank", "similarity", "edge_support", "appearance", "keypoints", "contours")
+        >>> seen = SimpleNamespace(**dict.fromkeys(names, one))
+        >>> Evidence.of(seen).similarity.tolist()
+        [1.0]
+    """
 
     @property
     def rank(self) -> Tensor:
@@ -69,7 +79,7 @@ class SeenPoses(Protocol):
 
     @property
     def keypoints(self) -> Tensor:
-        """Number of keypoints that agree with a pose."""
+        """Number of keypoints that agree with a pose, beyond those that agree by chance."""
 
     @property
     def contours(self) -> Tensor:
@@ -89,13 +99,20 @@ class Evidence(Rows):
         similarity: normalised correlation of the pose's view with the photograph.
         edge_support: of the fitted pose; 0 without the contour fit.
         appearance: log appearance score of the pose; 0 without that term.
-        landmarks: log (1 + n) with the number n of keypoints that agree with the pose, beyond
-            ``CHANCE_KEYPOINTS``; 0 without colours, camera or contour fit, with a similar mesh, and
+        landmarks: log (1 + n) with the number n of keypoints that agree with the pose, beyond those
+            that agree by chance; 0 without colours, camera or contour fit, with a similar mesh, and
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
             for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
         contours: by how much the edges under its contours exceed chance, see
             :func:`.contour_evidence`; 0 without the contour fit.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> similarity = torch.tensor([0.75, 0.5], dtype=torch.float64)
+        >>> evidence = replace(Evidence.zeros(2), similarity=similarity)
+        >>> evidence.named(0)["similarity"], evidence.scores(EvidenceWeights()).tolist()
+        (0.75, [7.5, 5.0])
     """
 
     rank: Tensor
@@ -114,10 +131,16 @@ class Evidence(Rows):
             similarity=seen.similarity,
             edge_support=seen.edge_support.nan_to_num(0.0),
             appearance=seen.appearance.double(),
-            landmarks=keypoint_evidence(seen.keypoints),
+            landmarks=seen.keypoints.log1p(),
             details=torch.zeros_like(seen.similarity),
             contours=seen.contours,
         )
+
+    @classmethod
+    def zeros(cls, count: int) -> "Evidence":
+        """``count`` poses for which nothing speaks."""
+        nothing = torch.zeros(count, dtype=torch.float64)
+        return cls(**{field.name: nothing for field in fields(cls)})
 
     @classmethod
     def of_hypotheses(cls, reported: Sequence[Mapping[str, float]]) -> "Evidence":
@@ -150,8 +173,3 @@ class Evidence(Rows):
     def named(self, h: int) -> dict[str, float]:
         """The evidence of pose ``h`` by name, as a hypothesis reports it."""
         return {name: float(column[h]) for name, column in self.columns().items()}
-
-
-def keypoint_evidence(count: Tensor) -> Tensor:
-    """(H,) :attr:`Evidence.landmarks` of numbers of keypoints that agree."""
-    return (count - CHANCE_KEYPOINTS).clamp(min=0.0).log1p()

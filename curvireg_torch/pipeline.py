@@ -1,12 +1,12 @@
 """The settings of a method that may be chosen, in one frozen value: the only source of their
-defaults. Constants of single steps stand at the top of the file of the step."""
+defaults, and what docs/experiments.md varies. Other constants of a step stand at the top of its
+file."""
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from dataclasses import field as dataclass_field
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,20 +15,13 @@ import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
-from .features.learned_field import SHA256, LearnedCurvilinearSaliency
-from .filters import (
-    ApparentRidges,
-    AverageShadingGradient,
-    DepthCurvilinearSaliency,
-    HessianFrobeniusNorm,
-    ImageGradient,
-    MultiScaleCurvilinearSaliency,
-    MultiScaleFocusCurves,
-)
+from .evidence import EvidenceWeights
+from .features.fields import DEPTH_FIELDS, FIELDS
+from .features.learned_field import SHA256
 from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
-from .utils.checks import check_option, check_positive
+from .utils.checks import check_integer, check_option, check_positive, check_probability
 from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
 
@@ -38,30 +31,12 @@ __all__ = [
     "PRESETS",
     "BankSettings",
     "DetectionSettings",
+    "FitSettings",
     "Pipeline",
     "ViewPolicy",
 ]
 VERSION = 2  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
-
-FIELDS: dict[str, Callable[[], nn.Module]] = {
-    "learned": LearnedCurvilinearSaliency,
-    "focus": MultiScaleFocusCurves,
-    "MFC": partial(MultiScaleFocusCurves, mode="reblur-saliency", saliency_weight=0.0),
-    "saliency": MultiScaleCurvilinearSaliency,
-    "gradient": ImageGradient,
-}
-"""Photograph filters by name: modules that are built without arguments. "MFC" is the paper's,
-"focus" the same weighted by CS, with the exact formula of the blur."""
-
-DEPTH_FIELDS: dict[str, Callable[..., nn.Module]] = {
-    "CS": DepthCurvilinearSaliency,
-    "ASG": AverageShadingGradient,
-    "HFN": HessianFrobeniusNorm,
-    "AR": ApparentRidges,
-}
-"""Depth filters by the paper's names: modules (N, 1, S, S) -> (N, 2, S, S) that are built without
-arguments."""
 
 Settings = TypeVar("Settings")
 
@@ -142,6 +117,10 @@ class BankSettings:
             defaults.
         grid, bins, block, clip: of :func:`hog`.
         point_fraction: of :func:`field_points`.
+
+    Example:
+        >>> BankSettings(image_size=64).grid
+        8
     """
 
     image_size: int = 128
@@ -182,6 +161,10 @@ class DetectionSettings:
         min_size: longer side of the smallest object that is searched for, as a fraction of the
             photograph's.
         proposals: number of boxes that are compared with all views of the bank.
+
+    Example:
+        >>> replace(Pipeline(), detection=DetectionSettings(proposals=40)).detection.views
+        96
     """
 
     views: int = 96
@@ -195,6 +178,82 @@ class DetectionSettings:
             raise InvalidInputError(
                 f"detection: min_size: expected a fraction in [0.02, 1], got {self.min_size}"
             )
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How views become poses, and poses an answer. Files of pipelines name them in an ablation;
+    confidences are calibrated for the defaults.
+
+    Attributes:
+        screened_views: best distinct views of an exact mesh that get a short contour fit, which
+            decides with their rank which become hypotheses.
+        screening_weight: of the edge support that a short fit reaches, beside log S, in that
+            choice.
+        least_hypotheses: that are refined, even if fewer are reported: the confidence depends on
+            rivals. Of 15 photographs of another object, 14 were called reliable with one
+            hypothesis, 2 with two, none with three or five.
+        start_angle, start_roll: degrees by which a pose is rotated left, right, up and down, and
+            about the line of sight, for further starts: about half the spacing of a bank's views.
+        far_angle: degrees of more starts of a pose that is fitted again.
+        wide_angles: degrees of more starts of poses that are refined: they may be worse than views
+            of a bank.
+        kept_starts: starts of a pose that continue after the first round.
+        finished_fits: hypotheses of a photograph whose contours are fitted at full size.
+        close_score: by which rivals may be behind to be compared with the best pose in detail.
+        close_rivals: how many of them are fitted as thoroughly.
+        same_pose_angle: degrees within which two fitted hypotheses count as one.
+        min_keypoints: that must agree on a pose to make it a start.
+        kept_keypoints: fraction of the keypoints that agree with a start, which must agree with its
+            fit as well.
+        chance_keypoints: that agree with a wrong pose by chance: on generated shelves, 96 % of
+            wrong hypotheses have no more.
+        weights: what each kind of evidence counts for in the score of a pose.
+        lost_confidence: confidence of a refinement below which the object counts as lost, see
+            docs/guides/known-pose.md.
+        reliable: confidence from which an answer is called reliable.
+
+    Raises:
+        InvalidInputError: a number out of range.
+
+    Example:
+        >>> replace(Pipeline(), fit=FitSettings(screened_views=15)).describe()["fit"]["start_angle"]
+        8.0
+    """
+
+    screened_views: int = 10
+    screening_weight: float = 20.0
+    least_hypotheses: int = 3
+    start_angle: float = 8.0
+    start_roll: float = 6.0
+    far_angle: float = 16.0
+    wide_angles: tuple[float, ...] = (14.0, 22.0)
+    kept_starts: int = 3
+    finished_fits: int = 2
+    close_score: float = 2.5
+    close_rivals: int = 2
+    same_pose_angle: float = 15.0
+    min_keypoints: int = 8
+    kept_keypoints: float = 0.5
+    chance_keypoints: int = 2
+    weights: EvidenceWeights = EvidenceWeights()
+    lost_confidence: float = 0.35
+    reliable: float = 0.9
+
+    def __post_init__(self) -> None:
+        angles = tuple(check_positive(angle, "fit: wide_angles") for angle in self.wide_angles)
+        object.__setattr__(self, "wide_angles", angles)
+        for name in ("screened_views", "least_hypotheses", "kept_starts", "finished_fits"):
+            check_integer(getattr(self, name), f"fit: {name}")
+        check_integer(self.min_keypoints, "fit: min_keypoints", least=4)
+        for name in ("close_rivals", "chance_keypoints"):
+            check_integer(getattr(self, name), f"fit: {name}", least=0)
+        for name in ("start_angle", "start_roll", "far_angle", "same_pose_angle"):
+            check_positive(getattr(self, name), f"fit: {name}")
+        for name in ("screening_weight", "close_score"):
+            check_positive(getattr(self, name), f"fit: {name}", zero_ok=True)
+        for name in ("kept_keypoints", "lost_confidence", "reliable"):
+            check_probability(getattr(self, name), f"fit: {name}")
 
 
 @dataclass(frozen=True)
@@ -216,6 +275,7 @@ class Pipeline:
             contour fit.
         contours: fit the mesh's contours to the photograph's edges.
         detection: how boxes that are not given are found.
+        fit: how views become poses, and poses an answer.
 
     Raises:
         InvalidInputError: an unknown name or a number out of range.
@@ -239,6 +299,7 @@ class Pipeline:
     search: bool = False
     contours: bool = True
     detection: DetectionSettings = DetectionSettings()
+    fit: FitSettings = FitSettings()
 
     def __post_init__(self) -> None:
         if not self.field.startswith(CUSTOM):
@@ -308,6 +369,7 @@ class Pipeline:
             "terms": {term.name: asdict(term) for term in self.terms},
         }
         described["views"]["elevations"] = list(self.views.elevations)
+        described["fit"]["wide_angles"] = list(self.fit.wide_angles)
         return described
 
     def to_json(self) -> str:

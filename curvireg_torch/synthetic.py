@@ -34,7 +34,13 @@ DEFOCUS = 1.5  # blur of the background in px
 
 def example_mesh(*, painted: bool = False) -> trimesh.Trimesh:
     """Return a toy truck, 0.25 m long, without symmetries; z up, front along -y, in metres;
-    ``painted``: in colours."""
+    ``painted``: in colours.
+
+    Example:
+        >>> mesh = example_mesh()
+        >>> mesh.is_watertight, len(mesh.faces) > 30
+        (True, True)
+    """
     box = trimesh.creation.box
     cylinder = trimesh.creation.cylinder
     shift = trimesh.transformations.translation_matrix
@@ -72,7 +78,14 @@ def random_pose(
     fill: tuple[float, float] = (0.4, 0.7),
 ) -> Tensor:
     """Return a (4, 4) float64 pose of an upright object that fills ``fill`` of the image's shorter
-    side."""
+    side.
+
+    Example:
+        >>> from curvireg_torch.geometry import camera_matrix
+        >>> K = camera_matrix(200.0, 200.0, 79.5, 59.5)
+        >>> random_pose(example_mesh(), K, (120, 160), torch.Generator().manual_seed(0)).shape
+        torch.Size([4, 4])
+    """
     u = torch.rand(6, generator=generator, dtype=torch.float64)
     elevation = elevations[0] + (elevations[1] - elevations[0]) * u[1]
     fraction = fill[0] + (fill[1] - fill[0]) * float(u[3])
@@ -86,7 +99,12 @@ def random_pose(
 
 
 def procedural_background(size: tuple[int, int], generator: torch.Generator) -> Tensor:
-    """Return (3, H, W) clutter: coloured 1/f noise with a few tilted bands."""
+    """Return (3, H, W) clutter: coloured 1/f noise with a few tilted bands.
+
+    Example:
+        >>> procedural_background((48, 64), torch.Generator().manual_seed(0)).shape
+        torch.Size([3, 48, 64])
+    """
     H, W = size
     picture = torch.zeros(1, 3, H, W)
     for octave in range(1, 7):
@@ -118,7 +136,17 @@ def synthesize_photograph(
     """Return a photograph (3, H, W) in [0, 1] of the mesh under random light, and the object's box
     (4,) in px. ``texture`` is the contrast of a random solid pattern; a mesh whose colours vary
     shows those instead. The background (3, H, W), default :func:`procedural_background`, is blurred
-    by ``defocus`` px."""
+    by ``defocus`` px.
+
+    Example:
+        >>> from curvireg_torch.geometry import camera_matrix
+        >>> K = camera_matrix(200.0, 200.0, 79.5, 59.5)
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> T = random_pose(example_mesh(), K, (120, 160), generator)
+        >>> image, box = synthesize_photograph(example_mesh(), T, K, (120, 160), generator)
+        >>> image.shape, box.shape
+        (torch.Size([3, 120, 160]), torch.Size([4]))
+    """
     H, W = size
     # Supersampling by two.
     K = (
@@ -178,7 +206,13 @@ def synthesize_photograph(
 class DemoScene(NamedTuple):
     """A generated ``image`` (3, 720, 960), float32 RGB in [0, 1], of a known object, its ``mesh``
     in metres and ``box`` (4,) x0, y0, x1, y1 in px; ``camera_matrix`` (3, 3) and ``truth`` (4, 4),
-    ``T_cam_from_model``, in float64."""
+    ``T_cam_from_model``, in float64.
+
+    Example:
+        >>> scene = demo_scene()
+        >>> scene.image.shape[0], scene.box.shape
+        (3, torch.Size([4]))
+    """
 
     mesh: trimesh.Trimesh
     image: Tensor

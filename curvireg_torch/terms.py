@@ -4,7 +4,7 @@ ranking multiplies."""
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from dataclasses import field as dataclass_field
 from typing import Any, ClassVar
 
@@ -70,6 +70,15 @@ class QueryFeatures:
         mask: (B, 1, S, S) probability that pixels of the first crop belong to the object, where the
             field predicts it.
         computed: features of the crops that terms have computed, by the term's name.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=90, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> query = cr.ViewMatcher(bank).query([scene.image], scene.box[None])
+        >>> query.crops.shape, query.field.shape
+        (torch.Size([1, 3, 64, 64]), torch.Size([1, 2, 64, 64]))
     """
 
     regions: Tensor
@@ -84,6 +93,26 @@ class QueryFeatures:
     def crops(self) -> Tensor:
         """(B, C, S, S) crops of the boxes themselves."""
         return self.regions[:, 0]
+
+    def split(self) -> "list[QueryFeatures]":
+        """Each photograph by itself."""
+        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
+        known = [getattr(self, name) for name in names]
+        count = len(self.regions)
+        parts = [[None] * count if x is None else x.split(1) for x in known]
+        queries = [QueryFeatures(*row) for row in zip(*parts, strict=True)]
+        for name, x in self.computed.items():
+            for query, part in zip(queries, x.split(1), strict=True):
+                query.computed[name] = part
+        return queries
+
+    @staticmethod
+    def cat(queries: "Sequence[QueryFeatures]") -> "QueryFeatures":
+        """The photographs together."""
+        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
+        known = [[getattr(query, name) for query in queries] for name in names]
+        parts = [None if some[0] is None else torch.cat(some) for some in known]
+        return QueryFeatures(*parts)  # type: ignore[arg-type]
 
 
 def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -186,7 +215,12 @@ Comparison = Callable[[QueryFeatures], Tensor]
 class Term(ABC):
     """One factor of the score S = prod S_t^w_t of a view for a photograph, left out where its
     ``weight`` w is 0. A new term is a frozen dataclass of plain numbers with a ``name`` and a
-    method ``build``, added to ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it."""
+    method ``build``, added to ``curvireg_torch.terms.TERMS`` if JSON files of pipelines name it.
+
+    Example:
+        >>> BoxShape.name, isinstance(BoxShape(), Term)
+        ('box', True)
+    """
 
     name: ClassVar[str]
     weight: float = 1.0
@@ -214,7 +248,13 @@ class Term(ABC):
 class Whitening(nn.Module):
     r"""x -> L^-1 (x - mean), where Sigma = L L^T: inner products become
     :math:`(x - \mu)^T \Sigma^{-1} (y - \mu)`. ``mean`` is (D,), ``covariance`` (D, D), symmetric,
-    positive definite."""
+    positive definite.
+
+    Example:
+        >>> whitening = Whitening(torch.ones(2), torch.diag(torch.tensor([4.0, 1.0])))
+        >>> whitening(torch.tensor([[3.0, 2.0]])).tolist()
+        [[1.0, 1.0]]
+    """
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
@@ -325,6 +365,10 @@ class Correlation(Term):
 
     Attributes:
         whitening: which of these.
+
+    Example:
+        >>> Correlation(whitening="bank").weight
+        1.0
     """
 
     name: ClassVar[str] = "hog"
@@ -371,6 +415,10 @@ class Repeatability(Term):
     Attributes:
         sigma, mode: of the score; the paper's :math:`\sigma_r`.
         eps: largest distance of matching points, as a fraction of the crop's side.
+
+    Example:
+        >>> Repeatability().log_score(torch.tensor([[0.9, 0.8]])).tolist()[0][0]
+        -0.0
     """
 
     name: ClassVar[str] = "repeatability"
@@ -462,7 +510,12 @@ def cell_counts(points: Tensor, cell: int) -> Tensor:
 class BoxShape(Term):
     r"""S_box in (0, 1], best view 1: :math:`\exp(-(d^2 - \min d^2) / (2\sigma^2))` with the
     difference d of the logs of width / height of the boxes of photograph and view. All views score
-    1 if the photograph's box reaches its border."""
+    1 if the photograph's box reaches its border.
+
+    Example:
+        >>> BoxShape().log_score(torch.tensor([[1.0, 0.5]])).tolist()
+        [[0.0, -0.6931471824645996]]
+    """
 
     name: ClassVar[str] = "box"
     sigma: float = 0.2  # corresponds to a box that is a fifth too wide
@@ -495,6 +548,11 @@ class Appearance(Term):
     bank a fixed packing is compared, with views at least ``min_angle`` degrees apart: of its cells,
     the ``top`` that hold the best views of the other terms. Every other view gets the score of the
     nearest compared view, and NaN as raw score. ``weights`` is the digest of the network's.
+
+    Example:
+        >>> from curvireg_torch.pipeline import Pipeline
+        >>> Pipeline().with_term("appearance", top=32).terms[-1] == Appearance(top=32)
+        True
     """
 
     name: ClassVar[str] = "appearance"

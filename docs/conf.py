@@ -56,6 +56,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": True,
     "download_all_examples": False,
     "min_reported_time": 1,
+    "write_computation_times": False,  # its page fetches scripts
 }
 
 COPIED_PAGES = {

@@ -3,13 +3,15 @@
 import datetime
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import resource
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RESULTS = REPOSITORY / "scripts" / "results"
@@ -79,9 +81,9 @@ def processor() -> str:
 
 def run_process(
     words: Sequence[str], folder: Path, environment: dict[str, str]
-) -> tuple[float, resource.struct_rusage, str]:
+) -> "tuple[float, resource.struct_rusage, str]":
     """Seconds, resources and output of a Python process in a folder; the script ends if the process
-    fails.
+    fails. On Windows, which does not count resources, an AttributeError.
 
     Args:
         words: arguments of the interpreter.

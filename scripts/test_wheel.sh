@@ -25,7 +25,7 @@ import curvireg_torch
 
 package = Path(curvireg_torch.__file__).parent
 assert package.is_relative_to(Path(sys.argv[1]).resolve()), f"imported from {package}, not from the wheel"
-for name in ("py.typed", "registration/calibration.json"):
+for name in ("py.typed", "calibration/calibration.json"):
     assert (files("curvireg_torch") / name).is_file(), f"the wheel lacks {name}"
 PYTHON
 "$work/venv/bin/curvireg" --version

@@ -34,7 +34,8 @@ def test_the_score_is_the_weighted_sum(name):
 def test_how_near_a_view_was_and_support_alone_are_no_evidence_for_a_fitted_pose(name):
     """Else of two poses that fit equally well the one with the nearer view would win by chance."""
     tied = evidence(2, similarity=[0.7, 0.7], **{name: [0.0, -1.335]})
-    assert tied.scores(EvidenceWeights()).tolist() == [7.0, 7.0]
+    first, second = tied.scores(EvidenceWeights()).tolist()
+    assert first == second
 
 
 def test_a_similar_mesh_keeps_the_order_of_the_ranking():
@@ -48,7 +49,7 @@ def test_evidence_is_read_from_poses():
         similarity=torch.tensor([0.7, 0.6]).double(),
         edge_support=torch.tensor([0.4, torch.nan]).double(),
         appearance=torch.tensor([0.5, -0.5]).double(),
-        keypoints=torch.tensor([1.0, 22.0]).double(),
+        keypoints=torch.tensor([0.0, 20.0]).double(),
         contours=torch.tensor([0.3, 0.0]).double(),
     )
     read = Evidence.of(seen)

@@ -7,9 +7,11 @@ import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.evidence import EvidenceWeights
 from curvireg_torch.features import LearnedCurvilinearSaliency
 from curvireg_torch.filters import MultiScaleFocusCurves
 from curvireg_torch.geometry import paper_views, sample_views
+from curvireg_torch.matching.cache import bank_key
 from curvireg_torch.matching.describe import depth_filter
 from curvireg_torch.pipeline import (
     DEFAULT,
@@ -17,6 +19,7 @@ from curvireg_torch.pipeline import (
     FIELDS,
     PRESETS,
     BankSettings,
+    FitSettings,
     ViewPolicy,
     preset_named,
 )
@@ -86,6 +89,11 @@ def test_json_contains_every_setting():
         "detection": ("views", "proposals"),
     }.items():
         changed += [replace(base, **{part: replace(getattr(base, part), **{n: 40})}) for n in names]
+    for f in fields(FitSettings):
+        other = {"wide_angles": (10.0,), "weights": EvidenceWeights(details=2.0)}
+        fractions = dict.fromkeys(("kept_keypoints", "lost_confidence", "reliable"), 0.75)
+        value = (other | fractions).get(f.name, 7)
+        changed.append(replace(base, fit=replace(base.fit, **{f.name: value})))
     for term in base.terms:
         for f in fields(term):
             value = {"none": "bank", "monotone": "paper", 1000: 7, 64: 7}.get(
@@ -116,6 +124,10 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
         ('{"views": {"theta_step": 0}}', "theta_step"),
         ('{"bank": {"image_size": 4}}', "image_size"),
         ('{"bank": {"block": 9}}', "hog: expected 1 <= block"),
+        ('{"fit": {"screened_views": 0}}', "fit: screened_views"),
+        ('{"fit": {"reliable": 2}}', "fit: reliable"),
+        ('{"fit": {"wide_angles": [-1]}}', "fit: wide_angles"),
+        ('{"fit": {"weights": {"detail": 1}}}', "fit: weights: unknown key 'detail'"),
         ('{"terms": {"hug": {}}}', "term: expected one of 'hog'"),
         *((f'{{"terms": {{"{name}": {{"weight": -1}}}}}}', f"{name}: weight") for name in TERMS),
         ('{"box_jitter": 0.6}', "box_jitter"),
@@ -133,6 +145,17 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
         with pytest.raises(InvalidInputError, match=message) as caught:
             Pipeline.read(path)
         assert "mine.json" in str(caught.value)
+
+
+def test_a_file_varies_a_fit_and_keeps_the_bank():
+    text = '{"fit": {"screened_views": 15, "weights": {"appearance": 5.0}}}'
+    pipeline = Pipeline.from_json(text)
+    weights = EvidenceWeights(appearance=5.0)
+    assert pipeline.fit == FitSettings(screened_views=15, weights=weights)
+    mesh = trimesh.creation.box((1, 2, 3))
+    views = sample_views(azimuth_step=60, elevations=[20])
+    keys = [bank_key(mesh, views, pipeline=p, renderer="auto") for p in (pipeline, Pipeline())]
+    assert keys[0] == keys[1]
 
 
 def test_photograph_field_refuses_other_weights():

@@ -188,7 +188,7 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     if run_processes(arguments.jobs, arguments.argv):
         return
     benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
-    check_writable(out, "--out")
+    check_writable(out)
     how: dict[str, Any] = {
         "limit": arguments.limit,
         "renderer": options.renderer,

@@ -37,6 +37,9 @@ MAX_FAILURES = 10
 # exit codes of ``--strict``
 NONE_RELIABLE = 3
 SOME_FAILED = 4
+NOT_CALIBRATED = "not calibrated for other terms, fields or views than the default ones"
+TRACKERS = ("m3t", "visp")
+FORMATS = ("ros", *TRACKERS)
 OPEN_AXES = 1.0  # axes of rotation that a fit leaves undetermined, from which the advice says so
 
 STAGES = {
@@ -129,11 +132,12 @@ def add_register(commands: Any) -> None:
         f"photographs failed"
     )
     add("--strict", action="store_true", help=strict)
-    ros = (
+    formats = (
         "ros: also write DIR/pose.yaml, a PoseStamped, DIR/tf.yaml, and, of reliable poses, "
-        "DIR/pose_with_covariance.yaml, in metres"
+        "DIR/pose_with_covariance.yaml, in metres; m3t, visp: a start pose and the mesh for these "
+        "trackers, DIR/object.yaml and others, or DIR/object.cao, object.init and object.pos"
     )
-    add("--format", choices=("ros",), help=ros)
+    add("--format", choices=FORMATS, help=formats)
     stamp = "with --format ros: when the photograph was taken, in seconds since 1970 (default: 0)"
     add("--stamp", type=time_stamp, metavar="SECONDS", help=stamp)
     frame = f"with --format ros: the camera's frame (default: {OPTICAL_FRAME})"
@@ -205,12 +209,15 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if (arguments.start or arguments.mask) and not is_one_photograph(arguments.photos):
         return "--start and --mask are of one photograph; give several masks in a list, column mask"
     for name in ("stamp", "frame"):
-        if getattr(arguments, name) is not None and not arguments.format:
+        if getattr(arguments, name) is not None and arguments.format != "ros":
             return f"--{name}: of the messages of --format ros; give it too"
     if arguments.format and (arguments.list or arguments.out is None):
-        return "--format ros: of one result, in --out DIR"
+        return f"--format {arguments.format}: of one result, in --out DIR"
+    if arguments.format in TRACKERS and rig is not None:
+        return f"--format {arguments.format}: a tracker starts in one camera, not in a rig's world"
     if arguments.format and rig is None and without_camera:
-        return f"--format ros: needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
+        wanted = f"needs a camera with --mesh-is similar; give {CAMERA_OPTIONS}"
+        return f"--format {arguments.format}: {wanted}"
     return None
 
 
@@ -321,7 +328,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
                 raise
         if out is not None:
             found.write(out)
-        _write_pose(arguments, found.document)
+        _write_pose(arguments, found.document, found.registrar.of_model(found.model))
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photo.notes, *camera_in_words(found.document)]
@@ -353,7 +360,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
         document["mesh"] = str(options.meshes[result.model])
         if out is not None:
             write_views(out, document, registrar, result, photographs)
-        _write_pose(arguments, document)
+        _write_pose(arguments, document, registrar.of_model(result.model))
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["photographs"]:
@@ -362,11 +369,18 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     return result.reliable
 
 
-def _write_pose(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
+def _write_pose(
+    arguments: argparse.Namespace, document: dict[str, Any], registrar: "Registrar"
+) -> None:
     """Write the pose in the format of another tool, if one is asked for."""
     from ..jobs.ros import write_ros
 
-    if arguments.format:
+    if arguments.format in TRACKERS:
+        from ..jobs import trackers
+
+        write = trackers.write_m3t if arguments.format == "m3t" else trackers.write_visp
+        write(arguments.out, registrar.bank.mesh, document)
+    elif arguments.format:
         mesh = Path(document.get("mesh") or arguments.meshes[0])
         chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
         given = {name: value for name, value in chosen.items() if value is not None}
@@ -430,11 +444,13 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     its files."""
     from ..registration.result import corners, remarks, two_decimals
 
-    confidence = (
-        "not calibrated" if document["confidence"] is None else two_decimals(document["confidence"])
-    )
+    confidence = NOT_CALIBRATED
+    if document["confidence"] is not None:
+        confidence = two_decimals(document["confidence"])
+    kind = " (as seen by a camera that looks straight at it)"
+    of_camera = "" if document["translation"] is not None else kind
     print(
-        f"viewpoint: {_angles(document)}   score {document['score']:.3f}   confidence "
+        f"viewpoint: {_angles(document)}{of_camera}   score {document['score']:.3f}   confidence "
         f"{confidence}, {document['verdict']}"
     )
     if not document["reliable"]:
@@ -447,7 +463,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
     for instance in document.get("detection", {}).get("instances", []):
         print(
             f"found in box {corners(instance['box'])}: there with probability "
-            f"{two_decimals(instance['score'])}"
+            f"{two_decimals(instance['score'])}; {_angles(instance)}{_place(instance, document)}"
         )
     if document["translation"] is not None:
         print(
@@ -466,6 +482,13 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "
         f"{out}/overlay.png"
     )
+
+
+def _place(pose: Mapping[str, Any], document: Mapping[str, Any]) -> str:
+    """The translation of an instance, behind its angles; "" without a camera."""
+    if pose["translation"] is None:
+        return ""
+    return f", at {', '.join(f'{v:.4g}' for v in pose['translation'])} {document['unit']}"
 
 
 def _angles(pose: Mapping[str, Any]) -> str:

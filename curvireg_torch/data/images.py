@@ -69,6 +69,11 @@ class Photo:
         notes: changes to the pixels, in words.
         taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None
             if it is not known.
+
+    Example:
+        >>> photo = Photo(torch.zeros(3, 48, 64, dtype=torch.uint8), 1, 28.0, ())
+        >>> round(float(photo.camera().matrix[0, 0]))
+        52
     """
 
     image: Tensor
@@ -185,6 +190,16 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 
     Grey images get three equal channels, an alpha channel is dropped. Errors as in
     :func:`read_photo`.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from PIL import Image
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "photo.png"
+        ...     Image.new("RGB", (64, 48)).save(path)
+        ...     read_image(path).shape
+        torch.Size([3, 48, 64])
     """
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 

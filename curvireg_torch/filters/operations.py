@@ -190,6 +190,11 @@ def gaussian_smooth(x: Tensor, sigma: float | Tensor) -> Tensor:
         sigma: standard deviation in px, >= 0; 0 returns ``x``. A scalar tensor is differentiable.
             The kernel is cut at ceil(4 sigma) px, for a tensor at 16 px at most. Traced tensors are
             clamped to 0.001 px, not checked.
+
+    Example:
+        >>> import torch
+        >>> gaussian_smooth(torch.ones(1, 1, 8, 8), 1.5).amin() > 0.999
+        tensor(True)
     """
     return smooth(at_least_float32(x), check_scalar(sigma, "sigma", zero_ok=True), margin=0).to(
         x.dtype

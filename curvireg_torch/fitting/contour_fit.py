@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..rendering.contours import MeshContours
+from ..pipeline import FitSettings
+from ..rendering.contours import Contours
 from ..utils.checks import (
     as_boxes,
     as_numbers,
@@ -17,6 +17,7 @@ from ..utils.checks import (
     check_pose,
     check_tensor,
 )
+from ..utils.likes import BoxesLike, CameraLike
 from .contour_problem import COARSE_DENSITY, ContourProblem, ContourState
 from .edges import EdgeCrops
 from .least_squares import apply_twist
@@ -28,26 +29,16 @@ SECOND_RADII = (3.0, 2.0)
 """Search radius for edges in px, one a round: at a quarter of the size, and at half size from all
 starts and then from the best."""
 
-KEPT_STARTS = 3
-"""Starts of a pose that continue after the first round, those with the most support."""
-
 SAME_POSE_SHIFT = 0.5
 """Mean shift in px at half size below which two fits count as one."""
-
-START_ANGLE = 8.0
-START_ROLL = 6.0
-FAR_ANGLE = 16.0
-"""Degrees by which the pose is rotated left, right, up and down, and about the line of sight, for
-further starts: about half the spacing of a bank's views. ``FAR_ANGLE``: more starts of a pose that
-is fitted again."""
 
 
 @torch.no_grad()
 def fit_contours(
-    contours: MeshContours,
+    contours: Contours,
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     starts: Tensor,
     *,
     image_index: Tensor | None = None,
@@ -130,7 +121,7 @@ def fit_contours(
 
 
 def fit_to_edges(
-    contours: MeshContours,
+    contours: Contours,
     crops: EdgeCrops,
     K: Tensor,
     T0: Tensor,
@@ -140,24 +131,26 @@ def fit_to_edges(
     wide_angles: Sequence[float] = (),
     quick: Tensor | None = None,
     again: bool = False,
+    settings: FitSettings = FitSettings(),
 ) -> ContourFit:
     """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras
     ``K`` (N, 3, 3). ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there
     was one. A pose that is fitted ``again`` is kept if the best fit at half size returns to it."""
     N = len(T0)
+    device = T0.device
+    rows = torch.arange(N, device=device)
     full, half = (
         ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2)
     )
     if quick is None:
         wide = _turned(T0, half.centre, wide_angles)
-        every = torch.arange(N).repeat_interleave(wide.shape[1])
+        every = rows.repeat_interleave(wide.shape[1])
         quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
-    angles = (START_ANGLE, FAR_ANGLE) if again else (START_ANGLE,)
-    around = torch.cat(
-        [_turned(T0, half.centre, angles, roll=START_ROLL), quick.view(N, -1, 4, 4)], dim=1
-    )
+    angles = (settings.start_angle, settings.far_angle) if again else (settings.start_angle,)
+    turned = _turned(T0, half.centre, angles, roll=settings.start_roll)
+    around = torch.cat([turned, quick.view(N, -1, 4, 4)], dim=1)
     M = around.shape[1]
-    every = torch.arange(N).repeat_interleave(M)
+    every = rows.repeat_interleave(M)
     begun = half.state(T0)
     coarse = replace(half[every], density=COARSE_DENSITY)
     before, weighted_before = half.supports(begun)
@@ -165,17 +158,17 @@ def fit_to_edges(
     kept = (
         coarse.supports(fits)[1]
         .view(N, M)
-        .argsort(dim=1, descending=True, stable=True)[:, :KEPT_STARTS]
+        .argsort(dim=1, descending=True, stable=True)[:, : settings.kept_starts]
     )
-    T = fits.T[(kept + M * torch.arange(N)[:, None]).flatten()]
+    T = fits.T[(kept + M * rows[:, None]).flatten()]
     M = kept.shape[1]
-    every = torch.arange(N).repeat_interleave(M)
+    every = rows.repeat_interleave(M)
     fits = half[every].descend(half[every].state(T), FIRST_RADII[1:])
     supports = half[every].supports(fits)[1].view(N, M)
     support, best = supports.max(dim=1)
-    first = fits[torch.arange(N) * M + best]
+    first = fits[rows * M + best]
     chosen = (
-        torch.ones(N, dtype=torch.bool)
+        torch.ones(N, dtype=torch.bool, device=device)
         if finish is None
         else _among_best(support, image_index, finish)
     )
@@ -201,7 +194,7 @@ def fit_to_edges(
         state = ContourState.cat([state, fitted.descend(fitted.state(T), FULL_SIZE_RADII)])
     support, weighted = full[owner].supports(state)
     before[index] = support[: len(index)]
-    best = torch.where(owner == torch.arange(N)[:, None], weighted, -1.0).argmax(dim=1)
+    best = torch.where(owner == rows[:, None], weighted, -1.0).argmax(dim=1)
     state = state[best]
     support = support[best]
     return measured_fit(full, state, support, before)
@@ -209,7 +202,7 @@ def fit_to_edges(
 
 @torch.no_grad()
 def quick_fit(
-    contours: MeshContours,
+    contours: Contours,
     crops: EdgeCrops,
     K: Tensor,
     T: Tensor,
@@ -228,9 +221,8 @@ def _turned(
 ) -> Tensor:
     """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes by
     +-``angles`` degrees, and about its z axis by +-``roll``."""
-    both = torch.cat(
-        [torch.eye(6, dtype=torch.float64)[:3], -torch.eye(6, dtype=torch.float64)[:3]]
-    )
+    axes = torch.eye(6, dtype=T.dtype, device=T.device)[:3]
+    both = torch.cat([axes, -axes])
     aside = [angle * both[[0, 3, 1, 4]] for angle in angles] + (
         [] if roll is None else [roll * both[[2, 5]]]
     )
@@ -251,9 +243,9 @@ def _two_best(
     M = supports.shape[1]
     each = half[index]
     supports = supports[index]
-    of_start = index[:, None] * M + torch.arange(M)
+    of_start = index[:, None] * M + torch.arange(M, device=index.device)
     best = supports.argmax(dim=1)
-    rows = torch.arange(n)
+    rows = torch.arange(n, device=index.device)
     other = fits[of_start.flatten()]
     reference = fits[of_start[rows, best].repeat_interleave(M)]
     gap = (
@@ -270,7 +262,7 @@ def _two_best(
 def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
     """(N,) bool: whether fewer than ``count`` other starts of the same photograph have more
     support."""
-    order = torch.arange(len(support))
+    order = torch.arange(len(support), device=support.device)
     ahead = (support > support[:, None]) | (
         (support == support[:, None]) & (order < order[:, None])
     )
@@ -279,8 +271,8 @@ def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
 
 def _checked(
     images: Tensor | Sequence[Tensor],
-    boxes: Any,
-    camera_matrices: Any,
+    boxes: BoxesLike,
+    camera_matrices: CameraLike,
     poses: Tensor,
     image_index: Tensor | None,
 ) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..rendering.contours import ContourPoints, MeshContours
+from ..rendering.contours import ContourPoints, Contours
 from ..utils.rows import Rows
 from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
@@ -49,7 +49,7 @@ class ContourProblem(Rows):
     """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras
     ``K`` (N, 3, 3); a ``mask`` weights the edges."""
 
-    contours: MeshContours
+    contours: Contours
     edges: EdgeField
     image_index: Tensor
     K: Tensor
@@ -60,7 +60,7 @@ class ContourProblem(Rows):
     @classmethod
     def of(
         cls,
-        contours: MeshContours,
+        contours: Contours,
         crops: EdgeCrops,
         K: Tensor,
         image_index: Tensor | None = None,
@@ -69,8 +69,10 @@ class ContourProblem(Rows):
     ) -> "ContourProblem":
         """The problem in ``crops`` whose sides are smaller by a ``factor``, with cameras ``K`` (N,
         3, 3) of the whole photographs ``image_index`` (N,), by default the first."""
-        index = torch.zeros(len(K), dtype=torch.long) if image_index is None else image_index
-        shrink = torch.diag(torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=torch.float64))
+        index = torch.zeros(len(K), dtype=torch.long, device=K.device)
+        index = index if image_index is None else image_index
+        scales = torch.tensor([1.0 / factor, 1.0 / factor, 1.0], dtype=K.dtype, device=K.device)
+        shrink = torch.diag(scales)
         shrink[:2, 2] = 0.5 / factor - 0.5
         K = shrink @ crops.transforms[index] @ K
         return cls(
@@ -113,7 +115,8 @@ class ContourProblem(Rows):
         if not bool(stale.any()):
             return state
         new = self[stale.nonzero()[:, 0]].state(state.T[stale])
-        index = torch.where(stale, len(stale) - 1 + stale.cumsum(0), torch.arange(len(stale)))
+        every = torch.arange(len(stale), device=stale.device)
+        index = torch.where(stale, len(stale) - 1 + stale.cumsum(0), every)
         return ContourState.cat([state, new])[index]
 
     def mean_shift(self, points: ContourPoints, before: Tensor, after: Tensor) -> Tensor:
@@ -149,7 +152,7 @@ class ContourProblem(Rows):
         J = J.to(distance.dtype)
         if self.mask is not None:
             strength = strength * self.mask.weights(
-                uv, points, _offsets(radius)[1:-1], self.image_index, self.size
+                uv, points, _offsets(radius, uv.device)[1:-1], self.image_index, self.size
             )
         log = strength.log()
         residual = distance
@@ -181,7 +184,7 @@ class ContourProblem(Rows):
     ) -> tuple[Tensor, Tensor]:
         """Distances in px along the normals and strengths, both (N, P, L) float32, enough for a
         step; the strength is 0 where there is no edge."""
-        offsets = _offsets(radius)
+        offsets = _offsets(radius, uv.device)
         profile = self.edges.strength(uv, points.normals, offsets, self.image_index)
         before = profile[..., :-2]
         here = profile[..., 1:-1]
@@ -201,7 +204,7 @@ class ContourProblem(Rows):
         what fits are compared by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
-        offsets = torch.arange(-3, 4, dtype=torch.float32)
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
         counts = self.edges.counts(uv, points.valid, self.image_index)
         near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(
             -0.5 * offsets**2
@@ -218,7 +221,7 @@ class ContourProblem(Rows):
     def strength_near(self, uv: Tensor, normals: Tensor) -> Tensor:
         """(N, P) float64 strength of the edges within about 1 px of points (N, P, 2) px with
         ``normals`` (N, P, 2)."""
-        offsets = torch.arange(-3, 4, dtype=torch.float32)
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
         near = self.edges.strength(uv, normals, offsets, self.image_index) * torch.exp(
             -0.5 * offsets**2
         )
@@ -235,7 +238,7 @@ class ContourProblem(Rows):
         return Measurements(J, d, W)
 
 
-def _offsets(radius: float) -> Tensor:
+def _offsets(radius: float, device: torch.device) -> Tensor:
     """Offsets in px at which edges are searched within ``radius`` of a predicted position."""
     far = round(1.5 * radius) + 1
-    return torch.arange(-far, far + 1, dtype=torch.float32)
+    return torch.arange(-far, far + 1, dtype=torch.float32, device=device)

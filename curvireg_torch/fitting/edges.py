@@ -81,7 +81,7 @@ class ObjectMask:
     """Probabilities (B, 1, s, s) that pixels of image crops belong to the object."""
 
     def __init__(self, probability: Tensor) -> None:
-        self.probability = probability.detach().cpu().float()
+        self.probability = probability.detach().float()
 
     def weights(
         self, uv: Tensor, points: ContourPoints, offsets: Tensor, image_index: Tensor, size: int
@@ -137,7 +137,8 @@ def _sampled_lines(
     # A matrix product is four times as fast as start + offset x normal with its short rows.
     lines = torch.cat([scale * uv + (0.5 * scale - 1.0), scale * normals], dim=-1).float()
     steps = torch.kron(
-        torch.stack([torch.ones_like(offsets), offsets]).float(), torch.eye(2, dtype=torch.float32)
+        torch.stack([torch.ones_like(offsets), offsets]).float(),
+        torch.eye(2, dtype=torch.float32, device=offsets.device),
     )
     grid = (lines.flatten(0, 1) @ steps).view(*lines.shape[:2], len(offsets), 2)
 
@@ -147,11 +148,29 @@ def _sampled_lines(
 
     if len(pictures) == 1:
         return sampled(pictures[0], grid)
+    if grid.device.type != "cpu":
+        return _sampled_together(pictures, grid, image_index, padding)
     out = grid.new_empty(len(uv), pictures.shape[1], *grid.shape[1:3])
     for b in image_index.unique().tolist():
         mine = (image_index == b).nonzero()[:, 0]
         out[mine] = sampled(pictures[b], grid[mine])
     return out
+
+
+def _sampled_together(pictures: Tensor, grid: Tensor, image_index: Tensor, padding: str) -> Tensor:
+    """(N, C, P, L) values of pictures (B, C, S, S) at (N, P, L, 2) places in pictures
+    ``image_index`` (N,), by one call for all of them, as a GPU does fastest."""
+    B = len(pictures)
+    N, P, L, _ = grid.shape
+    of_picture = torch.arange(B, device=grid.device)[:, None] == image_index
+    number = of_picture.cumsum(dim=1)[image_index, torch.arange(N, device=grid.device)] - 1
+    most = int(of_picture.sum(dim=1).max())
+    places = grid.new_full((B, most, P, L, 2), 2.0)
+    places[image_index, number] = grid
+    sampled = F.grid_sample(
+        pictures, places.view(B, most * P, L, 2), padding_mode=padding, align_corners=False
+    )
+    return sampled.view(B, -1, most, P, L)[image_index, :, number]
 
 
 class EdgeCrops:
@@ -173,6 +192,7 @@ class EdgeCrops:
         self._inside = inside
         self.mask = None if mask is None else ObjectMask(mask)
         self._fields: dict[int, EdgeField] = {}
+        self._copies: dict[torch.device, EdgeCrops] = {}
 
     @classmethod
     def cut(
@@ -184,6 +204,7 @@ class EdgeCrops:
         )
         check_pixels(crops, "of the box")
         transforms = crop_transforms(square_boxes(boxes, margin), CROP_SIZE)
+        mask = None if mask is None else mask.cpu()
         return cls(crops, inside_photographs(images, boxes, CROP_SIZE, margin), transforms, mask)
 
     @classmethod
@@ -195,6 +216,18 @@ class EdgeCrops:
         )
         masks = [part.mask.probability for part in parts if part.mask is not None]
         return cls(crops, inside, transforms, torch.cat(masks) if masks else None)
+
+    def to(self, device: torch.device) -> "EdgeCrops":
+        """The crops on a device, copied there once."""
+        if device == self.crops.device:
+            return self
+        if device not in self._copies:
+            crops, inside, transforms = (
+                x.to(device) for x in (self.crops, self._inside, self.transforms)
+            )
+            mask = None if self.mask is None else self.mask.probability.to(device)
+            self._copies[device] = EdgeCrops(crops, inside, transforms, mask)
+        return self._copies[device]
 
     def edges(self, factor: int) -> EdgeField:
         """The edges in crops whose sides are smaller by a factor."""

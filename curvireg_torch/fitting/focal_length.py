@@ -99,7 +99,7 @@ def fit_focal_length(
             step = step * fraction.clamp(max=1.0)[:, None]
             new = (log_zoom + step[:, 6]).clamp(prior.low, prior.high)
             moved = apply_twist(state.T, step[:, :6], problem.centre)
-            state = replace(state, T=_moved_away(moved, new - log_zoom, problem.centre))
+            state = replace(state, T=moved_away(moved, new - log_zoom, problem.centre))
             log_zoom = new
             problem = replace(problem, K=scaled_cameras(cameras, log_zoom))
         state = problem.state(state.T)
@@ -115,7 +115,7 @@ def scaled_cameras(cameras: Tensor, log_zoom: Tensor) -> Tensor:
     return scaled
 
 
-def _moved_away(T: Tensor, log_zoom: Tensor, centre: Tensor) -> Tensor:
+def moved_away(T: Tensor, log_zoom: Tensor, centre: Tensor) -> Tensor:
     """(N, 4, 4) poses whose images, by cameras with focal lengths longer by factors, have the same
     size and place; the object turns with the ray through its centre."""
     before = point_in_cameras(T, centre)
@@ -126,7 +126,7 @@ def _moved_away(T: Tensor, log_zoom: Tensor, centre: Tensor) -> Tensor:
 
 
 def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
-    """(N, 6) derivative of :func:`_moved_away`: rotation about the centre in rad, and its
+    """(N, 6) derivative of :func:`moved_away`: rotation about the centre in rad, and its
     translation."""
     position = point_in_cameras(T, centre)
     away = position * position.new_tensor([0.0, 0.0, 1.0])
@@ -136,7 +136,7 @@ def _motion_with_focal_length(T: Tensor, centre: Tensor) -> Tensor:
 
 def _by_focal_length(problem: ContourProblem, state: ContourState, uv: Tensor, J: Tensor) -> Tensor:
     """(N, P) derivative by log f of the shift of points at ``uv`` (N, P, 2) px along their normals,
-    with the motion of :func:`_moved_away`; ``J`` (N, P, 6) is that by the pose."""
+    with the motion of :func:`moved_away`; ``J`` (N, P, 6) is that by the pose."""
     zoom = ((uv - problem.K[:, None, :2, 2]) * state.points.normals).sum(dim=-1)
     motion = _motion_with_focal_length(state.T, problem.centre)
     return zoom + (J @ motion[..., None])[..., 0]

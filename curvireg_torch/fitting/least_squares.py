@@ -178,7 +178,7 @@ def summed_by_cells(uv: Tensor, values: Tensor) -> Tensor:
     """(N, C, D) sums of values (N, P, D) of points (N, P, 2) over the cells of crops within which
     errors are correlated."""
     cell = (uv / CELL_SIDE).floor().long().clamp(0, CELLS_PER_SIDE - 1)
-    cell = (cell * torch.tensor([1, CELLS_PER_SIDE])).sum(dim=-1)
+    cell = (cell * torch.tensor([1, CELLS_PER_SIDE], device=cell.device)).sum(dim=-1)
     sums = values.new_zeros(len(values), CELLS_PER_SIDE**2, values.shape[-1])
     return sums.scatter_add_(1, cell[..., None].expand_as(values), values)
 
@@ -239,7 +239,8 @@ def pose_covariance(
     # Basis of directions in which A + E is the identity and A is diagonal; first normalise the
     # units.
     unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * torch.eye(6, dtype=A.dtype)
+    identity = torch.eye(6, dtype=A.dtype, device=A.device)
+    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * identity
     lower = torch.linalg.cholesky(total)
     half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
     fraction, vectors = torch.linalg.eigh(
@@ -261,7 +262,7 @@ def pose_covariance(
     unknown = basis * (~known * size)[:, None]
     C = C + unknown @ unknown.mT
     # From the translation e of the centre to that of the origin, e - w x (R centre).
-    lever = torch.eye(6, dtype=C.dtype).repeat(len(C), 1, 1)
+    lever = identity.repeat(len(C), 1, 1)
     lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
     C = lever @ C @ lever.mT
     enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..rendering.contours import MeshContours
+from ..rendering.contours import Contours
 from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
@@ -39,6 +39,15 @@ class ContourFit(Rows):
         start_support: (N,) edge support of the starts (at half size for starts that are not
             finished).
         observable: (N,) int64, number of the six directions that the contours determine.
+
+    Example:
+        >>> T = torch.eye(4).repeat(2, 1, 1)
+        >>> covariance = torch.zeros(2, 6, 6)
+        >>> support = torch.tensor([0.6, 0.3])
+        >>> observable = torch.tensor([6, 6])
+        >>> fit = ContourFit(T, covariance, support, torch.tensor([0.2, 0.2]), observable)
+        >>> fit.trustworthy.tolist()
+        [True, False]
     """
 
     transform: Tensor
@@ -71,7 +80,7 @@ def measured_fit(
 
 @torch.no_grad()
 def measure_contours(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> ContourFit:
     """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay
     as they are."""
@@ -83,7 +92,7 @@ def measure_contours(
 
 @torch.no_grad()
 def contour_support(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
     fitted ones."""
@@ -93,7 +102,7 @@ def contour_support(
 
 @torch.no_grad()
 def contour_evidence(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """How far the edges under the contours of poses exceed what chance puts there.
 

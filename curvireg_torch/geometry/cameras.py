@@ -22,7 +22,12 @@ MIN_BOX_STEP = 1e-9  # change of the position in an iteration, relative to the p
 def camera_matrix(
     fx: float, fy: float, cx: float, cy: float, *, dtype: torch.dtype = torch.float64
 ) -> Tensor:
-    """Return the (3, 3) OpenCV camera matrix; all arguments in px."""
+    """Return the (3, 3) OpenCV camera matrix; all arguments in px.
+
+    Example:
+        >>> camera_matrix(800.0, 800.0, 319.5, 239.5)[0].tolist()
+        [800.0, 0.0, 319.5]
+    """
     fx, fy, cx, cy = (
         check_number(v, name) for v, name in ((fx, "fx"), (fy, "fy"), (cx, "cx"), (cy, "cy"))
     )
@@ -44,7 +49,12 @@ def camera_of_view(fov: float, size: tuple[int, int]) -> Tensor:
 
 
 def transform(R: Tensor, t: Tensor) -> Tensor:
-    """(..., 4, 4) rigid transform from (..., 3, 3) and (..., 3)."""
+    """(..., 4, 4) rigid transform from (..., 3, 3) and (..., 3).
+
+    Example:
+        >>> transform(torch.eye(3), torch.tensor([1.0, 2.0, 3.0]))[:3, 3].tolist()
+        [1.0, 2.0, 3.0]
+    """
     top = torch.cat([R, t[..., None]], dim=-1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(
         *top.shape[:-2], 1, 4
@@ -113,7 +123,14 @@ def projected_boxes(
     points: Tensor, T_cam_from_model: Tensor, K: Tensor, *, orthographic: bool = False
 ) -> Tensor:
     """(..., 4) boxes x0, y0, x1, y1 around projected model points, which must be in front of a
-    perspective camera."""
+    perspective camera.
+
+    Example:
+        >>> points = torch.tensor([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]).double()
+        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 5.0])).double()
+        >>> projected_boxes(points, T, camera_matrix(100.0, 100.0, 50.0, 50.0)).tolist()
+        [30.0, 30.0, 70.0, 70.0]
+    """
     return boxes_around(project_points(points, T_cam_from_model, K, orthographic=orthographic))
 
 
@@ -124,7 +141,13 @@ def boxes_around(pixels: Tensor) -> Tensor:
 
 def rotation_towards(rays: Tensor) -> Tensor:
     """(..., 3, 3) smallest rotations with ``R (0, 0, 1) = ray / |ray|``, for (..., 3) rays with z >
-    0: they turn allocentric rotations into poses."""
+    0: they turn allocentric rotations into poses.
+
+    Example:
+        >>> place = torch.tensor([0.0, 0.0, 4.0])
+        >>> torch.equal(rotation_towards(place), torch.eye(3))
+        True
+    """
     x, y, z = (rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)).unbind(-1)
     # Rodrigues with axis (0, 0, 1) x ray = (-y, x, 0): R = I + [v] + [v]^2 / (1 + z).
     f = 1.0 / (1.0 + z)
@@ -154,6 +177,15 @@ def pose_from_box(
     Raises:
         InvalidInputError: a matrix is not a rotation, the box is empty, or the camera matrix is
             unusable.
+
+    Example:
+        >>> cube = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3)
+        >>> K = camera_matrix(100.0, 100.0, 50.0, 50.0)
+        >>> T = transform(torch.eye(3), torch.tensor([0.0, 0.0, 6.0])).double()
+        >>> box = projected_boxes(cube, T, K)
+        >>> R, t = pose_from_box(cube, torch.eye(3).double(), box, K)
+        >>> [round(x, 3) for x in t.tolist()]
+        [0.0, 0.0, 6.0]
     """
     check_finite(rotation, "rotation")
     check_rotation(rotation, "rotation")

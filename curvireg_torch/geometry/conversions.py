@@ -27,6 +27,11 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
     """(..., 4, 4) transforms into the OpenGL camera, from those into the OpenCV camera: view
     matrices, whose inverse is the camera's pose in the model frame, as trimesh and Blender expect
     it.
+
+    Example:
+        >>> T = torch.eye(4); T[2, 3] = 5.0  # in front of OpenCV's camera
+        >>> float(opengl_from_opencv(T)[2, 3])
+        -5.0
     """
     check_pose(T_cam_from_model, "T_cam_from_model")
     signs = torch.tensor(
@@ -36,12 +41,25 @@ def opengl_from_opencv(T_cam_from_model: Tensor) -> Tensor:
 
 
 def opencv_from_opengl(T_cam_from_model: Tensor) -> Tensor:
-    """Inverse of :func:`opengl_from_opencv`: flipping two axes is its own inverse."""
+    """Inverse of :func:`opengl_from_opencv`: flipping two axes is its own inverse.
+
+    Example:
+        >>> T = torch.eye(4); T[2, 3] = -5.0  # in front of OpenGL's camera
+        >>> float(opencv_from_opengl(T)[2, 3])
+        5.0
+    """
     return opengl_from_opencv(T_cam_from_model)
 
 
 def axis_angle_from_rotation(R: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi."""
+    """(..., 3, 3) rotations to (..., 3) axis x angle, the angle in radians, at most pi.
+
+    Example:
+        >>> turn = torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64)
+        >>> back = axis_angle_from_rotation(rotation_from_axis_angle(turn))
+        >>> [round(float(angle), 6) for angle in back]
+        [0.0, 0.3, 0.0]
+    """
     check_rotation(R, "R")
     from kornia.geometry import conversions  # here, because its import takes 0.3 s
 

@@ -112,7 +112,12 @@ def viewpoint_from_rotation(R: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def up_rotation(up: str) -> Tensor:
     """(3, 3) float64 rotation from a frame whose axis ``up`` ("x" to "-z") points up to one whose z
-    axis does. glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0."""
+    axis does. glTF's front, +z under y up, becomes -y, PASCAL3D+'s at azimuth 0.
+
+    Example:
+        >>> (up_rotation("y") @ torch.tensor([0.0, 1.0, 0.0]).double()).tolist()
+        [0.0, 0.0, 1.0]
+    """
     check_option(up, UP_AXES, "up")
     return torch.tensor(UP_AXES[up], dtype=torch.float64)
 
@@ -171,6 +176,11 @@ class ViewSphere(Rows):
         azimuth, elevation, theta: (N,) degrees.
         distance: (N,) camera to object centre, in units of the object's radius (half the diagonal
             of its box).
+
+    Example:
+        >>> views = sample_views(azimuth_step=90, elevations=[0, 30])
+        >>> len(views), views[:2].azimuth.tolist()
+        (8, [0.0, 90.0])
     """
 
     azimuth: Tensor

@@ -5,15 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 import trimesh
-from scipy.spatial import cKDTree
-from torch import Tensor
 
-from ..geometry import rotation_error
 from ..matching.describe import VIEW_FACES
-from ..mesh import has_colours, mesh_symmetries, mesh_unit, mesh_up, mesh_warnings
+from ..mesh import has_colours, mesh_unit, mesh_up, mesh_warnings
 from ..mesh.mesh import extreme_points, mesh_radius
+from .surface import POINTS, Symmetry, looks_inwards, measured_symmetries, thin_fraction
 
 # From which simplification is advised: reading and the first bank take longer than a photograph
 MANY_FACES = 200_000
@@ -29,31 +26,9 @@ SPHERE_SPREAD = 0.03
 SMALLEST = 0.005
 LARGEST = 20.0
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "inches": 0.0254, "ft": 0.3048}
-SYMMETRY_POINTS = 2_000
+ROOM = 2.0  # Metres across from which faces that look inwards are those of a room
+MUCH_THIN = 0.3  # Fraction of the surface of thin parts from which a warning says so
 CONTINUOUS_TURN = 15.0  # Degrees below which a symmetry is one of a body of revolution
-
-
-@dataclass(frozen=True)
-class Symmetry:
-    """A rotation that maps a mesh to itself.
-
-    Attributes:
-        transform: (4, 4) float64 of the model frame.
-        angle: degrees.
-        deviation_percent: mean distance of the rotated surface from the surface, in percent of the
-            diameter.
-    """
-
-    transform: Tensor
-    angle: float
-    deviation_percent: float
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "transform": self.transform.tolist(),
-            "angle_deg": self.angle,
-            "deviation_percent": self.deviation_percent,
-        }
 
 
 @dataclass(frozen=True)
@@ -66,7 +41,9 @@ class MeshFacts:
         diameter: twice the radius, in that unit.
         faces, parts: numbers of faces, and of connected parts.
         is_watertight: whether every edge has two faces.
+        has_consistent_faces: whether neighbouring faces agree which of their sides is outside.
         doubled_faces: number of faces that exist twice.
+        thin: fraction of the surface that belongs to parts thinner than 1 % of the diameter.
         area_of_hull: area of the surface as a fraction of that of the convex hull; a closed convex
             body has 1.
         is_coloured: whether colours vary over the surface.
@@ -83,7 +60,9 @@ class MeshFacts:
     faces: int
     parts: int
     is_watertight: bool
+    has_consistent_faces: bool
     doubled_faces: int
+    thin: float
     area_of_hull: float
     is_coloured: bool
     symmetries: tuple[Symmetry, ...]
@@ -101,7 +80,9 @@ class MeshFacts:
             "faces": self.faces,
             "parts": self.parts,
             "watertight": self.is_watertight,
+            "consistent_faces": self.has_consistent_faces,
             "doubled_faces": self.doubled_faces,
+            "thin": self.thin,
             "area_of_hull": self.area_of_hull,
             "coloured": self.is_coloured,
         }
@@ -126,20 +107,26 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     corners = trimesh.graph.connected_component_labels(
         welded.edges_unique, node_count=len(welded.vertices)
     )
-    parts = len(np.unique(corners[welded.faces]))
+    part = corners[welded.faces[:, 0]]
+    parts = len(np.unique(part))
     symmetries = measured_symmetries(mesh)
     is_coloured = has_colours(mesh)
     warnings = [warning.text for warning in mesh_warnings(mesh)]
     warnings += _size_warnings(float(np.linalg.norm(extents)), unit)
     if len(mesh.faces) > MANY_FACES:
         warnings.append(
-            f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}; simplify it, and it loads "
-            f"faster"
+            f"{len(mesh.faces):,} faces: contours use {VIEW_FACES:,}, and generated photographs "
+            f"show it simplified; simplify it to {MANY_FACES:,}, and it loads faster"
         )
     if doubled_faces:
         warnings.append(
             f"{doubled_faces:,} faces exist twice: harmless here, but other programs draw them "
             f"flickering"
+        )
+    has_consistent_faces = bool(welded.is_winding_consistent)
+    if not has_consistent_faces:
+        warnings.append(
+            "some faces are flipped: harmless here, but other programs draw them as holes"
         )
     if parts > MANY_PARTS:
         warnings.append(
@@ -148,16 +135,29 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     verdicts = []
     if extents.min() < THIN * extents.max():
         verdicts.append("thin: its pose is uncertain where it is seen from the edge")
+    thin = thin_fraction(mesh, part)
+    if thin > MUCH_THIN:
+        verdicts.append(
+            f"{100 * thin:.0f} % of its surface is of parts thinner than 1 % of its size: they "
+            f"cover few pixels"
+        )
     is_sphere = _is_sphere(mesh)
+    is_large = unit is not None and float(np.linalg.norm(extents)) * METRES.get(unit, 1.0) > ROOM
+    is_room = is_large and looks_inwards(mesh, hull)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
         verdicts.append(
             "a sphere: it looks the same from everywhere, so its rotation cannot be seen"
         )
-    elif symmetries and not is_coloured:
-        verdicts.append(_symmetry_warning(symmetries))
+    elif same := tuple(each for each in symmetries if each.has_same_colours):
+        verdicts.append(_symmetry_warning(same))
     if is_wire:
         verdicts.append("hardly any surface, as of a wire: too thin for contours")
+    if is_room:
+        verdicts.append(
+            "its faces look inwards, as a room's do, but only what is seen from outside can be "
+            "registered; if it is an object, flip its faces"
+        )
     return MeshFacts(
         unit=unit,
         extents=(float(extents[0]), float(extents[1]), float(extents[2])),
@@ -165,67 +165,47 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
         faces=len(mesh.faces),
         parts=parts,
         is_watertight=bool(welded.is_watertight),
+        has_consistent_faces=has_consistent_faces,
         doubled_faces=doubled_faces,
+        thin=thin,
         area_of_hull=area_of_hull,
         is_coloured=is_coloured,
         symmetries=symmetries,
         up=mesh_up(mesh),
         verdicts=tuple(verdicts),
         warnings=(*warnings, *verdicts),
-        is_hopeless=is_wire or (is_sphere and not is_coloured),
+        is_hopeless=is_room or is_wire or (is_sphere and not is_coloured),
     )
-
-
-def measured_symmetries(mesh: trimesh.Trimesh) -> tuple[Symmetry, ...]:
-    """Rotations but the identity that leave the shape as it is, and how exactly they do."""
-    transforms = mesh_symmetries(mesh)
-    if len(transforms) == 1:
-        return ()
-    points = np.asarray(trimesh.sample.sample_surface(mesh, 20 * SYMMETRY_POINTS, seed=0)[0])
-    tree = cKDTree(points)
-    diameter = 2.0 * mesh_radius(mesh)
-    sample = points[::20]
-    # of points on one and the same surface
-    spacing = float(tree.query(sample, k=2)[0][:, 1].mean())
-    angles = rotation_error(transforms[:, :3, :3], torch.eye(3, dtype=torch.float64)).tolist()
-    symmetries = []
-    for transform, angle in zip(transforms[1:], angles[1:], strict=True):
-        moved = sample @ transform[:3, :3].numpy().T + transform[:3, 3].numpy()
-        distance = max(float(tree.query(moved)[0].mean()) - spacing, 0.0)
-        symmetries.append(Symmetry(transform, angle, 100.0 * distance / diameter))
-    return tuple(symmetries)
 
 
 def _size_warnings(size: float, unit: str | None) -> list[str]:
     """What is unusual about the size of the box's diagonal, and which unit would be usual."""
+    sizes = {name: size * METRES[name] for name in ("mm", "cm", "m")}
+    usual = {name: metres for name, metres in sizes.items() if SMALLEST < metres < LARGEST}
+    guess = " or ".join(f"{name} ({metres:.2g} m)" for name, metres in usual.items())
     if unit is None:
-        fitting = [name for name in ("mm", "cm", "m") if SMALLEST < size * METRES[name] < LARGEST]
-        guess = " or ".join(fitting) or "none that is usual"
-        return [f"its unit is unknown: {size:.4g} across, which suggests {guess}; give --unit"]
+        suggested = guess or "none that is usual"
+        across = f"{size:.4g} across, which suggests {suggested}"
+        return [f"its unit is unknown: {across}; give the unit"]
     metres = size * METRES.get(unit, 1.0)
     if SMALLEST < metres < LARGEST:
         return []
-    return [f"{metres:.3g} m across: is its unit really {unit}?"]
+    suggested = f"; usual would be {guess}" if guess else ""
+    across = f"{metres:,.0f}" if metres > LARGEST else f"{metres:.2g}"
+    return [f"{across} m across: is its unit really {unit}{suggested}?"]
 
 
 def _is_sphere(mesh: trimesh.Trimesh) -> bool:
     """Whether all points of the surface are about as far from its middle."""
-    points = np.asarray(trimesh.sample.sample_surface(mesh, SYMMETRY_POINTS, seed=0)[0])
+    points = np.asarray(trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0])
     distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
     return bool(distance.std() < SPHERE_SPREAD * distance.mean())
 
 
 def _symmetry_warning(symmetries: tuple[Symmetry, ...]) -> str:
     if any(symmetry.angle < CONTINUOUS_TURN for symmetry in symmetries):
-        return (
-            "a body of revolution without colours: its turn about the axis cannot be seen, "
-            "and is "
-            "not counted"
-        )
+        return "a body of revolution: its turn about the axis cannot be seen, and is not counted"
     worst = max(symmetry.deviation_percent for symmetry in symmetries)
     count = len(symmetries) + 1
-    return (
-        f"it looks the same in {count} orientations (up to {worst:.2g} % of its diameter): a "
-        f"pose "
-        f"is one of as many"
-    )
+    exactness = f"up to {worst:.2g} % of its diameter"
+    return f"it looks the same in {count} orientations ({exactness}): a pose is one of as many"

@@ -26,6 +26,12 @@ RESOLUTION = 3.0
 HALF_TURNS = torch.stack(
     [2.0 * torch.outer(axis, axis) - torch.eye(3).double() for axis in torch.eye(3).double()]
 )
+STEEP = 60.0  # Degrees of elevation from which azimuth and roll can hardly be told apart
+# A print tells two views apart if in more than a fraction of their cells of so many pixels colours
+# differ by so much, of 1
+PRINT_FRACTION = 0.03
+CELL = 8
+COLOUR_DIFFERENCE = 0.15
 # Degrees from which a rotation between two views is half a turn, and cosines of the angle between
 # its axis and the upward one that make it one about that axis, or about a level one
 HALF_TURN = 150.0
@@ -43,6 +49,8 @@ class LookAlike:
         angle: degrees between them, up to the mesh's symmetries.
         similarity: normalised correlation of their descriptors.
         resolved: that of the first view and itself, turned by what a photograph resolves.
+        print_differs: fraction of their area in which their colours differ; None without colours.
+        hint: the option of a pose prior that tells them apart.
     """
 
     rotation: Tensor
@@ -50,11 +58,18 @@ class LookAlike:
     angle: float
     similarity: float
     resolved: float
+    print_differs: float | None = None
+    hint: str = ""
 
     @property
     def is_alike(self) -> bool:
         """Whether a photograph of the first view does not tell the two apart."""
         return self.similarity >= self.resolved
+
+    @property
+    def print_tells(self) -> bool:
+        """Whether the mesh's print tells the two views apart."""
+        return self.print_differs is not None and self.print_differs > PRINT_FRACTION
 
     def to_dict(self) -> dict[str, Any]:
         views = {}
@@ -68,7 +83,8 @@ class LookAlike:
             "similarity": self.similarity,
             "resolved": self.resolved,
         }
-        return {**views, **numbers, "alike": self.is_alike}
+        told = {"alike": self.is_alike, "print_differs": self.print_differs, "hint": self.hint}
+        return {**views, **numbers, **told}
 
 
 @torch.no_grad()
@@ -115,17 +131,23 @@ def look_alikes(
         if report_progress is not None:
             report_progress(row, len(directions))
         angle = _angle(views, direction, group)
-        scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + STEPS[0], -torch.inf)
+        scores = similarity[row].masked_fill(angle <= RIVAL_ANGLE + sum(STEPS), -torch.inf)
         best = scores.topk(min(CANDIDATES, len(scores))).indices
         half_turns = direction @ HALF_TURNS
         candidates = torch.cat([views[best[scores[best].isfinite()]], half_turns])
-        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + STEPS[0]]
+        candidates = candidates[_angle(candidates, direction, group) > RIVAL_ANGLE + sum(STEPS)]
         if not len(candidates):
             continue
         rival, score = _nearest(describer, candidates, distance, descriptors[row])
         pairs.append(
             LookAlike(
-                direction, rival, float(_angle(rival[None], direction, group)), score, resolved[row]
+                direction,
+                rival,
+                float(_angle(rival[None], direction, group)),
+                score,
+                resolved[row],
+                print_difference(describer, direction, rival, distance),
+                _hint(direction, rival, up),
             )
         )
     if report_progress is not None:
@@ -146,6 +168,33 @@ def confused_sides(pairs: Sequence[LookAlike], up: str) -> str:
         level = half and steepness < ACROSS
         kinds["front and back" if upright else "top and bottom" if level else "several sides"] += 1
     return kinds.most_common(1)[0][0]
+
+
+def _hint(rotation: Tensor, rival: Tensor, up: Tensor) -> str:
+    """The option of a pose prior by which two views differ most, each within the range that it
+    has; ``up`` (3, 3) turns the mesh's upward axis to z."""
+    first, second = (viewpoint_from_rotation(each @ up.mT) for each in (rotation, rival))
+    elevations = float(first[1]), float(second[1])
+    if abs(elevations[0] - elevations[1]) > RIVAL_ANGLE:
+        return "--elevation"
+    if max(map(abs, elevations)) > STEEP:  # azimuth and roll are one turn there
+        return "--near"
+    turn = abs((float(first[0] - second[0]) + 180.0) % 360.0 - 180.0)
+    return "--azimuth" if turn > RIVAL_ANGLE else "--theta"
+
+
+def print_difference(
+    describer: ViewDescriber, rotation: Tensor, rival: Tensor, distance: Tensor
+) -> float | None:
+    """See :attr:`LookAlike.print_differs`: cells of a few pixels are compared, as the two views
+    hardly coincide better."""
+    if not describer.draws_colours:
+        return None
+    pictures = describer.shaded(torch.stack([rotation, rival]), distance.expand(2))[:, 1:]
+    cells = F.avg_pool2d(pictures, CELL)
+    seen = (cells < 1.0).any(dim=1).any(dim=0)
+    difference = (cells[0] - cells[1]).abs().amax(dim=0)
+    return float((difference[seen] > COLOUR_DIFFERENCE).double().mean())
 
 
 def _angle(rotations: Tensor, rotation: Tensor, group: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import base64
 import html
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,10 +15,11 @@ from ..visualization.contours import close_up, draw_window
 from ..visualization.encoding import jpeg, to_uint8
 from .facts import MeshFacts
 from .look_alikes import LookAlike
-from .report import Inspection
+from .report import ELEVATIONS, PIXELS_ACROSS, Inspection
 from .trial import Expected, Outcome
 
 MOST_PAIRS = 6
+FEW_PAIRS = 2  # where none is alike
 MOST_CONFUSIONS = 6
 PICTURE_SIDE = 224  # px
 
@@ -26,8 +28,8 @@ _PAGE = """<!DOCTYPE html>
 <title>curvireg inspect: {title}</title><style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
 table {{ border-collapse: collapse }} td, th {{ border: 1px solid #ccc; padding: .2rem .6rem; text-align: left }}
-figure {{ display: inline-block; margin: .5rem; vertical-align: top; max-width: 29rem }}
-img {{ height: 14rem; background: #eee }} .warning {{ border-left: 4px solid #d90; padding-left: .6rem }}
+figure {{ display: inline-block; margin: .5rem; vertical-align: top; max-width: 26rem }}
+img {{ height: 12rem; background: #eee }} .warning {{ border-left: 4px solid #d90; padding-left: .6rem }}
 </style></head><body><h1>{title}</h1>
 {body}
 </body></html>
@@ -74,11 +76,10 @@ def report_page(report: Inspection, registrar: Registrar | None, *, title: str) 
 
 
 def _in_words(expected: Expected) -> str:
-    shares = (
-        f"right in {expected.right:.2f}, reliable in {expected.reliable:.2f}, median "
-        f"{expected.median_deg:.1f} degrees"
-    )
-    return f"{shares} (of {expected.n} generated photographs)"
+    low, high = expected.right_interval
+    right = f"right in {expected.right:.2f} ({low:.2f} to {high:.2f})"
+    surely = f"reliable in {expected.reliable:.2f}, median {expected.median_deg:.1f} degrees"
+    return f"{right}, {surely} (of {expected.n} generated photographs)"
 
 
 def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
@@ -92,8 +93,9 @@ def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
     )
     return [
         ("size", f"{sides} {unit}"),
-        ("faces", f"{facts.faces:,} in {facts.parts:,} parts, {closed}"),
+        ("faces", f"{facts.faces:,} in {facts.parts:,} part{'s' * (facts.parts > 1)}, {closed}"),
         ("colours", colours),
+        ("thin parts", f"{100 * facts.thin:.0f} % of the surface, thinner than 1 % of the size"),
         (
             "symmetries",
             f"{len(facts.symmetries) + 1} orientations look the same"
@@ -113,9 +115,20 @@ def _warnings(warnings: Sequence[str]) -> str:
 
 
 def _symmetry_table(facts: MeshFacts) -> str:
-    shown = sorted(facts.symmetries, key=lambda symmetry: symmetry.angle, reverse=True)[:12]
-    rows = [("turn", "surface moves by, % of the diameter")]
-    rows += [(f"{symmetry.angle:.0f}°", f"{symmetry.deviation_percent:.2f}") for symmetry in shown]
+    groups = defaultdict[tuple[int, bool], list[float]](list)
+    for symmetry in facts.symmetries:
+        turn = round(symmetry.angle), symmetry.has_same_colours
+        groups[turn].append(symmetry.deviation_percent)
+    rows = [("turn", "axes and directions", "surface moves by, % of the diameter", "colours")]
+    rows += [
+        (
+            f"{angle}°",
+            str(len(deviations)),
+            f"{max(deviations):.2f}",
+            "the same" if is_same else "differ",
+        )
+        for (angle, is_same), deviations in sorted(groups.items(), reverse=True)
+    ]
     return _table(rows)
 
 
@@ -125,12 +138,15 @@ def _pairs(report: Inspection, registrar: Registrar | None) -> str:
         f"alike: "
         f"their edges differ by"
     )
+    told = f" The print tells {report.told_by_print} of them apart."
     lines = [
-        f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees.</p>"
+        f"<p>{count} no more than those of one pose and the same pose, turned by 3 degrees."
+        f"{told if report.facts.is_coloured and report.alike else ''}</p>"
     ]
     if registrar is None:
         return lines[0]
-    for pair in report.pairs[:MOST_PAIRS]:
+    shown = report.pairs[: MOST_PAIRS if report.alike else FEW_PAIRS]
+    for pair in shown:
         lines.append(_pair_figure(registrar.describer, registrar, pair))
     return "\n".join(lines)
 
@@ -141,9 +157,11 @@ def _pair_figure(describer: ViewDescriber, registrar: Registrar, pair: LookAlike
     pictures = describer.shaded(torch.stack([pair.rotation, pair.rival]), distance)
     images = "".join(_image(_picture(picture)) for picture in pictures)
     verdict = "alike" if pair.is_alike else "different"
+    told = f"its print and {pair.hint}" if pair.print_tells else pair.hint
+    help = f"; {told} would tell" if pair.is_alike else ""
     caption = (
-        f"{pair.angle:.0f}° apart: {verdict} (similarity {pair.similarity:.2f}, resolved "
-        f"{pair.resolved:.2f})"
+        f"{pair.angle:.0f}° apart: {verdict} in shape (similarity {pair.similarity:.2f}, resolved "
+        f"{pair.resolved:.2f}){help}"
     )
     return f"<figure>{images}<figcaption>{caption}</figcaption></figure>"
 
@@ -159,21 +177,19 @@ def _image(content: bytes) -> str:
 
 def _expectation(report: Inspection) -> str:
     assert report.trial is not None
-    document = report.to_dict()["expected"]
+    by_elevation = report.trial.by(lambda outcome: outcome.elevation, ELEVATIONS)
+    by_pixels = report.trial.by(lambda outcome: outcome.photograph.pixels_across, PIXELS_ACROSS)
     camera = "known" if report.with_camera else "unknown"
     header = ("photographs", "N", "right", "within 5°", "reliable", "reliable, wrong", "median")
     rows = [header, _row(f"all, camera {camera}", report.trial.expected)]
-    for key, name in (("by_elevation_deg", "elevation {}°"), ("by_pixels_across", "{} px across")):
-        rows += [
-            _row(name.format(interval), Expected(**values))
-            for interval, values in document[key].items()
-        ]
+    for ranges, name in ((by_elevation, "elevation {}°"), (by_pixels, "{} px across")):
+        rows += [_row(name.format(interval), expected) for interval, expected in ranges.items()]
     for name, (before, after) in report.trial.compared.items():
         rows += [_row("the first of them", before), _row(name, after)]
+    surroundings = "other objects around it" if report.clutter else "no clutter, nothing in front"
     note = (
-        "Right: within 30 degrees. Generated photographs are simpler than real ones: no "
-        "clutter, "
-        "nothing in front."
+        f"Right: within 30 degrees. Generated photographs ({surroundings}) are simpler than real "
+        f"ones."
     )
     return f"{_table(rows)}<p>{note}</p>"
 

@@ -13,11 +13,15 @@ from torch import Tensor
 
 from ..filters import gaussian_smooth
 from ..geometry import camera_matrix
-from ..geometry.cameras import transform
+from ..geometry.cameras import point_in_cameras, pose_around, transform
 from ..geometry.viewpoint import up_rotation
 from ..matching.describe import view_mesh
 from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_up
+from ..mesh.colours import surface_colours
+from ..mesh.edges import simplified
+from ..mesh.mesh import cached_in_mesh
 from ..synthetic import procedural_background, random_pose, synthesize_photograph
+from .facts import MANY_FACES
 
 SIZE = (480, 640)  # of the photographs, H, W
 FOCAL = 700.0  # px: a field of view of 49 degrees
@@ -26,9 +30,6 @@ UPRIGHT = (-10.0, 60.0)  # Elevations from which an upright object is seen, degr
 BOX_ERROR = 0.05  # Standard deviation of the box's edges, as a fraction of its sides
 BLUR = 1.2  # px, the largest standard deviation
 SHARP = 0.3  # px, below which nothing is blurred
-# Faces above which photographs of a mesh without colours show a simplified one: preparing millions
-# of faces for each would take longer than to register it
-MANY_FACES = 200_000
 # Clutter: most objects beside and behind the object, their radii and distances from its centre as
 # a fraction of its radius
 MOST_BESIDE = 6
@@ -36,6 +37,10 @@ SIZES = (0.4, 1.2)
 NEAREST = 0.9
 FARTHEST = 2.2
 COVERED = 0.3  # of the object's box, at most, by the object in front of it
+# Faces of the mesh that stands for a coloured one of many faces, and points of the surface from
+# which its corners take their colours
+COLOURED_FACES = 50_000
+COLOURED_POINTS = 400_000
 # Patches of colour of a print, and the longest edge of a face with one, as a fraction of the
 # mesh's size; edges are halved up to so many times
 PATCHES = 60
@@ -46,12 +51,13 @@ SIDES = (6, 32)  # of prisms and cylinders
 
 @dataclass(frozen=True)
 class Photograph:
-    """A generated photograph: (3, H, W) uint8, its box (4,) in px, the true pose (4, 4), and its
-    number."""
+    """A generated photograph: (3, H, W) uint8, its box (4,) in px, the true pose (4, 4), the camera
+    matrix (3, 3), and its number."""
 
     image: Tensor
     box: Tensor
     truth: Tensor
+    camera: Tensor
     number: int = 0
 
     @property
@@ -105,7 +111,7 @@ class PhotographGenerator:
         blur = BLUR * float(torch.rand((), generator=generator))
         if blur > SHARP:
             image = gaussian_smooth(image[None], blur)[0]
-        return Photograph(to_bytes(image), _wrong_box(box, generator), truth, index)
+        return Photograph(to_bytes(image), _wrong_box(box, generator), truth, K, index)
 
 
 def trial_camera() -> Tensor:
@@ -114,11 +120,26 @@ def trial_camera() -> Tensor:
     return camera_matrix(FOCAL, FOCAL, 0.5 * (width - 1), 0.5 * (height - 1), dtype=torch.float64)
 
 
+@cached_in_mesh
 def photographed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh, or a simplified one in its place if it has many faces and no colours."""
-    if len(mesh.faces) <= MANY_FACES or has_colours(mesh):
+    """The mesh, or a simplified one in its place if it has many faces: preparing millions of them
+    for each photograph would take longer than to register it."""
+    if len(mesh.faces) <= MANY_FACES:
         return mesh
-    return view_mesh(mesh)
+    colours = surface_colours(mesh)
+    if colours is None or not has_colours(mesh):
+        return view_mesh(mesh)
+    centre = mesh_centre(mesh).numpy()
+    vertices, faces = simplified(mesh, centre, COLOURED_FACES)
+    simple = trimesh.Trimesh(vertices + centre, faces, process=False)
+    points, owners = trimesh.sample.sample_surface(mesh, COLOURED_POINTS, seed=0)
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[owners], points)
+    seen = colours.at(owners, *weights[:, 1:].T)
+    nearest = cKDTree(points).query(simple.vertices)[1]
+    simple.visual.vertex_colors = (255.0 * seen[nearest]).round().astype(np.uint8)
+    simple.units = mesh.units
+    simple.metadata["up"] = mesh_up(mesh)
+    return simple
 
 
 def without_colours(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -165,13 +186,13 @@ def _random_truth(
     elevations = UPRIGHT if upright else (-90.0, 90.0)
     T = random_pose(mesh, K, SIZE, generator, elevations=elevations, fill=FILL)
     centre = mesh_centre(mesh)
-    position = T[:3, :3] @ centre + T[:3, 3]
+    position = point_in_cameras(T, centre)
     R = T[:3, :3]
     if not upright:
         R = _random_rotation(generator)
     elif mesh_up(mesh) != "z":
         R = R @ up_rotation(mesh_up(mesh)).double()
-    return transform(R, position - R @ centre)
+    return pose_around(R, position, centre)
 
 
 def _random_rotation(generator: torch.Generator) -> Tensor:
@@ -217,7 +238,7 @@ def _with_objects_behind(
     """The background with up to six objects beside and behind the object, as far away as its
     centre or farther."""
     radius = mesh_radius(mesh)
-    centre = truth[:3, :3] @ mesh_centre(mesh) + truth[:3, 3]
+    centre = point_in_cameras(truth, mesh_centre(mesh))
     count = 1 + int(MOST_BESIDE * float(torch.rand((), generator=generator)))
     picture = background
     for _ in range(count):
@@ -241,7 +262,7 @@ def _with_object_in_front(
     """The photograph with something before a side or corner of the object's box, of which it covers
     less than a third."""
     radius = mesh_radius(mesh)
-    centre = truth[:3, :3] @ mesh_centre(mesh) + truth[:3, 3]
+    centre = point_in_cameras(truth, mesh_centre(mesh))
     depth = float(centre[2]) - 1.5 * radius
     if depth < radius:
         return image

@@ -1,7 +1,8 @@
 """``curvireg inspect``: one report of a mesh, before anyone takes a photograph."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,7 @@ from ..mesh.mesh import as_mesh
 from ..pipeline import Pipeline
 from ..registration import Registrar
 from ..utils.checks import check_integer
+from ..utils.likes import MeshLike
 from ..utils.threads import one_torch_thread
 from .facts import MeshFacts, mesh_facts
 from .look_alikes import LookAlike, confused_sides, look_alikes
@@ -40,6 +42,7 @@ class Inspection:
             asked for.
         seed: of the photographs.
         with_camera: whether the camera was known.
+        clutter: whether other objects stood around the object.
         registrar: of the mesh, which draws the pictures of the report; None for a mesh without
             hope.
     """
@@ -49,12 +52,18 @@ class Inspection:
     trial: Trial | None = None
     seed: int = 0
     with_camera: bool = True
+    clutter: bool = False
     registrar: Registrar | None = None
 
     @property
     def alike(self) -> tuple[LookAlike, ...]:
-        """The pairs that a photograph does not tell apart."""
+        """The pairs that a photograph does not tell apart by shape."""
         return tuple(pair for pair in self.pairs if pair.is_alike)
+
+    @property
+    def told_by_print(self) -> int:
+        """Number of those pairs that the mesh's print tells apart."""
+        return sum(pair.print_tells for pair in self.alike)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -91,10 +100,18 @@ class Inspection:
         return "; ".join([f"{kind}: its sides differ in shape", *self.facts.verdicts])
 
     def _alike_in_words(self) -> str:
+        """Which sides look alike, from how many views, and what tells them apart."""
+        hints = Counter(pair.hint for pair in self.alike)
+        hint = f"a pose prior ({hints.most_common(1)[0][0]})"
+        shape = "in shape " if self.facts.is_coloured else ""
         sides = confused_sides(self.alike, self.facts.up)
-        remedy = "a pose prior" if self.facts.is_coloured else "a texture or a pose prior"
-        share = 100.0 * self.alike_share
-        return f"{sides} look alike from {share:.0f} % of the views; give {remedy}"
+        share = f"{sides} look alike {shape}from {100.0 * self.alike_share:.0f} % of the views"
+        if not self.facts.is_coloured:
+            return f"{share}; give a texture or {hint}"
+        if self.told_by_print == len(self.alike):
+            return f"{share}; its print tells them apart"
+        told = 100.0 * self.told_by_print / len(self.alike)
+        return f"{share}; its print tells {told:.0f} % of these apart, {hint} the others"
 
     @property
     def is_hopeless(self) -> bool:
@@ -110,6 +127,7 @@ class Inspection:
             "look_alikes": {
                 "directions": len(self.pairs),
                 "alike": len(self.alike),
+                "told_by_print": self.told_by_print,
                 "pairs": [pair.to_dict() for pair in self.pairs],
             },
             "warnings": list(self.warnings),
@@ -130,13 +148,14 @@ class Inspection:
             "by_pixels_across": {name: expected.to_dict() for name, expected in sizes.items()},
             "compared": compared,
             "with_camera": self.with_camera,
+            "clutter": self.clutter,
             "seed": self.seed,
         }
         return document
 
 
 def inspect(
-    mesh: Any,
+    mesh: MeshLike,
     *,
     n: int = 60,
     seed: int = 0,
@@ -183,33 +202,24 @@ def inspect(
     clean: trimesh.Trimesh = as_mesh(mesh) if registrar is None else registrar.bank.mesh
     facts = mesh_facts(clean)
     report("mesh", 1, 1)
+    found = Inspection(facts, seed=seed, with_camera=with_camera, clutter=clutter)
     if facts.is_hopeless:
-        return Inspection(facts, seed=seed, with_camera=with_camera)
+        return found
     with one_torch_thread():
         if registrar is None:
             bank = cached_bank(
-                clean,
-                pipeline=pipeline,
-                renderer=renderer,
-                device=device,
-                progress=report,
+                clean, pipeline=pipeline, renderer=renderer, device=device, progress=report
             )
             registrar = Registrar(bank, mesh_is="exact", renderer=renderer)
         pairs = look_alikes_of(registrar, partial(report, "look-alikes"))
+        found = replace(found, pairs=pairs, registrar=registrar)
         if n == 0:
-            return Inspection(facts, pairs, None, seed, with_camera, registrar)
+            return found
         pictures = [_background(picture) for picture in backgrounds]
         upright = registrar.pipeline.views.pose == "upright"
         generate = PhotographGenerator(clean, seed, upright, pictures, clutter)
-        trial = run_trial(
-            registrar,
-            generate,
-            n,
-            with_camera=with_camera,
-            compare=compare,
-            report=report,
-        )
-    return Inspection(facts, pairs, trial, seed, with_camera, registrar)
+        how: dict[str, Any] = {"with_camera": with_camera, "compare": compare, "report": report}
+        return replace(found, trial=run_trial(registrar, generate, n, **how))
 
 
 def look_alikes_of(

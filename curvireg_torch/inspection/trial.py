@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import torch
+import torch.nn.functional as F
 import trimesh
+from scipy.stats import binomtest
 from torch import Tensor
 
 from ..errors import CurviregError
@@ -28,15 +30,16 @@ from .photographs import (
     PhotographGenerator,
     photographed_mesh,
     to_bytes,
-    trial_camera,
     with_print,
     without_colours,
 )
+from .surface import look_symmetries
 
 RIGHT_DEGREES = 30.0  # within which an answer is right, as confidence understands it
 FINE_DEGREES = 5.0
 COMPARED_FRACTION = 0.2  # of the photographs, with which other conditions are tried
-HINT_DEGREES = 45.0  # by which the hint may be off, and which it allows
+HINT_DEGREES = 45.0  # around a hint, within which the pose lies, as those of the viewer's
+HINT_ERROR = 30.0  # Degrees by which hints are off, at most
 SECOND_CAMERA = 60.0  # Degrees about the object between two photographs
 IDENTITY = torch.eye(3, dtype=torch.float64)[None]
 
@@ -94,8 +97,15 @@ class Expected:
             median_deg=float(errors.median()),
         )
 
+    @property
+    def right_interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the share of right answers."""
+        counted = binomtest(round(self.right * self.n), self.n)
+        interval = counted.proportion_ci(method="wilson")
+        return float(interval.low), float(interval.high)
+
     def to_dict(self) -> dict[str, Any]:
-        return dict(vars(self))
+        return {**vars(self), "right_interval": list(self.right_interval)}
 
 
 @dataclass(frozen=True)
@@ -124,7 +134,7 @@ class Trial:
 
 def run_trial(
     registrar: Registrar,
-    generate: PhotographGenerator,
+    generate: Callable[[int], Photograph],
     count: int,
     *,
     with_camera: bool = True,
@@ -137,7 +147,7 @@ def run_trial(
 
     Args:
         registrar: of the mesh.
-        generate: photograph by number.
+        generate: photograph by number; other conditions need a :class:`PhotographGenerator`.
         count: of the photographs.
         with_camera: whether the camera is known.
         compare: whether other conditions are tried.
@@ -145,9 +155,12 @@ def run_trial(
             the mesh with or without a print.
     """
     part = max(1, round(COMPARED_FRACTION * count))
-    camera = trial_camera() if with_camera else None
-    setup = _Setup(registrar, camera, _symmetries(registrar))
-    conditions = _conditions(setup, generate, report) if compare else []
+    setup = _Setup(registrar, with_camera, _symmetries(registrar))
+    conditions = (
+        _conditions(setup, generate, report)
+        if compare and isinstance(generate, PhotographGenerator)
+        else []
+    )
     registrations = sum(1 if condition.before is None else 2 for condition in conditions)
     total = count + part * registrations
     counter = itertools.count(1)
@@ -187,11 +200,11 @@ class _Condition:
 
 @dataclass(frozen=True)
 class _Setup:
-    """A registrar, the camera that it is told, and the (S, 3, 3) rotations that do not count as
+    """A registrar, whether it is told the camera, and the (S, 3, 3) rotations that do not count as
     errors."""
 
     registrar: Registrar
-    K: Tensor | None
+    with_camera: bool
     symmetries: Tensor
 
     @property
@@ -199,18 +212,21 @@ class _Setup:
         return self.registrar.bank.mesh
 
     def register(self, photograph: Photograph, *, prior: PosePrior | None = None) -> Outcome:
-        found = self.registrar([photograph.image], photograph.box[None], self.K, prior=prior)[0]
+        camera = photograph.camera if self.with_camera else None
+        found = self.registrar([photograph.image], photograph.box[None], camera, prior=prior)[0]
         return self.outcome(photograph, found if isinstance(found, Registration) else None)
 
     def register_with_hint(self, photograph: Photograph) -> Outcome:
-        error = HINT_DEGREES * (2.0 * float(torch.rand((), generator=_generator(photograph))) - 1.0)
-        middle = float(viewpoint_of(self.mesh, photograph.truth[:3, :3])[0]) + error
-        azimuth = (middle - HINT_DEGREES) % 360.0, (middle + HINT_DEGREES) % 360.0
-        return self.register(photograph, prior=PosePrior(azimuth=azimuth))
+        """The outcome with a pose that a user has set by hand, some degrees off."""
+        generator = _generator(photograph)
+        axis = F.normalize(torch.randn(3, generator=generator, dtype=torch.float64), dim=0)
+        angle = math.radians(HINT_ERROR) * float(torch.rand((), generator=generator))
+        rotation = rotation_from_axis_angle(angle * axis) @ photograph.truth[:3, :3]
+        return self.register(photograph, prior=PosePrior(rotation=rotation, within=HINT_DEGREES))
 
     def register_with_second(self, photograph: Photograph) -> Outcome:
         """The outcome of a photograph and a second one, of a camera to its side."""
-        K = trial_camera()
+        K = photograph.camera
         turn = rotation_from_axis_angle(
             torch.tensor([0.0, math.radians(SECOND_CAMERA), 0.0], dtype=torch.float64)
         )
@@ -249,13 +265,11 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
 
     A print makes poses differ that look alike without: with and without it, each counts.
     """
-    is_known = setup.K is not None
-    other = replace(setup, K=None if is_known else trial_camera())
+    is_known = setup.with_camera
+    other = replace(setup, with_camera=not is_known)
     conditions = [
         _Condition("without a camera" if is_known else "with a camera", other.register),
-        _Condition(
-            f"with a pose prior: azimuth within {HINT_DEGREES:g} degrees", setup.register_with_hint
-        ),
+        _Condition(f"with a pose prior within {HINT_DEGREES:g} degrees", setup.register_with_hint),
         _Condition("with a second photograph from another side", setup.register_with_second),
     ]
     if has_colours(setup.mesh):
@@ -279,9 +293,10 @@ def _conditions(setup: _Setup, generate: PhotographGenerator, report: Report) ->
 
 
 def _symmetries(registrar: Registrar) -> Tensor:
-    """(S, 3, 3) rotations that do not count as errors."""
-    transforms = registrar.symmetries_of(exact=True)
-    return IDENTITY if transforms is None else transforms[:, :3, :3].double()
+    """(S, 3, 3) rotations that do not count as errors: what was given, or cannot be seen."""
+    given = registrar.symmetries
+    transforms = look_symmetries(registrar.bank.mesh) if given is None else given
+    return transforms[:, :3, :3].double()
 
 
 def _like(registrar: Registrar, mesh: trimesh.Trimesh, report: Report) -> Registrar:

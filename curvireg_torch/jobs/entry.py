@@ -18,6 +18,7 @@ from ..geometry.pose_prior import PosePrior
 from ..registration.inputs import ImageItem, image_items
 from ..utils.choices import UNITS
 from ..utils.files import file_digest, text_digest
+from ..utils.likes import BoxLike
 from .options import RegisterOptions, prior_from_limits
 from .views import View
 
@@ -34,7 +35,7 @@ class Entry:
     name: str = ""  # as the user calls the photograph
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()  # of several the best is found
-    box: Sequence[float] | None = None  # x0, y0, x1, y1 in px; None: the object is detected
+    box: BoxLike | None = None  # x0, y0, x1, y1 in px; None: the object is detected
     # "exif" insists on the file's; or a horizontal field of view in degrees
     camera: Camera | str | float | None = None
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels

@@ -264,7 +264,9 @@ def register_list(
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
     if (out / "summary.json").exists():
-        raise InvalidInputError(f"{out}: holds the evaluation of a dataset; choose another --out")
+        raise InvalidInputError(
+            f"{out}: holds the evaluation of a dataset; choose another folder", kind="out"
+        )
     files = chain(inputs, chain.from_iterable(entry.files for entry in usable))
     how: dict[str, Any] = {
         "settings": settings,

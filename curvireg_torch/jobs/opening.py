@@ -70,13 +70,10 @@ def check_bank(bank: "ViewBank", path: Path, *, unit: str | None, up: str | None
 
     built_unit = mesh_unit(bank.mesh)
     built_up = mesh_up(bank.mesh)
-    again = "or build it again with 'curvireg bank'"
     if unit not in (None, built_unit):
-        kind = f"with --unit {built_unit}" if built_unit else "without a unit"
-        raise BankError(
-            f"built {kind}, not with --unit {unit}; leave --unit out, {again}", subject=path
-        )
+        built = f"with unit {built_unit}" if built_unit else "without a unit"
+        message = f"built {built}, not {unit}; leave the unit out, or build it again"
+        raise BankError(message, subject=path, kind="bank unit")
     if up not in (None, built_up):
-        raise BankError(
-            f"built with --up={built_up}, not with --up={up}; leave --up out, {again}", subject=path
-        )
+        message = f"built with {built_up} up, not {up}; leave the axis out, or build it again"
+        raise BankError(message, subject=path, kind="bank up")

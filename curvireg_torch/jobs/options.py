@@ -46,6 +46,10 @@ ADVICE = {
     "opengl": "; or give --start-convention opengl",
     "fractions": ", or give --box-format fractions, or yolo",
     "corners": ", or --box-format xywh",
+    "out": " (--out)",
+    "bank": ": curvireg bank MESH --out FILE",
+    "bank unit": " (leave --unit out, or curvireg bank)",
+    "bank up": " (leave --up out, or curvireg bank)",
 }
 """Options that help, by the kind of an error. Messages of the library name no options."""
 

@@ -20,7 +20,15 @@ from .store import is_one_of_several
 
 MARKER = ".curvireg.json"
 
-ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *ros.FILES)
+M3T_FILES = ("object.obj", "object.yaml", "object_detector.yaml")
+"""The mesh in its own unit, M3T's body and its static detector, whose world is the camera."""
+
+VISP_FILES = ("object.cao", "object.init", "object.pos")
+"""The mesh, points of it with the pixels where they are (``initFromPoints``), and the pose
+(``initFromPose``)."""
+
+FOR_TOOLS = (*ros.FILES, *M3T_FILES, *VISP_FILES)
+ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
 ROWS = ("results.jsonl", "results.*-of-*.jsonl", "index.html", "thumbnails")
 FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,
@@ -32,7 +40,7 @@ FILES: dict[str, tuple[str, ...]] = {
 }
 """Names, or patterns of names, that each command may write into the folder of its results."""
 
-ELSEWHERE = "choose another --out"
+ELSEWHERE = "choose another folder"
 
 
 @contextmanager
@@ -74,9 +82,10 @@ def output_folder(
     lost = [name for name in before.get("source", ()) if name not in source]
     if lost and source and in_the_way:
         raise InvalidInputError(
-            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}"
+            f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}",
+            kind="out",
         )
-    check_writable(folder, "--out")
+    check_writable(folder)
     kept = list(source or before.get("source", ()))
     _mark(folder, command, names, kept)
     try:
@@ -96,9 +105,9 @@ def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> Non
         _check_inputs([path], inputs)
         if not path.is_file() or mark not in path.read_bytes():
             raise InvalidInputError(
-                f"{path}: exists, and this command did not write it; {ELSEWHERE}"
+                f"{path}: exists, and this command did not write it; {ELSEWHERE}", kind="out"
             )
-    check_writable(path.parent, "--out")
+    check_writable(path.parent)
 
 
 def _existing(folder: Path, names: Iterable[str]) -> list[Path]:
@@ -117,7 +126,8 @@ def _check_inputs(outputs: Sequence[Path], inputs: Iterable[Path]) -> None:
     for path in inputs:
         if path.exists() and _identity(path) in identities:
             raise InvalidInputError(
-                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}"
+                f"{path}: an input of this command, which would overwrite it; {ELSEWHERE}",
+                kind="out",
             )
 
 
@@ -139,8 +149,12 @@ def _check_owner(path: Path, command: str, written: Mapping[str, Any]) -> None:
     if command in owners:
         return
     if owners:
-        raise InvalidInputError(f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}")
-    raise InvalidInputError(f"{path}: not written by this command; move it away, or {ELSEWHERE}")
+        raise InvalidInputError(
+            f"{path}: a result of 'curvireg {owners[0]}'; {ELSEWHERE}", kind="out"
+        )
+    raise InvalidInputError(
+        f"{path}: not written by this command; move it away, or {ELSEWHERE}", kind="out"
+    )
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -151,7 +165,7 @@ def _read(folder: Path) -> dict[str, Any]:
     content = read_json(path, dict, "docs/results.md")
     runs = content.get("commands")
     if not isinstance(runs, dict) or not all(map(_is_run, runs.values())):
-        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}")
+        raise InvalidInputError(f"{path}: not of this program; {ELSEWHERE}", kind="out")
     return runs
 
 

@@ -27,7 +27,9 @@ from ..registration.detection import detect_items
 from ..registration.inputs import image_item
 from ..registration.poses import projected_box
 from ..registration.refinement import refine_items
+from ..registration.registrar import ObjectLike
 from ..registration.result import detection_document, result_document
+from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
 from .entry import Entry, Observation, observe, start_in_unit
@@ -95,12 +97,12 @@ class RegisteredPhotograph(Registration):
 
 
 def register(
-    image: Any,
-    mesh: Any,
+    image: ImageLike,
+    mesh: ObjectLike | Registrar,
     *,
-    box: Any = None,
-    camera: Any = None,
-    mask: Any = None,
+    box: BoxLike | None = None,
+    camera: CameraLike | str | PathLike[str] | None = None,
+    mask: MaskLike | None = None,
     prior: PosePrior | None = None,
     unit: str | None = None,
     up: str | None = None,
@@ -146,18 +148,17 @@ def register(
         name = str(image)
         photo = read_photo(image)
     else:
-        is_picture = isinstance(image, Image.Image)
         photo = (
             photo_of_picture(image)
-            if is_picture
+            if isinstance(image, Image.Image)
             else Photo(image_item(image, None).image, 1, None, ())
         )
     if isinstance(camera, str | PathLike):
         camera = camera if camera == "exif" else load_camera(camera)
     elif camera is not None and not isinstance(camera, Camera):
-        camera = Camera(
-            camera_matrix(*camera) if isinstance(camera, Sequence) and len(camera) == 4 else camera
-        )
+        K: Any = camera
+        is_short = isinstance(camera, Sequence) and len(camera) == 4
+        camera = Camera(camera_matrix(*K) if is_short else K)
     if isinstance(mesh, str | PathLike):
         meshes = (Path(mesh),)
         if meshes[0].suffix == ".safetensors":

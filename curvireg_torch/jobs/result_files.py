@@ -14,7 +14,7 @@ from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
-from . import ros
+from .outputs import FOR_TOOLS
 from .store import to_json
 from .views import View
 
@@ -121,5 +121,5 @@ def write_lost(out: Path, message: str) -> None:
 
 def _remove(out: Path) -> None:
     """Remove an older result: none of its files may stay beside those of a new one."""
-    for name in ("result.json", "pose.glb", "overlay.png", *ros.FILES):
+    for name in ("result.json", "pose.glb", "overlay.png", *FOR_TOOLS):
         (out / name).unlink(missing_ok=True)

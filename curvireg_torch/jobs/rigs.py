@@ -219,7 +219,13 @@ def _bop(folder: Path, mesh: Path | None, find: FindFile) -> Iterator[View]:
             k for k, one in enumerate(objects) if number and one.get("obj_id") == int(number[1])
         ]
         box = bop_box(entry_at(infos.get(key), mine[0]).get("bbox_obj")) if len(mine) == 1 else None
-        pose = values.get("cam_R_w2c"), values.get("cam_t_w2c")
+        if "cam_R_w2c" not in values:
+            raise InvalidInputError(
+                "no cam_R_w2c in scene_camera.json, the pose of the camera in the world, which a "
+                "rig needs; register these photographs one by one, or write the poses in a CSV",
+                subject=f"image {key}",
+            )
+        pose = values["cam_R_w2c"], values.get("cam_t_w2c")
         try:
             camera_of_image = Camera(torch.tensor(K, dtype=torch.float64).view(3, 3))
         except InvalidInputError as error:  # skew, for instance

@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from ..errors import (
@@ -23,6 +24,7 @@ from ..errors import (
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
 from ..registration.result import SCHEMA, line_document, places_document, verdict_of_error
+from ..utils.company import map_in_company
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
@@ -146,7 +148,10 @@ def _register_some(
             bar.update()
 
     device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
-    map_on_threads(register_one, range(len(pairs)), device=device)
+    if torch.device(device).type == "cpu":
+        map_on_threads(register_one, range(len(pairs)))
+    else:
+        map_in_company(register_one, range(len(pairs)))
 
 
 def _row(

@@ -200,8 +200,8 @@ class ResultStore:
             row = json.loads(line)
             self._rows.setdefault(str(row["key"]), []).append((dict(row["digests"]), line))
         except (ValueError, KeyError, TypeError, RecursionError):
-            message = f"{path}: not results of this command; choose another --out, or move it away"
-            raise InvalidInputError(message) from None
+            message = f"{path}: not results of this command; move it away, or choose another folder"
+            raise InvalidInputError(message, kind="out") from None
 
 
 def _line(row: Row) -> bytes:

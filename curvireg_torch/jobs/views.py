@@ -12,6 +12,7 @@ from ..data import read_photo
 from ..errors import CurviregError
 from ..geometry import Camera, undistorted
 from ..registration import Registrar, Registration
+from ..utils.likes import BoxLike
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class View:
 
     name: str  # as the user calls the photograph
     photo: Path
-    box: Sequence[float] | None  # x0, y0, x1, y1 in px
+    box: BoxLike | None  # x0, y0, x1, y1 in px
     camera: Camera
     T_cam_from_world: Tensor  # (4, 4) float64, lengths in the mesh's unit
     image: Tensor | None = None  # its pixels, if it was read

@@ -3,6 +3,7 @@ times."""
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, fields, replace
 from functools import cached_property
 from os import PathLike
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
@@ -35,14 +37,17 @@ from ..terms import Precision, Whitening, ledoit_wolf
 from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
 from ..utils.choices import UNITS, UP_AXES
 from ..utils.files import tensor_digest, write_tensors
+from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
 FORMAT_VERSION = 8
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
+VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
+PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
-REBUILD = "build it again with 'curvireg bank MESH --out FILE'"
+REBUILD = "build it again"
 
 
 class ViewBank:
@@ -59,6 +64,14 @@ class ViewBank:
             Meshes with colours have grey features followed by coloured ones.
         described_views_file: where those of a large bank are kept, as views are described; None
             keeps them in memory.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> mesh = cr.synthetic.example_mesh()
+        >>> bank = cr.ViewBank.build(mesh, views, image_size=64, progress=False)
+        >>> len(bank), bank.rotations.shape
+        (6, torch.Size([6, 3, 3]))
     """
 
     described_views_file: Path | None = None
@@ -146,7 +159,7 @@ class ViewBank:
     @classmethod
     def build(
         cls,
-        mesh: Any,
+        mesh: MeshLike,
         views: ViewSphere | None = None,
         *,
         image_size: int | None = None,
@@ -195,10 +208,13 @@ class ViewBank:
         term = pipeline.stored_appearance(len(views))
         appearance = None if term is None else term.build().to(device)
 
+        on_cpu = torch.device(device).type == "cpu"
+        at_a_time = VIEWS_AT_A_TIME if on_cpu else VIEWS_ON_DEVICE
+
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = (
-                rotations[start : start + VIEWS_AT_A_TIME],
-                distances[start : start + VIEWS_AT_A_TIME],
+                rotations[start : start + at_a_time],
+                distances[start : start + at_a_time],
             )
             tensors = packed(describe(*chunk))
             if appearance is not None:
@@ -208,9 +224,10 @@ class ViewBank:
         parts = []
         with (
             tqdm(total=len(views), desc="views", unit="view", disable=progress is not True) as bar,
-            single_threaded_pool() as pool,
+            single_threaded_pool() if on_cpu else nullcontext() as pool,
         ):
-            for part in pool.map(describe_chunk, range(0, len(views), VIEWS_AT_A_TIME)):
+            map_chunks = map if pool is None else pool.map
+            for part in map_chunks(describe_chunk, range(0, len(views), at_a_time)):
                 parts.append(part)
                 bar.update(len(part["boxes"]))
                 if callable(progress):
@@ -277,26 +294,27 @@ class ViewBank:
         """
         path = Path(path)
         if not path.is_file():
-            raise MissingFileError(
-                f"no such bank; build one with 'curvireg bank MESH --out {path}'", subject=path
-            )
+            raise MissingFileError("no such bank; build one", subject=path, kind="bank")
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
                 if metadata.get("format") != FORMAT:
                     raise BankError(
-                        "not a view bank; build one with 'curvireg bank MESH --out FILE'",
+                        "not a view bank; build one",
                         subject=path,
+                        kind="bank",
                     )
                 if (version := metadata.get("version")) != str(FORMAT_VERSION):
                     message = (
                         f"bank format {version}, this library reads {FORMAT_VERSION}; {REBUILD}"
                     )
-                    raise BankError(message, subject=path)
+                    raise BankError(message, subject=path, kind="bank")
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
             if metadata["checksum"] != tensor_digest(tensors, size=16):
                 raise BankError(
-                    f"changed since it was written (its checksum differs); {REBUILD}", subject=path
+                    f"changed since it was written (its checksum differs); {REBUILD}",
+                    subject=path,
+                    kind="bank",
                 )
             pipeline = Pipeline.from_json(metadata["pipeline"])
             views = ViewSphere(**{f.name: tensors[f"views.{f.name}"] for f in fields(ViewSphere)})
@@ -311,12 +329,16 @@ class ViewBank:
             raise
         except (SafetensorError, OSError) as error:
             raise BankError(
-                f"truncated or not a safetensors file ({error}); {REBUILD}", subject=path
+                f"truncated or not a safetensors file ({error}); {REBUILD}",
+                subject=path,
+                kind="bank",
             ) from error
         except Exception as error:  # a file may hold anything
             reason = str(error) if isinstance(error, CurviregError) else repr(error)
             reason = reason.partition("\n")[0][:200]
-            raise BankError(f"incomplete bank ({reason}); {REBUILD}", subject=path) from error
+            raise BankError(
+                f"incomplete bank ({reason}); {REBUILD}", subject=path, kind="bank"
+            ) from error
         return cls(mesh, views, pipeline, tensors).to(device)
 
 
@@ -337,13 +359,17 @@ def packed(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """What :class:`ViewDescriber` says of N views, with its masks (N, S, S) bool as (N, ceil(S * S
     / 8)) uint8."""
     masks = {name: tensors[name] for name in ("points", "silhouettes")}
-    small = {
-        name: np.packbits(mask.flatten(1).cpu().numpy(), axis=1) for name, mask in masks.items()
-    }
-    return {
-        **tensors,
-        **{name: torch.from_numpy(bits).to(masks[name].device) for name, bits in small.items()},
-    }
+    return {**tensors, **{name: _pack(mask.flatten(1)) for name, mask in masks.items()}}
+
+
+def _pack(mask: Tensor) -> Tensor:
+    """(N, ceil(P / 8)) uint8 of (N, P) bool."""
+    if mask.device.type == "cpu":
+        return torch.from_numpy(np.packbits(mask.numpy(), axis=1))
+    bits = F.pad(mask, (0, -mask.shape[1] % 8)).unflatten(1, (-1, 8)).to(torch.uint8)
+    values = torch.tensor(PIXEL_BITS, dtype=torch.uint8, device=mask.device)
+    packed: Tensor = (bits * values).sum(dim=2, dtype=torch.uint8)
+    return packed
 
 
 def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from ..mesh.mesh import as_mesh, mesh_up
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, text_digest
+from ..utils.likes import MeshLike
 from ..utils.sources import import_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
 
@@ -36,7 +37,12 @@ _BUILDER = "matching/bank.py"
 
 class CachedBank(NamedTuple):
     """A file of the cache: ``path``, ``size`` in bytes, and ``used``, the time of its last use in
-    seconds."""
+    seconds.
+
+    Example:
+        >>> CachedBank(Path("bank.safetensors"), 1000, 0.0).size
+        1000
+    """
 
     path: Path
     size: int
@@ -47,7 +53,12 @@ def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else
     ``~/.cache/curvireg_torch``. Only files named ``bank-<32 digits>.safetensors`` or
     ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder ``banks`` are ever
-    listed, overwritten or removed."""
+    listed, overwritten or removed.
+
+    Example:
+        >>> cache_folder().is_absolute()
+        True
+    """
     if folder := os.environ.get("CURVIREG_CACHE"):
         return Path(folder)
     if folder := os.environ.get("XDG_CACHE_HOME"):
@@ -66,7 +77,16 @@ def bank_key(
     renderer: str = "auto",
 ) -> str:
     """32 hexadecimal digits: digest of mesh (with colours and up axis), views, settings, renderer
-    and code. Views look the same in every unit of length, so the unit is no part of it."""
+    and code. Views look the same in every unit of length, so the unit is no part of it.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> mesh = cr.synthetic.example_mesh()
+        >>> views = cr.sample_views(azimuth_step=90, elevations=[0])
+        >>> key = bank_key(mesh, views)
+        >>> len(key), key == bank_key(mesh, views, pipeline=cr.Pipeline(hypotheses=1))
+        (32, True)
+    """
     pipeline = pipeline or Pipeline()
     settings = {
         **asdict(pipeline.bank),
@@ -88,7 +108,7 @@ def bank_key(
 
 
 def cached_bank(
-    mesh: Any,
+    mesh: MeshLike,
     views: ViewSphere | None = None,
     *,
     pipeline: Pipeline | None = None,
@@ -165,7 +185,12 @@ def cached_bank(
 
 
 def list_cache(folder: Path | None = None) -> list[CachedBank]:
-    """The banks of the cache, most recently used first."""
+    """The banks of the cache, most recently used first.
+
+    Example:
+        >>> all(bank.path.suffix == ".safetensors" for bank in list_cache())
+        True
+    """
     return [file for file in _files(folder or cache_folder()) if _is_bank(file)]
 
 

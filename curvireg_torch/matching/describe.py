@@ -16,7 +16,9 @@ from ..mesh.edges import simplified
 from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
-from ..rendering.contours import LEVELS, MeshContours
+from ..rendering.contours import LEVELS, Contours, MeshContours
+from ..rendering.device_contours import DeviceContours
+from ..rendering.zbuffer import DeviceRenderer
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
 # to which larger meshes are simplified for views: their contours are those of full size
@@ -59,7 +61,15 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see
     :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of at most
-    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh."""
+    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> describer = ViewDescriber(cr.synthetic.example_mesh(), cr.BankSettings(image_size=64))
+        >>> R = cr.rotation_from_viewpoint(torch.tensor([0.0, 90.0]), 20.0)
+        >>> describer.fields(R, torch.full((2,), 5.0 * describer.radius)).shape
+        torch.Size([2, 2, 64, 64])
+    """
 
     def __init__(
         self,
@@ -75,10 +85,12 @@ class ViewDescriber:
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
         self.hull = extreme_points(mesh)
-        self._device = device
+        self._device = torch.device(device)
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
             self._simple = view_mesh(mesh)
             self.view_renderer = make_renderer(self._simple, renderer, many_views=True)
+        if renderer == "auto" and self._device.type != "cpu":
+            self.view_renderer = DeviceRenderer(self._simple, self._device)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -89,8 +101,15 @@ class ViewDescriber:
 
     @cached_property
     def contours(self) -> MeshContours:
-        """Occluding contours and creases at any pose."""
+        """Occluding contours and creases at any pose, on the CPU."""
         return MeshContours(self._simple)
+
+    @cached_property
+    def device_contours(self) -> Contours:
+        """The same, on the device of the views."""
+        if self._device.type == "cpu":
+            return self.contours
+        return DeviceContours(self.contours, self._device)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
         """The same mesh and renderer with other settings; convex hulls of large meshes take

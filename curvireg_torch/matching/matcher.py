@@ -29,6 +29,8 @@ from ..terms import (
     whole_box_shapes,
 )
 from ..utils.checks import as_boxes, check_pixels, check_symmetries
+from ..utils.company import by_key, compute_together
+from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import VIEWS_AT_A_TIME, ViewBank, packed
@@ -41,6 +43,7 @@ ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle coun
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
+FEATURES_ON_DEVICE = 256  # the same on another device than the CPU
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,15 @@ class Ranking:
             aspect ratios in [0, 1], best view 1.
         allowed, outside: of a pose prior, else None: (B, N) bool, the views that it leaves; (B,)
             the best of the others more than 30 degrees from the best view, or -1.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> ranking = cr.ViewMatcher(bank)([scene.image], [scene.box])
+        >>> ranking.scores.shape, ranking.top(2).shape
+        (torch.Size([1, 6]), torch.Size([1, 2]))
     """
 
     scores: Tensor
@@ -84,6 +96,21 @@ class Ranking:
         """(B, k) indices of the best views; fewer if the bank is smaller."""
         return self.order[:, :k]
 
+    def split(self) -> "list[Ranking]":
+        """Each photograph by itself, on the CPU."""
+        scores, order = (x.cpu().split(1) for x in (self.scores, self.order))
+        terms = {name: x.cpu().split(1) for name, x in self.terms.items()}
+        limits = [None if x is None else x.cpu().split(1) for x in (self.allowed, self.outside)]
+        return [
+            Ranking(
+                scores[b],
+                order[b],
+                {name: x[b] for name, x in terms.items()},
+                *(None if x is None else x[b] for x in limits),
+            )
+            for b in range(len(self))
+        ]
+
 
 def distinct_views(
     order: Tensor,
@@ -104,6 +131,12 @@ def distinct_views(
 
     Returns:
         (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> R = rotation_from_viewpoint(torch.tensor([0.0, 10.0, 90.0]), 0.0)
+        >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
+        [1, 2]
     """
     symmetries = torch.eye(3)[None] if symmetries is None else symmetries
     check_symmetries(symmetries)
@@ -224,7 +257,7 @@ class ViewMatcher(nn.Module):
         built."""
         map_on_threads(lambda _: self._prepare(), [0])
 
-    def forward(self, images: Tensor | Sequence[Tensor], boxes: Any) -> Ranking:
+    def forward(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> Ranking:
         """Rank all views.
 
         Args:
@@ -240,16 +273,60 @@ class ViewMatcher(nn.Module):
         return self.rank(self.query(images, boxes))
 
     @in_full_precision
-    def query(self, images: Tensor | Sequence[Tensor], boxes: Any) -> QueryFeatures:
+    def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
+        return self.describe(*self._regions(images, boxes))
+
+    def _regions(
+        self, images: Tensor | Sequence[Tensor], boxes: BoxesLike
+    ) -> tuple[Tensor, Tensor]:
+        """Crops (B, K, C, S, S) of the boxes, jittered, and their shapes (B,)."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
         jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
         regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
-        return self.describe(
-            regions, whole_box_shapes(boxes, [(int(i.shape[-2]), int(i.shape[-1])) for i in images])
-        )
+        sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
+        return regions, whole_box_shapes(boxes, sizes)
+
+    def query_together(self, image: Tensor, box: Tensor) -> QueryFeatures:
+        """:meth:`query` of one photograph (C, H, W) with a box (4,), described with those that
+        other jobs of :func:`.map_in_company` have."""
+        image = image.to(self.bank.device)
+        return compute_together(self._described, self._regions([image], box[None]))
+
+    def _described(self, requests: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
+        if len(requests) == 1:
+            return [self.describe(*requests[0])]
+
+        def describe(some: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
+            regions, shapes = (torch.cat(parts) for parts in zip(*some, strict=True))
+            return self.describe(regions, shapes).split()
+
+        return by_key(requests, lambda request: request[0].shape, describe)
+
+    def rank_together(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
+        """:meth:`rank` of one photograph, with those that other jobs of :func:`.map_in_company`
+        have; the ranking is on the CPU."""
+        return compute_together(self._ranked, (query, allowed))
+
+    def _ranked(self, requests: Sequence[tuple[QueryFeatures, Tensor | None]]) -> list[Ranking]:
+        if len(requests) == 1:
+            return self.rank(*requests[0]).split()
+
+        def rank(some: Sequence[tuple[QueryFeatures, Tensor | None]]) -> list[Ranking]:
+            together = QueryFeatures.cat([query for query, _ in some])
+            limits = [allowed for _, allowed in some if allowed is not None]
+            rankings = self.rank(together, torch.cat(limits) if limits else None).split()
+            for (query, _), known in zip(some, together.split(), strict=True):
+                query.computed.update(known.computed)
+            return rankings
+
+        def key(request: tuple[QueryFeatures, Tensor | None]) -> tuple[Any, ...]:
+            query, allowed = request
+            return (query.regions.shape, query.mask is None, allowed is None)
+
+        return by_key(requests, key, rank)
 
     def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
@@ -387,21 +464,22 @@ class ViewMatcher(nn.Module):
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        chunks = [
-            views[k : k + FEATURES_AT_A_TIME] for k in range(0, len(views), FEATURES_AT_A_TIME)
-        ]
+        at_a_time = FEATURES_AT_A_TIME if self.bank.device.type == "cpu" else FEATURES_ON_DEVICE
+        chunks = [views[k : k + at_a_time] for k in range(0, len(views), at_a_time)]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
     @in_full_precision
-    def appearance_score(self, query: QueryFeatures, ranking: Ranking, pictures: Tensor) -> Tensor:
-        """(H,) float64 log scores of ``pictures`` (H, C, S, S) of poses in one photograph by the
-        appearance term, minus that of the most similar view of its ranking."""
+    def appearance_of(self, pictures: Tensor) -> Tensor:
+        """(H, D) features of ``pictures`` (H, C, S, S) by the appearance term."""
         assert self._appearance is not None
-        raw = (
-            self._appearance.compare(query, self._appearance.describe(pictures, together=True))[0]
-            .cpu()
-            .double()
-        )
+        return self._appearance.describe(pictures, together=True)
+
+    @in_full_precision
+    def appearance_score(self, query: QueryFeatures, ranking: Ranking, features: Tensor) -> Tensor:
+        """(H,) float64 log scores of poses in one photograph, whose pictures have these features
+        (H, D), by the appearance term, minus that of the most similar view of its ranking."""
+        assert self._appearance is not None
+        raw = self._appearance.compare(query, features)[0].cpu().double()
         views = ranking.terms[Appearance.name][0].cpu().double()
         views = views[views.isfinite()].expand(len(raw), -1)
         scores = self._appearance.term.log_score(torch.cat([views, raw[:, None]], dim=1))

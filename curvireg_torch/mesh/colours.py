@@ -37,6 +37,11 @@ class SurfaceColours(Rows):
         uv: (F, 3, 2) float32 texture coordinates; (0, 0) is the bottom left, and textures repeat.
         texture: (F,) int32 index of the texture, -1 for none.
         textures: (h, w, 3) uint8 RGB each.
+
+    Example:
+        >>> red = SurfaceColours.plain(12, (255, 0, 0))
+        >>> len(red), red[:2].corners.shape
+        (12, (2, 3, 3))
     """
 
     corners: NDArray[np.uint8]
@@ -98,7 +103,13 @@ class SurfaceColours(Rows):
 
 def has_colours(mesh: Any) -> bool:
     """Whether a mesh has colours that vary over its surface: one plain material is no print. The
-    only place where it is decided; symmetries, appearance and fits to colours follow it."""
+    only place where it is decided; symmetries, appearance and fits to colours follow it.
+
+    Example:
+        >>> from curvireg_torch.synthetic import example_mesh
+        >>> has_colours(example_mesh()), has_colours(example_mesh(painted=True))
+        (False, True)
+    """
     colours = surface_colours(mesh)
     return colours is not None and _vary(colours, mesh)
 
@@ -145,7 +156,14 @@ def colours_of_parts(meshes: Iterable[Any]) -> list[SurfaceColours | None]:
 def surface_colours(mesh: Any) -> SurfaceColours | None:
     """The colours of a ``trimesh.Trimesh``, or None where it has none; transparent texels are
     white. They come from ``mesh.metadata["colours"]``, where :func:`load_mesh` keeps them, else
-    from ``mesh.visual``."""
+    from ``mesh.visual``.
+
+    Example:
+        >>> from curvireg_torch.synthetic import example_mesh
+        >>> mesh = example_mesh(painted=True)
+        >>> len(surface_colours(mesh)) == len(mesh.faces)
+        True
+    """
     return _surface_colours(mesh, {})
 
 

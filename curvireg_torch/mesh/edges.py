@@ -68,6 +68,12 @@ class MeshEdges:
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
         self.normals: np.ndarray = normals.astype(np.float32)
 
+    def sides_data(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """What :meth:`sides` computes with: planes (F, 3) and offsets (F,) of the faces, whose
+        lengths are twice their areas, the faces (E, k) of each edge, and whether these run along it
+        backwards (k, E)."""
+        return self._plane, self._offset, self._edge_faces, self._flips
+
     def sides(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Which edges are on the occluding contour, seen from cameras (N, 3) relative to
         ``centre``. (N, E) bool: the third corners of all faces lie on one side of the plane through

@@ -7,7 +7,7 @@ from contextlib import suppress
 from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from ..errors import (
 )
 from ..utils.checks import check_option
 from ..utils.choices import MESHES, UNITS, UP_AXES
+from ..utils.likes import MeshLike
 from .colours import colours_of_parts
 from .files import read_source
 from .health import precision_warning, stray_faces, stray_warning
@@ -71,6 +72,16 @@ def load_mesh(
         MissingDependencyError: a package is needed for the format.
         MeshError: the file is unreadable, empty, without faces, with NaN or infinite vertices,
             beyond :mod:`curvireg_torch.errors`, or states another unit than ``unit``.
+
+    Example:
+        >>> import tempfile, trimesh
+        >>> from pathlib import Path
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "part.stl"
+        ...     _ = trimesh.creation.box((100.0, 200.0, 300.0)).export(path)
+        ...     mesh = load_mesh(path, unit="mm")
+        >>> mesh_unit(mesh), len(mesh.faces)
+        ('mm', 12)
     """
     path = Path(path)
     if unit is not None:
@@ -109,9 +120,15 @@ def load_mesh(
     return mesh
 
 
-def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
+def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
     """One clean mesh from a path, a ``trimesh.Trimesh`` or a ``trimesh.Scene``; errors as
-    :func:`load_mesh`."""
+    :func:`load_mesh`.
+
+    Example:
+        >>> import trimesh
+        >>> len(as_mesh(trimesh.Scene([trimesh.creation.box(), trimesh.creation.box()])).faces)
+        24
+    """
     if isinstance(source, str | PathLike):
         return load_mesh(source)
     noticed = list(mesh_warnings(source)) if isinstance(source, trimesh.Trimesh) else []
@@ -156,7 +173,13 @@ def as_mesh(source: Any, *, name: str = "mesh") -> trimesh.Trimesh:
 
 
 def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:
-    """What a mesh lacks, or what was changed in it, as :func:`load_mesh` noticed."""
+    """What a mesh lacks, or what was changed in it, as :func:`load_mesh` noticed.
+
+    Example:
+        >>> import trimesh
+        >>> mesh_warnings(trimesh.creation.box())
+        ()
+    """
     found = mesh.metadata.get("warnings", ())
     return tuple(warning for warning in found if isinstance(warning, MeshWarning))
 
@@ -213,7 +236,15 @@ def checked_triangles(
 
 def mesh_unit(mesh: trimesh.Trimesh) -> str | None:
     """The unit that ``mesh.units`` names, as a key of ``UNITS``; None where it names none of
-    them."""
+    them.
+
+    Example:
+        >>> import trimesh
+        >>> mesh = trimesh.creation.box()
+        >>> mesh.units = "millimeters"
+        >>> mesh_unit(mesh)
+        'mm'
+    """
     if mesh.units in UNITS:
         return str(mesh.units)
     try:
@@ -233,7 +264,13 @@ def format_up(suffix: str) -> str:
 
 def mesh_up(mesh: trimesh.Trimesh) -> str:
     """The axis that :func:`load_mesh` noted, "z" for meshes from elsewhere; mesh and poses stay in
-    the file's frame."""
+    the file's frame.
+
+    Example:
+        >>> import trimesh
+        >>> mesh_up(trimesh.creation.box())
+        'z'
+    """
     return str(mesh.metadata.get("up", "z"))
 
 
@@ -277,12 +314,25 @@ def box_corners(mesh: trimesh.Trimesh) -> Tensor:
 
 
 def mesh_centre(mesh: trimesh.Trimesh) -> Tensor:
-    """(3,) float64 centre of the axis-aligned box, in model units."""
+    """(3,) float64 centre of the axis-aligned box, in model units.
+
+    Example:
+        >>> import trimesh
+        >>> mesh = trimesh.creation.box((1.0, 2.0, 2.0))
+        >>> mesh_centre(mesh.apply_translation([0.0, 0.0, 3.0])).tolist()
+        [0.0, 0.0, 3.0]
+    """
     return torch.from_numpy(np.asarray(mesh.bounds, dtype=np.float64).mean(axis=0))
 
 
 def mesh_radius(mesh: trimesh.Trimesh) -> float:
-    """Half the diagonal of the axis-aligned box, in model units."""
+    """Half the diagonal of the axis-aligned box, in model units.
+
+    Example:
+        >>> import trimesh
+        >>> mesh_radius(trimesh.creation.box((1.0, 2.0, 2.0)))
+        1.5
+    """
     return 0.5 * float(np.linalg.norm(mesh.extents))
 
 

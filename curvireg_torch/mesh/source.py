@@ -25,6 +25,10 @@ class MeshWarning:
     Attributes:
         kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
         text: one sentence, without the name of the file.
+
+    Example:
+        >>> MeshWarning("colours", "the texture 'label.png' is missing").text
+        "the texture 'label.png' is missing"
     """
 
     kind: str
@@ -178,11 +182,7 @@ class MeshSource:
                 kind, f"{first} is missing beside it; the mesh is shown without these colours"
             )
         else:
-            text = (
-                f"{first} lies outside of its folder and is left out; name its folder "
-                f"(--textures "
-                f"DIR)"
-            )
+            text = f"{first} lies outside of its folder and is left out; name its folder"
             self.warn(kind, text)
         return None
 

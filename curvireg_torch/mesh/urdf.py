@@ -165,8 +165,7 @@ class _Parts:
         path = self._find(name)
         if path is None:
             self._source.warn(
-                "link",
-                f"the mesh {name[:100]} is missing in its folder; name its folder (--textures DIR)",
+                "link", f"the mesh {name[:100]} is missing in its folder; name its folder"
             )
             return None
         if path not in self._meshes:

@@ -8,7 +8,7 @@ accuracy on others.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -17,12 +17,12 @@ from ..calibration import CALIBRATION
 from ..evidence import Evidence
 from ..geometry.viewpoint import angles_between
 from ..mesh.symmetry import ROUND
-from ..pipeline import BankSettings, Pipeline
+from ..pipeline import BankSettings, FitSettings, Pipeline
 
-# Probability that the object is where landmarks agree on a pose, in a whole photograph: on
+# Probability that the object is where keypoints agree on a pose, in a whole photograph: on
 # generated shelves 84 of 88. It is less where other objects have a similar print
-LANDMARK_PROBABILITY = 0.95
-RELIABLE = 0.9  # Confidence from which a registration is called reliable
+KEYPOINT_PROBABILITY = 0.95
+RELIABLE = FitSettings().reliable  # Confidence from which an answer is called reliable by default
 # the more, the better
 EVIDENCE_FEATURES = (
     "similarity",
@@ -78,10 +78,10 @@ def model_name(*, exact: bool) -> str:
 
 def is_calibrated(pipeline: Pipeline) -> bool:
     """Whether the models were fitted for such a pipeline: learned field, default terms, contour
-    fit, default views.
+    fit with its default settings, default views.
 
-    The number of hypotheses, the box jitter, the size of the views, their spacing, and how many of
-    them the appearance term compares may differ.
+    The number of hypotheses, the box jitter, the size of the views, their spacing, how many of them
+    the appearance term compares, and from where answers are called reliable may differ.
     """
     default = Pipeline()
     bank = pipeline.bank
@@ -92,8 +92,9 @@ def is_calibrated(pipeline: Pipeline) -> bool:
         ]
         return pipeline.field, pipeline.weights, terms
 
-    usual = bank == BankSettings(image_size=bank.image_size) and pipeline.contours
-    return usual and compared(pipeline) == compared(default)
+    fit = replace(pipeline.fit, reliable=default.fit.reliable)
+    usual = bank == BankSettings(image_size=bank.image_size) and fit == default.fit
+    return usual and pipeline.contours and compared(pipeline) == compared(default)
 
 
 def probability_of_any(features: Features, *, exact: bool) -> float:
@@ -123,7 +124,7 @@ def detection_probability(
     Args:
         response: the detector's, of the box.
         similarity: normalised correlation of the box's best view.
-        rival: where landmarks led to the box, whose number is the response, the largest number at
+        rival: where keypoints led to the box, whose number is the response, the largest number at
             another place.
 
     Example:
@@ -131,7 +132,7 @@ def detection_probability(
         True
     """
     if rival is not None:
-        return LANDMARK_PROBABILITY * response / (response + 0.5 * rival)
+        return KEYPOINT_PROBABILITY * response / (response + 0.5 * rival)
     return LogisticModel.named("detection")({"response": response, "similarity": similarity})
 
 

@@ -1,5 +1,6 @@
 """A photograph as poses are compared with it, and the poses beside it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -8,12 +9,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..evidence import Evidence
-from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import LandmarkMatches
-from ..fitting.measured_fit import contour_evidence
+from ..fitting.keypoints import KeypointMatches
+from ..fitting.together import details_together, evidence_together
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
+from ..utils.company import by_key, compute_together
 from .poses import Poses
 from .target import Target
 
@@ -28,14 +29,14 @@ class DescribedPhotograph:
         descriptor: (1, D) on a grid twice as fine as the bank's, or (H, D) if each pose has its own
             box.
         crops: of the box, for contour fits; None without them.
-        landmarks: those found in the box; None where they do not count.
+        keypoints: those found in the box; None where they do not count.
     """
 
     query: QueryFeatures
     ranking: Ranking
     descriptor: Tensor
     crops: EdgeCrops | None
-    landmarks: LandmarkMatches | None
+    keypoints: KeypointMatches | None
 
 
 @dataclass(frozen=True)
@@ -63,18 +64,19 @@ class ComparedPoses:
 
     @property
     def appearance(self) -> Tensor:
-        _, pictures = self._views
-        if pictures is None:
+        _, features = self._views
+        if features is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
         photograph = self.photograph
-        return self.target.matcher.appearance_score(photograph.query, photograph.ranking, pictures)
+        return self.target.matcher.appearance_score(photograph.query, photograph.ranking, features)
 
     @property
     def keypoints(self) -> Tensor:
-        landmarks = self.photograph.landmarks
-        if landmarks is None:
+        keypoints = self.photograph.keypoints
+        if keypoints is None:
             return torch.zeros(len(self.poses), dtype=torch.float64)
-        return landmarks.agreeing(self.poses.T, self.poses.cameras)
+        count = keypoints.agreeing(self.poses.T, self.poses.cameras)
+        return (count - self.target.pipeline.fit.chance_keypoints).clamp(min=0.0)
 
     @property
     def contours(self) -> Tensor:
@@ -82,18 +84,36 @@ class ComparedPoses:
         poses = self.poses
         if crops is None:
             return torch.zeros(len(poses), dtype=torch.float64)
-        contours = self.target.describer.contours
-        return contour_evidence(contours, crops, poses.cameras, poses.T, poses.crop_index)
+        contours = self.target.describer.device_contours
+        return evidence_together(contours, crops, poses.cameras, poses.T, poses.crop_index)
 
     @cached_property
     def _views(self) -> tuple[Tensor, Tensor | None]:
-        """(H, D) descriptors of the poses' views, and their pictures where the appearance
-        counts."""
-        describer = self.target.describer
-        pose = self.poses.rotation, self.poses.distance
-        if Appearance.name not in self.photograph.ranking.terms:
-            return describer.descriptors(*pose), None
-        return describer.described(*pose)
+        """(H, D) descriptors of the poses' views, and the features (H, F) of their pictures where
+        the appearance counts."""
+        return compute_together(_views_of, self)
+
+    @property
+    def views_key(self) -> tuple[int, bool]:
+        """What poses have in common whose views are drawn together."""
+        return id(self.target.describer), Appearance.name in self.photograph.ranking.terms
+
+
+def _views_of(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
+    return by_key(requests, lambda request: request.views_key, _views_of_one_mesh)
+
+
+def _views_of_one_mesh(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
+    target = requests[0].target
+    counts = [len(request.poses) for request in requests]
+    rotation = torch.cat([request.poses.rotation for request in requests])
+    distance = torch.cat([request.poses.distance for request in requests])
+    if Appearance.name not in requests[0].photograph.ranking.terms:
+        views = target.describer.descriptors(rotation, distance)
+        return [(part, None) for part in views.split(counts)]
+    views, pictures = target.describer.described(rotation, distance)
+    features = target.matcher.appearance_of(pictures)
+    return list(zip(views.split(counts), features.split(counts), strict=True))
 
 
 def evidence_of(target: Target, photograph: DescribedPhotograph, poses: Poses) -> Evidence:
@@ -107,8 +127,8 @@ def with_details(
     """The evidence of poses, ``rivals`` (R,) of which are compared in detail with the ``best``."""
     index = torch.cat([torch.tensor([best]), rivals])
     some = poses[index]
-    contours = target.describer.contours
-    scores, _ = compare_details(contours, crops, some.cameras, some.T, some.crop_index)
+    contours = target.describer.device_contours
+    scores, _ = details_together(contours, crops, some.cameras, some.T, some.crop_index)
     details = evidence.details.clone()
     details[rivals] = details[best] + scores[1:, 0].to(details)
     return replace(evidence, details=details)

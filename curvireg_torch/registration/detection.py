@@ -1,13 +1,12 @@
 """Detection: objects are found and registered in photographs that come without a box.
 
-A few representative views are compared with every position of the photograph, and landmarks with
+A few representative views are compared with every position of the photograph, and keypoints with
 its features. The boxes that they propose are compared with all views, and the most probable ones
 are registered.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +16,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..geometry.crops import box_iou, non_maximum_suppression
 from ..geometry.pose_prior import PosePrior
 from ..terms import QueryFeatures
+from ..utils.likes import CameraLike, ImagesLike
 from .confidence import detection_probability
 from .detector import Proposals
 from .focal import usual_camera
@@ -27,7 +27,7 @@ from .result import Detection, FailedRegistration, Registration, corners, two_de
 from .target import Target
 from .tracker import boxes_at
 from .unknown_camera import limits_of
-from .work import landmark_poses, map_items
+from .work import keypoint_poses, map_items
 
 TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
@@ -45,8 +45,8 @@ Results = list[Registration | FailedRegistration]
 @torch.no_grad()
 def detect(
     target: Target,
-    images: Tensor | Sequence[Any],
-    camera_matrices: Any | None = None,
+    images: ImagesLike,
+    camera_matrices: CameraLike | None = None,
     *,
     instances: int = 1,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
@@ -68,6 +68,15 @@ def detect(
 
     Raises:
         InvalidInputError: not as many cameras or priors as images, or ``instances`` < 1.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> (found,) = detect(cr.Registrar(bank), [scene.image], scene.camera_matrix)
+        >>> len(found) >= 1
+        True
     """
     items = image_items(images, None, camera_matrices, prior)
     return detect_items(target, items, instances=instances)
@@ -102,14 +111,14 @@ def detect_item(target: Target, item: ImageItem, index: int, *, instances: int =
 
 
 def propose(target: Target, item: ImageItem) -> "Proposals":
-    """Boxes in which a photograph may show the object: those around poses on which landmarks of its
+    """Boxes in which a photograph may show the object: those around poses on which keypoints of its
     print agree, their number being the response, and those of the detector."""
     extremes = torch.stack(
         [item.image.flatten(1).amin(dim=1), item.image.flatten(1).amax(dim=1)], dim=1
     )
     check_crop(extremes.float() / 255.0 if extremes.dtype == torch.uint8 else extremes)
     distance = allowed = None
-    poses, count = landmark_poses(target, target.landmark_matches(item))
+    poses, count = keypoint_poses(target, target.keypoint_matches(item))
     if item.prior is not None:
         distance = item.prior.distance
         allowed = _allowed_views(target, item)
@@ -124,7 +133,7 @@ def propose(target: Target, item: ImageItem) -> "Proposals":
     first = boxes[visible].to(others.boxes), count[visible], poses.view[visible]
     pairs = zip(first, (others.boxes, others.responses, others.views), strict=True)
     boxes, responses, views = (torch.cat(pair) for pair in pairs)
-    proposals = Proposals(boxes, responses, views, by_landmarks=int(visible.sum()))
+    proposals = Proposals(boxes, responses, views, by_keypoints=int(visible.sum()))
     if not len(proposals.boxes):
         raise InvalidInputError(
             "nothing of such a size fits into the photograph; give other distances, or the box"
@@ -224,7 +233,7 @@ def _register_candidates(
     the best if there is none."""
     candidates = []
     failed = None
-    counts = proposals.responses[: proposals.by_landmarks].tolist()
+    counts = proposals.responses[: proposals.by_keypoints].tolist()
     for k, (box, response) in enumerate(
         zip(proposals.boxes, proposals.responses.tolist(), strict=True)
     ):

@@ -34,15 +34,21 @@ class Proposals:
     Attributes:
         boxes: (P, 4) x0, y0, x1, y1 in px, of the whole object: they may extend beyond the image.
         responses: (P,) similarity, in standard deviations above the view's mean over the
-            photograph; of boxes that landmarks led to, the number of these.
+            photograph; of boxes that keypoints led to, the number of these.
         views: (P,) int64 view of the bank.
-        by_landmarks: how many of the boxes landmarks led to, the first ones.
+        by_keypoints: how many of the boxes keypoints led to, the first ones.
+
+    Example:
+        >>> box = torch.tensor([[0.0, 0.0, 9.0, 9.0]])
+        >>> found = Proposals(box, torch.tensor([8.0]), torch.tensor([2]))
+        >>> found.boxes.shape
+        torch.Size([1, 4])
     """
 
     boxes: Tensor
     responses: Tensor
     views: Tensor
-    by_landmarks: int = 0
+    by_keypoints: int = 0
 
 
 class Detector(nn.Module):

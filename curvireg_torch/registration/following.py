@@ -12,8 +12,8 @@ from ..geometry.calibration import Camera
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
+from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
-from .confidence import RELIABLE
 from .inputs import ImageItem, image_items
 from .poses import Poses, hypothesis_of
 from .refinement import refine_item
@@ -79,7 +79,10 @@ class Follower:
         self.camera_matrix = camera_matrix
         self.prior = prior
         describer = self.registrar.describer
-        self._tracker = Tracker(describer.renderer, describer.contours, describer.hull)
+        self._reliable = self.registrar.pipeline.fit.reliable
+        self._tracker = Tracker(
+            describer.renderer, describer.contours, describer.hull, reliable=self._reliable
+        )
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
 
@@ -92,7 +95,7 @@ class Follower:
         )
 
     @torch.no_grad()
-    def start(self, image: Any, pose: Any, *, confidence: float = 1.0) -> None:
+    def start(self, image: ImageLike, pose: ArrayLike, *, confidence: float = 1.0) -> None:
         """Begin from a known pose, in place of registering the first frame.
 
         Args:
@@ -123,7 +126,9 @@ class Follower:
         self._base = confidence
 
     @torch.no_grad()
-    def __call__(self, image: Any, box: Any = None) -> Registration | FailedRegistration:
+    def __call__(
+        self, image: ImageLike, box: BoxLike | None = None
+    ) -> Registration | FailedRegistration:
         """The pose in the next frame, or why there is none.
 
         Args:
@@ -135,7 +140,7 @@ class Follower:
         # with it.
         return map_on_threads(lambda image: self._next(image, box), [image])[0]
 
-    def _next(self, image: Any, box: Any) -> Registration | FailedRegistration:
+    def _next(self, image: ImageLike, box: BoxLike | None) -> Registration | FailedRegistration:
         item = image_items([image], None, self.camera_matrix)[0]
         if not isinstance(item, ImageItem):
             return FailedRegistration(item)
@@ -168,13 +173,13 @@ class Follower:
             self._tracker.accept(tracked)
             self._base = _confidence(found)
             return found
-        registered = self._registered(item, image, box, RELIABLE)
+        registered = self._registered(item, image, box, self._reliable)
         return (
             registered if isinstance(registered, Registration) and registered.reliable else refined
         )
 
     def _registered(
-        self, item: ImageItem, image: Any, box: Any, least: float
+        self, item: ImageItem, image: ImageLike, box: BoxLike | None, least: float
     ) -> Registration | FailedRegistration:
         """Register a frame; track from its pose if it lies within the frame, with a confidence of
         ``least``."""
@@ -196,7 +201,7 @@ class Follower:
         except CurviregError as error:
             return FailedRegistration(error)
         assert self._base is not None
-        bound = 1.0 if _confidence(result) >= RELIABLE else self._base
+        bound = 1.0 if _confidence(result) >= self._reliable else self._base
         return replace(result, probabilities=tuple(min(p, bound) for p in result.probabilities))
 
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
@@ -226,6 +231,7 @@ class Follower:
             warnings=warnings,
             notes=notes,
             camera=item.camera,
+            reliable_from=self._reliable,
         )
 
 

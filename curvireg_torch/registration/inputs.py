@@ -36,6 +36,7 @@ from ..utils.checks import (
     check_tensor,
     type_and_shape,
 )
+from ..utils.likes import ArrayLike, BoxesLike, BoxLike, CameraLike, ImageLike, ImagesLike, MaskLike
 from .framing import clipped
 
 # Pixels; a smaller box is refused. With one of 1 px, the preset "fast" reached a confidence of
@@ -142,11 +143,11 @@ class ImageItem:
 
 
 def image_items(
-    images: Tensor | Sequence[Any],
-    boxes: Any,
-    camera_matrices: Any | None,
+    images: ImagesLike,
+    boxes: BoxesLike | None,
+    camera_matrices: CameraLike | None,
     prior: PosePrior | Sequence[PosePrior | None] | None = None,
-    masks: Any | None = None,
+    masks: Sequence[MaskLike | None] | Tensor | None = None,
 ) -> Sequence[ImageItem | CurviregError]:
     """Photographs with boxes (None: those of the masks, or the whole images), cameras and masks, or
     their errors. Arguments and errors are those of ``Registrar``; each is read and checked whenever
@@ -160,13 +161,14 @@ def image_items(
         )
     n = len(images)
     no_box = boxes is None
+    given: list[Tensor | None]
     if isinstance(boxes, list | tuple) and any(is_missing(box) for box in boxes):
-        boxes = [
+        given = [
             None if is_missing(box) else as_boxes([box], 1)[0]
             for box in _one_each(boxes, n, "boxes")
         ]
     else:
-        boxes = [None] * n if boxes is None else list(as_boxes(boxes, n))
+        given = [None] * n if boxes is None else list(as_boxes(boxes, n))
     cameras = _cameras(camera_matrices, n)
     masks = [None] * n if masks is None else _one_each(masks, n, "masks")
     if no_box and any(m is None for m in masks) and any(m is not None for m in masks):
@@ -181,9 +183,10 @@ def image_items(
 
     def item(i: int) -> ImageItem | CurviregError:
         try:
-            item = image_item(images[i], boxes[i], cameras[i], priors[i], masks[i])
+            box = given[i]
+            item = image_item(images[i], box, cameras[i], priors[i], masks[i])
             if (side := _visible_side(item.box, item.size)) < MIN_BOX_SIDE:
-                if boxes[i] is not None and float(boxes[i].abs().max()) <= MAX_FRACTION:
+                if box is not None and float(box.abs().max()) <= MAX_FRACTION:
                     raise InvalidInputError(FRACTIONS, kind="fractions")
                 small = min(item.size) < MIN_BOX_SIDE
                 where = (
@@ -202,7 +205,7 @@ def image_items(
     return OnDemand(item, n)
 
 
-def check_cameras(images: Any, camera_matrices: Any | None, what: str) -> None:
+def check_cameras(images: Any, camera_matrices: CameraLike | None, what: str) -> None:
     """Refuse photographs without a camera and without a file, whose EXIF data may have one."""
     if camera_matrices is None and not all(
         isinstance(image, str | PathLike | Picture) for image in images
@@ -219,12 +222,12 @@ def _one_each(values: Iterable[Any], count: int, name: str) -> list[Any]:
     return values
 
 
-def is_missing(box: Any) -> bool:
+def is_missing(box: BoxLike | None) -> bool:
     """Whether a box is None, or all its numbers are NaN."""
     return box is None or bool(as_numbers(box, "boxes").isnan().all())
 
 
-def rig_cameras(poses: Any, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
+def rig_cameras(poses: ArrayLike, items: "Sequence[ImageItem | CurviregError]") -> Tensor:
     """Poses of the cameras of photographs from the world as (V, 4, 4) float64; an error names the
     photograph: a pose that is not rigid and finite, or that of another photograph by the same
     camera which shows something else."""
@@ -301,11 +304,11 @@ def _cameras(given: Any, count: int) -> Sequence[Tensor | Camera | None]:
 
 
 def image_item(
-    image: Any,
+    image: ImageLike,
     box: Tensor | None,
     camera: Tensor | Camera | None = None,
     prior: PosePrior | None = None,
-    mask: Any | None = None,
+    mask: MaskLike | None = None,
 ) -> ImageItem:
     """One photograph in any form, with its (4,) box (None: that of the mask, or the whole image),
     however small."""
@@ -395,7 +398,7 @@ class OnDemand(Sequence[ImageItem | CurviregError]):
         return self._item(self._indices[index])
 
 
-def _pixels(image: Any) -> tuple[Tensor, Camera | None]:
+def _pixels(image: ImageLike) -> tuple[Tensor, Camera | None]:
     """The pixels of a photograph in any form, and the camera of its EXIF data."""
     if isinstance(image, str | PathLike):
         photo = read_photo(image)

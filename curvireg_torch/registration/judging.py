@@ -54,7 +54,7 @@ def judged(
     fraction = _outside_fraction(target, work, poses[best])
     # Poses that merged have no probability of their own.
     rivals = own[distinct[own]]
-    near = are_near(target.bank.rotations, poses.rotation[best[0]], work.symmetries)
+    near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
         evidence[rivals],
         scores[rivals],
@@ -89,6 +89,7 @@ def judged(
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
         camera=item.camera,
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 

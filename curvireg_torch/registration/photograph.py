@@ -17,8 +17,6 @@ from .focal import FINISHED
 from .inputs import ImageItem, check_crop
 from .judging import judged
 from .poses import (
-    FINISHED_FITS,
-    SCREENING_WEIGHT,
     Poses,
     best_views,
     common_score,
@@ -42,16 +40,12 @@ from .unknown_camera import (
 from .work import (
     Work,
     fitted_poses,
-    landmark_poses,
+    keypoint_poses,
     least_starts,
     poses_in_box,
     poses_of_views,
     with_replaced,
 )
-
-SCREENED_VIEWS = 10
-"""Number of the best distinct views of an exact mesh that get a short contour fit, which decides
-with their rank which become hypotheses."""
 
 
 def register_item(target: Target, item: ImageItem) -> Registration:
@@ -71,7 +65,7 @@ def register_item(target: Target, item: ImageItem) -> Registration:
 
 
 def _register_box(target: Target, item: ImageItem) -> Registration:
-    query = target.matcher.query([item.image], item.box[None])
+    query = target.matcher.query_together(item.image, item.box)
     check_crop(query.crops[0])
     return register(target, item, query)
 
@@ -98,7 +92,7 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
             poses = poses.replaced(
                 unknown, with_quick_fit(target.describer, work.crops, poses[unknown])[0]
             )
-        finish = FINISHED_FITS if work.starts is None else FINISHED
+        finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
     evidence = evidence_of(target, work, poses)
     sibling = Rival.none(poses, evidence)
@@ -112,7 +106,9 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         poses, evidence = _with_texture(target, work, work.crops, poses, evidence, outside)
     inside = (~outside).nonzero()[:, 0]
     scores = evidence[inside].scores(target.score_weights(exact=work.exact))
-    distinct = outside.index_copy(0, inside, distinct_poses(poses[inside], scores, work.symmetries))
+    angle = target.pipeline.fit.same_pose_angle
+    found = distinct_poses(poses[inside], scores, work.symmetries, angle=angle)
+    distinct = outside.index_copy(0, inside, found)
     # Unlike another view, these started near the pose that they merged with: they are no
     # rivals.
     other = (distinct | ~repeated).nonzero()[:, 0]
@@ -145,7 +141,9 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     target.report_progress("ranking")
     exact = target.is_exact
     limits = None if item.prior is None else limits_of(target, item)
-    ranking = target.matcher.rank(query, None if limits is None else limits.allowed()[None])
+    ranking = target.matcher.rank_together(
+        query, None if limits is None else limits.allowed()[None]
+    )
     symmetries = target.symmetries_of(exact=exact)
     crops = None
     if target.pipeline.contours:
@@ -156,7 +154,7 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
         ranking=ranking,
         descriptor=target.describer.descriptor(query.field),
         crops=crops,
-        landmarks=target.landmark_matches(item, item.box) if target.uses_landmarks else None,
+        keypoints=target.keypoint_matches(item, item.box) if target.uses_keypoints else None,
         item=item,
         limits=limits,
         exact=exact,
@@ -167,7 +165,7 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits,
     the last one at most, and which repeats another one: the same view with another camera, or a
-    pose that landmarks agree on, in place of the views near it.
+    pose that keypoints agree on, in place of the views near it.
 
     That outside is the best view there; it is never reported, and tells whether the limits are
     wrong.
@@ -175,7 +173,7 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
     poses = _promising(target, work) if work.starts is None else work.starts
     repeated = _are_repeated(poses.view)
     if work.crops is not None and work.exact:
-        found, _ = landmark_poses(target, work.landmarks)
+        found, _ = keypoint_poses(target, work.keypoints)
         found = found if work.limits is None else found[work.limits.keeps(found)]
         if len(found):
             far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)
@@ -199,7 +197,9 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
 def _promising(target: Target, work: Work) -> Poses:
     """Poses of the most promising distinct views."""
     count = least_starts(target)
-    screened = max(SCREENED_VIEWS, count) if work.crops is not None and work.exact else count
+    screened = count
+    if work.crops is not None and work.exact:
+        screened = max(target.pipeline.fit.screened_views, count)
     view, rank = best_views(work.ranking, target.bank, count=screened, symmetries=work.symmetries)
     poses = poses_of_views(target, work, view, rank)
     if work.limits is not None:
@@ -213,7 +213,7 @@ def _screened(target: Target, crops: EdgeCrops, poses: Poses, count: int) -> Pos
     """The ``count`` poses with the largest sum of rank and weighted edge support after a short
     fit, best first."""
     poses, support = with_quick_fit(target.describer, crops, poses)
-    score = poses.rank + SCREENING_WEIGHT * support
+    score = poses.rank + target.pipeline.fit.screening_weight * support
     return poses[score.argsort(descending=True, stable=True)[:count]]
 
 

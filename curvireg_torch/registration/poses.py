@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 from ..evidence import EvidenceWeights
-from ..fitting.contour_fit import fit_to_edges, quick_fit
 from ..fitting.contour_problem import ContourProblem
 from ..fitting.edges import EdgeCrops
-from ..fitting.measured_fit import ContourFit, contour_support
+from ..fitting.measured_fit import ContourFit
 from ..fitting.texture_fit import fit_texture, turned
+from ..fitting.together import fit_together, quick_fit_together, support_together
 from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
+from ..pipeline import FitSettings
 from ..utils.rows import Rows
 from .confidence import are_near
 from .result import Hypothesis
 
 __all__ = [
-    "SCREENING_WEIGHT",
     "Poses",
     "best_views",
     "close_rivals",
@@ -36,21 +36,6 @@ __all__ = [
     "with_edge_support",
     "with_quick_fit",
 ]
-
-SAME_POSE_ANGLE = 15.0
-"""Degrees within which two fitted hypotheses count as one."""
-
-SCREENING_WEIGHT = 20.0
-"""Weight of the edge support that a short fit reaches, beside log S, in the choice of the views
-that are fitted."""
-
-FINISHED_FITS = 2
-"""Hypotheses of a photograph whose contours are fitted at full size."""
-
-CLOSE_SCORE = 2.5
-CLOSE_RIVALS = 2
-"""Score by which rivals may be behind to be compared with the best pose in detail, and how many of
-them are fitted as thoroughly."""
 
 
 @dataclass(frozen=True)
@@ -152,17 +137,25 @@ def best_views(
     order = ranking.order[0]
     if ranking.allowed is not None:
         order = order[ranking.allowed[0][order]]
-    view = distinct_views(order, bank.rotations, count=count, symmetries=symmetries).cpu()
+    rotations = bank.views.rotations  # on the CPU, in the precision of bank.rotations
+    view = distinct_views(order, rotations, count=count, symmetries=symmetries).cpu()
     log = ranking.scores[0].cpu().double().clamp(min=torch.finfo(torch.float64).tiny).log()
     return view, log[view] - log.max()
 
 
-def fit_poses(describer: ViewDescriber, crops: EdgeCrops, poses: Poses, **options: Any) -> Poses:
+def fit_poses(
+    describer: ViewDescriber,
+    crops: EdgeCrops,
+    poses: Poses,
+    *,
+    settings: FitSettings = FitSettings(),
+    **options: Any,
+) -> Poses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.crop_index
-    return poses.with_fit(
-        fit_to_edges(*given, **{"finish": FINISHED_FITS, **options}), describer.centre
-    )
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    finish = options.pop("finish", settings.finished_fits)
+    fit = fit_together(*given, settings=settings, finish=finish, **options)
+    return poses.with_fit(fit, describer.centre)
 
 
 def with_quick_fit(
@@ -170,7 +163,8 @@ def with_quick_fit(
 ) -> tuple[Poses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`quick_fit`."""
-    T, support = quick_fit(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    T, support = quick_fit_together(*given)
     return replace(poses, quick=T), support
 
 
@@ -193,7 +187,8 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Poses) -> Poses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    support = contour_support(describer.contours, crops, poses.cameras, poses.T, poses.crop_index)
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
+    support = support_together(*given)
     return replace(poses, edge_support=support)
 
 
@@ -205,24 +200,26 @@ def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:
     return similarity + weights.landmarks * evidence["landmarks"]
 
 
-def distinct_poses(poses: Poses, score: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(H,) bool: False where a pose is within ``SAME_POSE_ANGLE`` degrees of one with a higher
-    ``score`` (H,)."""
+def distinct_poses(
+    poses: Poses, score: Tensor, symmetries: Tensor | None = None, *, angle: float
+) -> Tensor:
+    """(H,) bool: False where a pose is within ``angle`` degrees of one with a higher ``score``
+    (H,)."""
     order = score.argsort(descending=True, stable=True)
     R = poses.rotation[order].float()
     best_first = torch.arange(len(order))
-    chosen = distinct_views(
-        best_first, R, count=len(order), angle=SAME_POSE_ANGLE, symmetries=symmetries
-    )
+    chosen = distinct_views(best_first, R, count=len(order), angle=angle, symmetries=symmetries)
     return torch.zeros(len(order), dtype=torch.bool).index_fill(0, order[chosen], True)
 
 
-def close_rivals(poses: Poses, scores: Tensor, symmetries: Tensor | None = None) -> Tensor:
-    """(R,) indices of other poses whose scores (H,) are nearly as high as the best one, best
-    first."""
+def close_rivals(
+    poses: Poses, scores: Tensor, symmetries: Tensor | None = None, *, behind: float
+) -> Tensor:
+    """(R,) indices of other poses whose scores (H,) are less than ``behind`` below the best one,
+    best first."""
     best = int(scores.argmax())
     same = are_near(poses.rotation, poses.rotation[best], symmetries)
-    close = ~same & (scores > scores[best] - CLOSE_SCORE)
+    close = ~same & (scores > scores[best] - behind)
     order = torch.where(close, scores, -torch.inf).argsort(descending=True, stable=True)
     return order[: int(close.sum())]
 

@@ -3,7 +3,6 @@ checks them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +11,7 @@ from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
+from ..utils.likes import ArrayLike, CameraLike, ImagesLike
 from .confidence import are_near, is_calibrated, refinement_confidence
 from .described import DescribedPhotograph, evidence_of
 from .focal import focal_covariance
@@ -30,21 +30,16 @@ from .target import Target, nearest_view
 from .tracker import OUTSIDE, boxes_at
 from .work import map_items
 
-# Degrees by which given starts are rotated away, to fit from there too: they may be worse than
-# views of a bank
-WIDE_ANGLES = (14.0, 22.0)
 # Hypotheses of the registration that checks a refined pose, even if fewer are reported
 COMPARED = 5
-# Confidence of the fit below which the object counts as lost, see docs/guides/known-pose.md
-LOST_CONFIDENCE = 0.35
 
 
 @torch.no_grad()
 def refine(
     target: Target,
-    images: Tensor | Sequence[Any],
-    camera_matrices: Any,
-    poses: Any,
+    images: ImagesLike,
+    camera_matrices: CameraLike | None,
+    poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
 ) -> list[Registration | FailedRegistration]:
@@ -71,6 +66,16 @@ def refine(
     Raises:
         InvalidInputError: not as many cameras or starts as photographs, a start that is not rigid
             and finite, or a confidence that is no probability.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=45, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> start = scene.truth
+        >>> (found,) = refine(cr.Registrar(bank), [scene.image], scene.camera_matrix, [start])
+        >>> found.ok, len(found.hypotheses)
+        (True, 1)
     """
     check_cameras(images, camera_matrices, "refine")
     items = image_items(images, None, camera_matrices)
@@ -81,7 +86,7 @@ def refine(
 def refine_items(
     target: Target,
     items: Sequence[ImageItem | CurviregError],
-    poses: Any,
+    poses: ArrayLike,
     *,
     start_confidences: Sequence[float | None] | None = None,
 ) -> list[Registration | FailedRegistration]:
@@ -130,16 +135,19 @@ def refine_item(
     poses = replace(poses, crop_index=each, view=views)
     mask = target.object_mask(query, [item] * len(T))
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
-    poses = fit_poses(describer, crops, poses, wide_angles=WIDE_ANGLES)
+    settings = target.pipeline.fit
+    wide_angles = settings.wide_angles
+    poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
 
-    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, landmarks=None)
+    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, keypoints=None)
     weights = target.score_weights(exact=True)
     best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
     if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
         poses = poses.replaced(best, fitted)
     evidence = evidence_of(target, photograph, poses)
     scores = evidence.scores(weights)
-    distinct = distinct_poses(poses, scores, target.symmetries_of(exact=True))
+    symmetries = target.symmetries_of(exact=True)
+    distinct = distinct_poses(poses, scores, symmetries, angle=settings.same_pose_angle)
     order = [h for h in scores.argsort(descending=True, stable=True).tolist() if distinct[h]]
     if item.focal_deviation:
         first = torch.tensor(order[:1])
@@ -149,7 +157,7 @@ def refine_item(
     hypotheses = tuple(hypothesis_of(poses, h, evidence.named(h)) for h in order)
     features = {name: hypotheses[0].evidence[name] for name in ("similarity", "edge_support")}
     confidence = refinement_confidence(features)
-    if confidence < LOST_CONFIDENCE:
+    if confidence < settings.lost_confidence:
         raise LostObjectError(
             f"the object is not near the start (edge support {features['edge_support']:.2f}, "
             f"similarity "
@@ -174,6 +182,7 @@ def refine_item(
         warnings=warnings,
         notes=notes,
         camera=item.camera,
+        reliable_from=settings.reliable,
     )
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from .described import evidence_of, with_details
-from .poses import CLOSE_RIVALS, Poses, close_rivals, distinct_poses
+from .poses import Poses, close_rivals, distinct_poses
 from .target import Target
 from .work import Work, fitted_poses, with_replaced
 
@@ -35,13 +35,15 @@ def fitted_again(
     best = best_inside(target, evidence, outside)
     poses, evidence = _refitted(target, work, crops, poses, evidence, best)
     scores = scores_inside(target, evidence, outside)
-    rivals = close_rivals(poses, scores, work.symmetries)
+    settings = target.pipeline.fit
+    rivals = close_rivals(poses, scores, work.symmetries, behind=settings.close_score)
     if not len(rivals):
         return poses, evidence
-    different = distinct_poses(poses[rivals], scores[rivals], work.symmetries)
-    poses, evidence = _refitted(
-        target, work, crops, poses, evidence, rivals[different][:CLOSE_RIVALS]
+    different = distinct_poses(
+        poses[rivals], scores[rivals], work.symmetries, angle=settings.same_pose_angle
     )
+    fitted = rivals[different][: settings.close_rivals]
+    poses, evidence = _refitted(target, work, crops, poses, evidence, fitted)
     return poses, with_details(target, crops, poses, evidence, int(best), rivals)
 
 

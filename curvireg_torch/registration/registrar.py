@@ -3,7 +3,8 @@
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -14,8 +15,9 @@ from ..geometry.viewpoint import ViewSphere
 from ..matching import ViewBank, ViewMatcher, cached_bank
 from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
-from ..utils.checks import check_device, check_option, check_symmetries
+from ..utils.checks import check_device, check_integer, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .detection import detect_item
@@ -27,10 +29,12 @@ from .result import FailedRegistration, Registration
 from .several import register_views
 from .target import Target
 from .work import map_items
+from .workers import Workers
 
 __all__ = ["Registrar"]
 
 Results = list[Registration | FailedRegistration]
+ObjectLike: TypeAlias = MeshLike | ViewBank | ViewMatcher
 
 
 class Registrar(Target):
@@ -59,6 +63,9 @@ class Registrar(Target):
             an exact mesh without colours, see :func:`curvireg_torch.mesh.mesh_symmetries`;
             ``torch.eye(4)[None]`` for none.
         device: of modules, bank and search.
+        workers: processes that register photographs side by side on a CPU, from the first call on;
+            1: this one, on several threads, which share Python's interpreter lock. A script starts
+            processes within ``if __name__ == "__main__":``. They show no progress.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "detection"
             (without a box), "bank", "ranking", "search" and "contours"; to cancel, it may raise
             what is no :class:`CurviregError`. On a CPU photographs are registered in parallel:
@@ -79,7 +86,7 @@ class Registrar(Target):
 
     def __init__(
         self,
-        bank_or_mesh: Any,
+        bank_or_mesh: ObjectLike | Sequence[ObjectLike],
         *,
         pipeline: Pipeline | None = None,
         views: ViewSphere | None = None,
@@ -89,17 +96,20 @@ class Registrar(Target):
         mesh_is: str | None = None,
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
+        workers: int = 1,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
+        check_integer(workers, "workers")
         if device is not None:
             check_device(device)
         if mesh_is is not None:
             check_option(mesh_is, MESH_KINDS, "mesh_is")
         if symmetries is not None:
             check_symmetries(symmetries)
+        source: Any = bank_or_mesh
         self.others = []
-        if isinstance(bank_or_mesh, list | tuple):
-            meshes = list(bank_or_mesh)
+        if isinstance(source, list | tuple):
+            meshes = list(source)
             if not meshes:
                 raise InvalidInputError("Registrar: expected a mesh or several, got an empty list")
             if len(meshes) > 1 and not isinstance(renderer, str):
@@ -119,15 +129,15 @@ class Registrar(Target):
                 "device": device,
             }
             self.others = [Registrar(mesh, **same, progress=progress) for mesh in meshes[1:]]
-            bank_or_mesh = meshes[0]
-        matcher: ViewMatcher = bank_or_mesh
-        if isinstance(bank_or_mesh, ViewMatcher):
+            source = meshes[0]
+        matcher: ViewMatcher = source
+        if isinstance(source, ViewMatcher):
             if any(value is not None for value in (pipeline, field, views, settings)):
                 raise InvalidInputError(
                     "Registrar: pipeline, field, views and settings belong to the matcher"
                 )
         else:
-            if not isinstance(bank := bank_or_mesh, ViewBank):
+            if not isinstance(bank := source, ViewBank):
                 pipeline = pipeline or Pipeline()
                 pipeline = replace(pipeline, bank=settings or pipeline.bank)
                 built: dict[str, Any] = {
@@ -136,7 +146,7 @@ class Registrar(Target):
                     "progress": progress,
                     "device": device or "cpu",
                 }
-                bank = cached_bank(bank_or_mesh, views, **built)
+                bank = cached_bank(source, views, **built)
             elif views is not None or settings is not None:
                 raise InvalidInputError(
                     "Registrar: views and settings belong to the bank; give them with a mesh only"
@@ -146,17 +156,22 @@ class Registrar(Target):
             # Built on one thread, so that rounding does not depend on the number of threads.
             matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
         super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
+        self.workers = workers
+        if workers > 1 and self.bank.device.type != "cpu":
+            raise InvalidInputError(
+                "workers: processes are for the CPU; a GPU registers photographs together"
+            )
 
     @torch.no_grad()
     @in_full_precision
     def __call__(
         self,
-        images: Tensor | Sequence[Any],
-        boxes: Any | None = None,
-        camera_matrices: Any | None = None,
+        images: ImagesLike,
+        boxes: BoxesLike | None = None,
+        camera_matrices: CameraLike | None = None,
         *,
         prior: PosePrior | Sequence[PosePrior | None] | None = None,
-        masks: Any | None = None,
+        masks: Sequence[MaskLike | None] | Tensor | None = None,
     ) -> Results:
         """Register a batch.
 
@@ -195,6 +210,10 @@ class Registrar(Target):
 
         :meta private:
         """
+        if self.workers > 1 and len(items) > 1:
+            if not self._workers.are_open:
+                del self._workers
+            return self._workers.register(items, detects=detects)
         for other in self.others:
             other.share()
 
@@ -210,6 +229,10 @@ class Registrar(Target):
                 _ = target.detector  # created once, before threads use it
         results: Results = map_items(self, items, register)
         return results
+
+    @cached_property
+    def _workers(self) -> Workers:
+        return Workers(self, self.workers)
 
     def _result_of(
         self, item: ImageItem, index: int, *, detects: bool
@@ -227,13 +250,19 @@ class Registrar(Target):
         return self.others[model - 1] if model else self
 
     @in_full_precision
-    def refine(self, images: Tensor | Sequence[Any], camera_matrices: Any, poses: Any) -> Results:
+    def refine(
+        self, images: ImagesLike, camera_matrices: CameraLike | None, poses: ArrayLike
+    ) -> Results:
         """Refine known poses of the first mesh, see :func:`curvireg_torch.registration.refine`."""
         return refine(self, images, camera_matrices, poses)
 
     @in_full_precision
     def register_views(
-        self, images: Sequence[Any], boxes: Any, camera_matrices: Any, T_cam_from_world: Any
+        self,
+        images: ImagesLike,
+        boxes: BoxesLike | None,
+        camera_matrices: CameraLike | None,
+        T_cam_from_world: ArrayLike,
     ) -> Registration:
         """Register photographs of one object together, see
         :func:`curvireg_torch.registration.register_views`."""

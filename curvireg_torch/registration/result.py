@@ -52,8 +52,8 @@ CONVENTIONS = {  # docs/results.md describes all keys
     "orientation applied)",
     "boxes": "x0, y0, x1, y1 in those pixels",
     "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": f"confidence of at least {RELIABLE:g}, and nothing questionable; false = the pose "
-    f"is a guess",
+    "reliable": "confidence of at least pipeline.fit.reliable, and nothing questionable; false = "
+    "the pose is a guess",
     "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: "
     "R_true = exp([w]x) R, "
     "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
@@ -84,6 +84,16 @@ class Hypothesis:
             units) along them, ``R_true = exp([w]x) R``, ``t_true = t + e``, if pose and camera
             matrix are right; None without a camera matrix, without contour fit, and where too few
             edges were found.
+
+    Example:
+        >>> from curvireg_torch.registration.poses import Poses, hypothesis_of
+        >>> T = torch.eye(4).double()[None]; T[:, 2, 3] = 5.0
+        >>> view = torch.zeros(1, dtype=torch.long)
+        >>> centre = torch.zeros(3).double()
+        >>> poses = Poses.at(T, torch.eye(3).double()[None], centre, view, view.double())
+        >>> hypothesis = hypothesis_of(poses, 0, {"similarity": 0.8})
+        >>> hypothesis.score, hypothesis.distance
+        (0.8, 5.0)
     """
 
     rotation: Tensor
@@ -138,6 +148,11 @@ class Detection:
         response: of the proposal that led here, see :class:`.Proposals`.
         boxes: (P, 4) float64, all proposals, the results' boxes first, with their ``responses``
             (P,).
+
+    Example:
+        >>> box = torch.tensor([10.0, 20.0, 110.0, 90.0]).double()
+        >>> Detection(box, 0.97, 8.0, box[None], torch.tensor([8.0])).score
+        0.97
     """
 
     box: Tensor
@@ -159,6 +174,11 @@ class PhotographPose:
         contribution: score by which the photograph prefers the pose to its best rival, of 5 points
             if there is none; 0 if the photograph does not count.
         failure: why the photograph does not count, in words; None if it does.
+
+    Example:
+        >>> pose = PhotographPose(torch.eye(4).double(), failure="the photograph is empty")
+        >>> pose.to_dict()["translation"], pose.contribution
+        ([0.0, 0.0, 0.0], 0.0)
     """
 
     T_cam_from_model: Tensor
@@ -224,6 +244,16 @@ class Registration:
             of several photographs.
         views: of :meth:`.Registrar.register_views`, the pose in each photograph; poses and
             covariance are then ``T_world_from_model``, along the world's axes.
+        reliable_from: confidence from which it is called reliable.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=30, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> result = cr.Registrar(bank)([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> result.rotation.shape, len(result.hypotheses) == len(result.probabilities)
+        (torch.Size([3, 3]), True)
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -240,6 +270,7 @@ class Registration:
     model: int = 0
     camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
+    reliable_from: float = RELIABLE
 
     ok = True
     """False of a :class:`FailedRegistration`."""
@@ -280,12 +311,12 @@ class Registration:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least ``RELIABLE``, without ``warnings`` or a better pose
-        outside the prior, and the contours determine at least one axis of rotation; if False, the
-        pose is a guess."""
+        """Whether the confidence is at least ``reliable_from``, without ``warnings`` or a better
+        pose outside the prior, and the contours determine at least one axis of rotation; if False,
+        the pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
-        if self.confidence is None or not self.confidence >= RELIABLE or doubtful:
+        if self.confidence is None or not self.confidence >= self.reliable_from or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
@@ -416,7 +447,14 @@ def _finite(deviations: Tensor) -> list[float | None]:
 @dataclass(frozen=True)
 class FailedRegistration:
     """A photograph that could not be registered because of its ``error``, which access to a pose
-    raises."""
+    raises.
+
+    Example:
+        >>> from curvireg_torch.errors import ImageError
+        >>> failed = FailedRegistration(ImageError("the photograph is empty"))
+        >>> failed.ok, failed.verdict
+        (False, 'failed')
+    """
 
     error: CurviregError
 

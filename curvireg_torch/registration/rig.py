@@ -28,7 +28,6 @@ from .confidence import MAX_MARGIN, refinement_confidence
 from .described import DescribedPhotograph, evidence_of
 from .inputs import ImageItem
 from .poses import Poses
-from .refinement import LOST_CONFIDENCE
 from .result import Hypothesis, Registration
 from .target import Target, nearest_view
 from .tracker import boxes_at
@@ -154,7 +153,7 @@ class RigPhotograph(DescribedPhotograph):
             query=query,
             ranking=result.ranking,
             descriptor=target.describer.descriptor(query.field),
-            landmarks=target.landmark_matches(item, box) if target.uses_landmarks else None,
+            keypoints=target.keypoint_matches(item, box) if target.uses_keypoints else None,
             result=result,
         )
 
@@ -487,7 +486,7 @@ class Rig:
         for v, photograph in enumerate(self.photographs):
             if not sees[v]:
                 reasons[photograph.index] = ELSEWHERE
-            elif found[v] < LOST_CONFIDENCE * max(found):
+            elif found[v] < self.target.pipeline.fit.lost_confidence * max(found):
                 numbers = "similarity {:.2f}, edge support {:.2f}".format(*pairs[v])
                 reasons[photograph.index] = (
                     f"the object is not seen where the other photographs have it ({numbers})"

@@ -3,13 +3,13 @@ of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..evidence import Evidence
+from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike
 from .confidence import (
     MAX_MARGIN,
     RIVAL_ANGLE,
@@ -44,10 +44,10 @@ JOINT_HYPOTHESES = 5
 @torch.no_grad()
 def register_views(
     target: Target,
-    images: Sequence[Any],
-    boxes: Any,
-    camera_matrices: Any,
-    T_cam_from_world: Any,
+    images: ImagesLike,
+    boxes: BoxesLike | None,
+    camera_matrices: CameraLike | None,
+    T_cam_from_world: ArrayLike,
 ) -> Registration:
     """Register several photographs of one object together: one pose in the world.
 
@@ -208,6 +208,7 @@ def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> 
         ),
         notes=first.result.notes,
         views=tuple(views),
+        reliable_from=target.pipeline.fit.reliable,
     )
 
 

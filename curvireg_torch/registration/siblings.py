@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from ..evidence import Evidence, EvidenceWeights
-from ..fitting.details import compare_details
 from ..fitting.edges import EdgeCrops
+from ..fitting.together import details_together
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
 from .confidence import RIVAL_ANGLE
@@ -75,8 +75,8 @@ class Siblings:
         evidence."""
         copies = pose[torch.zeros(len(symmetries), dtype=torch.long)]
         poses = placed(copies, copies.T @ symmetries.to(copies.T), describer.centre)
-        details = compare_details(
-            describer.contours, crops, poses.cameras, poses.T, poses.crop_index
+        details = details_together(
+            describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
         )
         return Siblings(poses, measure(poses), *details, weights=weights)
 

@@ -12,7 +12,7 @@ import trimesh
 from torch import Tensor
 
 from ..evidence import RANK_ALONE, EvidenceWeights
-from ..fitting.landmarks import LandmarkMatches, Landmarks
+from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
 from ..terms import QueryFeatures
@@ -71,7 +71,7 @@ class Target:
 
     def score_weights(self, *, exact: bool) -> EvidenceWeights:
         """What evidence counts for with an exact mesh, or with a similar one."""
-        return EvidenceWeights() if exact else RANK_ALONE
+        return self.pipeline.fit.weights if exact else RANK_ALONE
 
     @cached_property
     def telling_symmetries(self) -> TellingSymmetries:
@@ -83,14 +83,14 @@ class Target:
         return telling_symmetries(self.bank.mesh, symmetries)
 
     @property
-    def uses_landmarks(self) -> bool:
-        """Whether landmarks give starts and evidence: with an exact mesh and the contour fit."""
+    def uses_keypoints(self) -> bool:
+        """Whether keypoints give starts and evidence: with an exact mesh and the contour fit."""
         return self.is_exact and self.pipeline.contours
 
-    def landmark_matches(
+    def keypoint_matches(
         self, item: ImageItem, box: Tensor | None = None
-    ) -> LandmarkMatches | None:
-        """Landmarks of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
+    ) -> KeypointMatches | None:
+        """Keypoints of the mesh's print in a photograph, or in a ``box`` (4,) of it; None without
         colours or a camera matrix.
 
         :meta private:
@@ -98,12 +98,12 @@ class Target:
         if not self.describer.draws_colours or item.camera_matrix is None:
             return None
         with _SHAPE_LOCK:  # photographs share them
-            landmarks = self._landmarks
-        return landmarks.matches(item.image, item.camera_matrix, box)
+            keypoints = self._keypoints
+        return keypoints.matches(item.image, item.camera_matrix, box)
 
     @cached_property
-    def _landmarks(self) -> Landmarks:
-        return Landmarks(self.describer)
+    def _keypoints(self) -> Keypoints:
+        return Keypoints(self.describer, least=self.pipeline.fit.min_keypoints)
 
     @cached_property
     def mesh_warnings(self) -> tuple[str, ...]:

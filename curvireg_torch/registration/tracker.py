@@ -104,10 +104,18 @@ class Tracker:
     was seen from the most similar direction.
 
     A pose that is found counts as known, to predict and to learn colours from, only after
-    :meth:`accept`.
+    :meth:`accept`. One of confidence ``reliable`` is convincing.
     """
 
-    def __init__(self, renderer: DepthRenderer, contours: MeshContours, hull: Tensor) -> None:
+    def __init__(
+        self,
+        renderer: DepthRenderer,
+        contours: MeshContours,
+        hull: Tensor,
+        *,
+        reliable: float = RELIABLE,
+    ) -> None:
+        self.reliable = reliable
         self.renderer = renderer
         self.contours = contours
         self.hull = hull.double()
@@ -143,7 +151,7 @@ class Tracker:
             # pixels beside a wrong prediction may be unusable
             with suppress(LostObjectError, ImageError):
                 found.append(self._fit(image, K, T))
-                if found[-1].confidence >= RELIABLE:
+                if found[-1].confidence >= self.reliable:
                     break
         if not found:
             raise LostObjectError("the object has left the photograph")

@@ -10,6 +10,7 @@ from ..errors import InvalidInputError
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import USUAL_DEVIATION
+from .confidence import are_near
 from .described import evidence_of
 from .focal import (
     FITTED,
@@ -20,13 +21,17 @@ from .focal import (
     starts_of_fields,
     usual_camera,
     with_focal_length,
+    zoomed,
 )
 from .inputs import ImageItem
-from .poses import Poses, best_views
+from .poses import Poses, best_views, close_rivals
 from .priors import Limits
 from .refits import best_inside, scores_inside
 from .target import Target
 from .work import Work, least_starts, poses_of_views, with_replaced
+
+OTHER_FOCAL = 0.2
+"""Difference of log f from which a fit from another focal length may end elsewhere."""
 
 SAME_SCORE = 0.2
 """Difference of scores that does not decide between focal lengths: 0.02 of similarity or edge
@@ -64,12 +69,18 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
             seen = replace(work, item=replace(item, camera_matrix=camera))
             poses = poses_of_views(target, seen, view, rank)
             of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(target.describer, work.crops, of_cameras, least_starts(target))
+        starts = starts_of_fields(
+            target.describer,
+            work.crops,
+            of_cameras,
+            least_starts(target),
+            screening_weight=target.pipeline.fit.screening_weight,
+        )
         K = starts.cameras[0]
     item = replace(item, camera_matrix=K)
     limits = None if item.prior is None else Limits(item, target.bank)
-    landmarks = target.landmark_matches(item, item.box) if target.uses_landmarks else None
-    return replace(work, item=item, limits=limits, landmarks=landmarks, starts=starts)
+    keypoints = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+    return replace(work, item=item, limits=limits, keypoints=keypoints, starts=starts)
 
 
 def with_fitted_focal_lengths(
@@ -80,19 +91,53 @@ def with_fitted_focal_lengths(
     evidence: Evidence,
     outside: Tensor,
 ) -> tuple[Poses, Evidence]:
-    """The best poses fitted together with their focal lengths, where that does not lower their
-    scores noticeably: where perspective tells nothing, a usual focal length is better than one of
-    those tried."""
+    """The best poses and close rivals, each fitted together with its own focal length, where that
+    does not lower its score noticeably: where perspective tells nothing, a usual focal length is
+    better than one of those tried."""
     scores = scores_inside(target, evidence, outside)
-    count = FITTED if work.starts is not None else 1
-    weights = target.score_weights(exact=True)
-    best = scores.topk(min(count, int((~outside).sum()))).indices
-    for index in best.split(1):
-        fitted = with_focal_length(target.describer, crops, poses[index], work.item)
-        new = evidence_of(target, work, fitted)
-        if bool(new.scores(weights) >= scores[index] - SAME_SCORE):
-            poses, evidence = with_replaced(work, poses, evidence, index, fitted, new)
+    behind = target.pipeline.fit.close_score
+    chosen = _to_be_fitted(work, poses, scores, int((~outside).sum()), behind=behind)
+    index, focal = _focal_starts(chosen, poses.cameras[:, 0, 0])
+    starts = zoomed(poses[index], focal, target.describer.centre)
+    fitted = with_focal_length(target.describer, crops, starts, work.item)
+    new = evidence_of(target, work, fitted)
+    gain = new.scores(target.score_weights(exact=True)) - scores[index]
+    for h in chosen.tolist():
+        own = torch.where(index == h, gain, -torch.inf)
+        if float(own.max()) >= -SAME_SCORE:
+            best = own.argmax()[None]
+            poses, evidence = with_replaced(
+                work, poses, evidence, index[best], fitted[best], new[best]
+            )
     return poses, evidence
+
+
+def _focal_starts(chosen: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
+    """(N,) poses and focal lengths that fits begin from: one camera took the photograph, so that
+    the others also begin from the focal length of the first of the ``chosen`` poses (R,), and this
+    one from that of the second. ``focal`` (H,) px is that of each pose."""
+    first = chosen[:1].expand(len(chosen) - 1)
+    others = chosen[1:]
+    differ = (focal[first] / focal[others]).log().abs() > OTHER_FOCAL
+    second = others[differ][:1]
+    index = torch.cat([chosen, first[: len(second)], others[differ]])
+    starts = torch.cat([focal[chosen], focal[second], focal[first[differ]]])
+    return index, starts
+
+
+def _to_be_fitted(
+    work: Work, poses: Poses, scores: Tensor, inside: int, *, behind: float
+) -> Tensor:
+    """(R,) indices of the best poses and, of an unknown camera, of a rival that differs from them
+    and, as its score is less than ``behind`` below, could be better with another focal length;
+    ``inside`` poses may be chosen."""
+    if work.starts is None:
+        return scores.topk(min(1, inside)).indices
+    best = scores.topk(min(FITTED, inside)).indices
+    rivals = close_rivals(poses, scores, work.symmetries, behind=behind)
+    for index in best:
+        rivals = rivals[~are_near(poses.rotation[rivals], poses.rotation[index], work.symmetries)]
+    return torch.cat([best, rivals[:1]])
 
 
 def with_focal_deviation(

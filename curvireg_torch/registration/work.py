@@ -11,8 +11,10 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
-from ..fitting.landmarks import MIN_LANDMARKS, LandmarkMatches
+from ..fitting.keypoints import KeypointMatches
 from ..fitting.measured_fit import measure_contours
+from ..utils.company import map_in_company
+from ..utils.precision import exact_convolutions
 from ..utils.threads import map_on_threads
 from .described import DescribedPhotograph
 from .inputs import ImageItem
@@ -20,14 +22,6 @@ from .poses import Poses, fit_poses
 from .priors import Limits
 from .result import FailedRegistration
 from .target import Target, nearest_view
-
-MIN_REFINED = 3
-"""Minimum number of hypotheses to refine, even if fewer are reported: the confidence depends on
-rivals. Of 15 photographs of another object, 14 were called reliable with one hypothesis, 2 with
-two, none with three or five."""
-
-# Fraction of the landmarks that agree with a start, which must agree with its fit as well
-KEPT_LANDMARKS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,8 +52,8 @@ def map_items(
     each error.
 
     On a CPU each photograph has a thread, in which torch uses no further ones: its result is
-    the same to the bit, whatever else is registered. Items are read on demand, so that few
-    photographs are in memory.
+    the same to the bit, whatever else is registered. On other devices, what the photographs need
+    is computed together. Items are read on demand, so that few photographs are in memory.
     """
     target.share()
 
@@ -72,11 +66,14 @@ def map_items(
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 
-    return map_on_threads(run, range(len(items)), device=target.bank.device)
+    if target.bank.device.type == "cpu":
+        return map_on_threads(run, range(len(items)))
+    with exact_convolutions():
+        return map_in_company(run, range(len(items)))
 
 
 def least_starts(target: Target) -> int:
-    return max(MIN_REFINED, target.pipeline.hypotheses)
+    return max(target.pipeline.fit.least_hypotheses, target.pipeline.hypotheses)
 
 
 def poses_of_views(target: Target, work: Work, view: Tensor, rank: Tensor) -> Poses:
@@ -94,8 +91,8 @@ def poses_in_box(target: Target, work: Work, *poses: Tensor) -> Poses:
     return Poses.in_box(target.describer, work.item.box, work.item.camera_matrix, *poses)
 
 
-def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Poses, Tensor]:
-    """Poses on which landmarks agree, as promising as the best view, and how many, the largest
+def keypoint_poses(target: Target, matches: KeypointMatches | None) -> tuple[Poses, Tensor]:
+    """Poses on which keypoints agree, as promising as the best view, and how many, the largest
     number first.
 
     :meta private:
@@ -116,13 +113,15 @@ def landmark_poses(target: Target, matches: LandmarkMatches | None) -> tuple[Pos
 def fitted_poses(
     target: Target, work: Work, crops: EdgeCrops, starts: Poses, **options: Any
 ) -> Poses:
-    """Fit the contours of ``starts``; one keeps its pose if the fit leaves the landmarks that
+    """Fit the contours of ``starts``; one keeps its pose if the fit leaves the keypoints that
     agree with it."""
-    poses = fit_poses(target.describer, crops, starts, **options)
-    if work.landmarks is not None:
-        before = work.landmarks.agreeing(starts.T, starts.cameras)
-        after = work.landmarks.agreeing(poses.T, poses.cameras)
-        left = ((before >= MIN_LANDMARKS) & (after < KEPT_LANDMARKS * before)).nonzero()[:, 0]
+    settings = target.pipeline.fit
+    poses = fit_poses(target.describer, crops, starts, settings=settings, **options)
+    if work.keypoints is not None:
+        before = work.keypoints.agreeing(starts.T, starts.cameras)
+        after = work.keypoints.agreeing(poses.T, poses.cameras)
+        is_left = (before >= settings.min_keypoints) & (after < settings.kept_keypoints * before)
+        left = is_left.nonzero()[:, 0]
         if len(left):
             kept = starts[left]
             seen = measure_contours(

@@ -2,6 +2,7 @@
 picture."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -49,6 +50,25 @@ class ContourPoints(Rows):
     normals: Tensor
     valid: Tensor
     outline: Tensor
+
+
+class Contours(Protocol):
+    """Contours of a mesh at any pose: :class:`MeshContours`, and :class:`.DeviceContours`.
+
+    Attributes:
+        device: of its tensors.
+        centre, radius: of the object, (3,) and model units.
+    """
+
+    device: torch.device
+    centre: Tensor
+    radius: float
+
+    def points(
+        self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
+    ) -> ContourPoints:
+        """See :meth:`MeshContours.points`."""
+        ...
 
 
 class _Level:
@@ -230,6 +250,8 @@ class MeshContours:
         [1.0, 1.0, 1.0]
     """
 
+    device = torch.device("cpu")
+
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.centre = mesh_centre(mesh)
         self.radius = mesh_radius(mesh)
@@ -241,6 +263,12 @@ class MeshContours:
                 level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False
             )
 
+    def level_of(self, size: int) -> tuple[int, _Level]:
+        """The largest crop that the simplified mesh for crops of ``size`` px serves, and this
+        mesh."""
+        limit = next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])
+        return limit, self._levels[limit]
+
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0
     ) -> ContourPoints:
@@ -248,7 +276,7 @@ class MeshContours:
         3); float64, CPU. ``density`` is a fraction of the usual number of points."""
         T = T_cam_from_model.numpy()
         K = camera_matrices.expand(len(T_cam_from_model), 3, 3).numpy()
-        level = self._levels[next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])]
+        _, level = self.level_of(size)
         edges = level.edges
         R = T[:, :3, :3]
         position = R @ self.centre.numpy() + T[:, :3, 3]

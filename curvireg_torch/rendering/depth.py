@@ -27,6 +27,14 @@ def make_renderer(
     For ``many_views``, "auto" leaves out the back faces of closed surfaces, which halves the time.
 
     Raises :class:`RenderingError` where the backend does not work.
+
+    Example:
+        >>> import torch, trimesh
+        >>> T = torch.eye(4).double()[None]; T[:, 2, 3] = 5.0
+        >>> K = torch.tensor([[60.0, 0, 31.5], [0, 60.0, 31.5], [0, 0, 1]]).double()
+        >>> depth = make_renderer(trimesh.creation.box()).render(T, K[None], (64, 64))
+        >>> round(float(depth[0, 0, 32, 32]), 4)
+        4.5
     """
     if not isinstance(backend, str):
         return backend

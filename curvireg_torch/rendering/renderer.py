@@ -13,7 +13,13 @@ NEAREST = 1e-3
 
 
 class DepthRenderer(Protocol):
-    """Depth images of one mesh. Both sides of every face are visible; textures are ignored."""
+    """Depth images of one mesh. Both sides of every face are visible; textures are ignored.
+
+    Example:
+        >>> import trimesh
+        >>> from curvireg_torch.rendering import make_renderer
+        >>> renderer: DepthRenderer = make_renderer(trimesh.creation.box())
+    """
 
     name: str
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..errors import ImageError, InvalidInputError
+from .likes import BoxesLike, CameraLike
 
 MAX_ROTATION_DEVIATION = 1e-2  # poses in files are rounded, and half precision rounds to 5e-4
 MAX_PIXEL_ASPECT = 1.1  # largest ratio of the focal lengths at which pixels count as square
@@ -301,7 +302,7 @@ def check_numbers(values: Any, name: str, count: int | None = None) -> Tensor:
     return numbers.double()
 
 
-def as_boxes(boxes: Any, count: int) -> Tensor:
+def as_boxes(boxes: BoxesLike, count: int) -> Tensor:
     """A tensor, an array or lists as (count, 4) boxes, at least float32; values are checked with
     the images."""
     x = as_numbers(boxes, "boxes")
@@ -313,7 +314,7 @@ def as_boxes(boxes: Any, count: int) -> Tensor:
     return x
 
 
-def as_camera_matrices(matrices: Any, count: int) -> Tensor:
+def as_camera_matrices(matrices: CameraLike, count: int) -> Tensor:
     """One matrix for all, or one for each, as (count, 3, 3) float64; values are not checked."""
     K = as_numbers(matrices, "camera_matrices", dtype=torch.float64)
     if K.shape[-2:] != (3, 3) or K.shape[:-2] not in ((), (1,), (count,)):

@@ -110,9 +110,8 @@ def _inert(cell: object) -> object:
     return cell if numbers else f"'{cell}"
 
 
-def check_writable(folder: Path, name: str) -> None:
-    """Create a folder, or raise :class:`OutputError` that names option ``name``, before work whose
-    results go there."""
+def check_writable(folder: Path) -> None:
+    """Create a folder, or raise :class:`OutputError`, before work whose results go there."""
     probe = folder / f".probe-{secrets.token_hex(4)}"
     try:
         write_file(probe, b"probe")
@@ -120,7 +119,7 @@ def check_writable(folder: Path, name: str) -> None:
     except OSError as error:
         reason = getattr(error.__cause__ or error, "strerror", None)
         raise OutputError(
-            f"cannot be written to ({reason}); choose another {name}", subject=f"{name} {folder}"
+            f"cannot be written to ({reason}); choose another folder", subject=folder, kind="out"
         ) from error
 
 

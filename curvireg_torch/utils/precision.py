@@ -22,6 +22,17 @@ def full_precision() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def exact_convolutions() -> Iterator[None]:
+    """Within, GPUs compute convolutions in float32, not in TF32, whose 10 bits move poses."""
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.allow_tf32 = before
+
+
 def in_full_precision(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Decorator: ``function`` computes with autocast off. Scores of views differ by less than
     bfloat16 can tell apart, and threads would not inherit the caller's autocast anyway."""

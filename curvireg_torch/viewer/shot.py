@@ -18,6 +18,7 @@ from ..jobs.options import RegisterOptions
 from ..jobs.result_files import views_glb, views_picture
 from ..jobs.views import View
 from ..registration import Hypothesis, Registrar, Registration, fit_contours
+from ..utils.likes import BoxLike
 from ..visualization import contour_overlay, pose_glb
 from ..visualization.encoding import png
 
@@ -236,9 +237,17 @@ class Shot:
         assert self.photo is not None
         contours = registrar.describer.contours
         margin = registrar.bank.settings.margin
-        fit = fit_contours(contours, self.photo.image, self.found_box, K, T[None], margin=margin)
+        fit = fit_contours(
+            contours, self.photo.image, self.require_box(), K, T[None], margin=margin
+        )
         supports = f"{float(fit.start_support[0]):.2f} to {float(fit.edge_support[0]):.2f}"
         self.place(fit.transform[0], f"contours fitted, edge support {supports}")
+
+    def require_box(self) -> Tensor:
+        """The box in which the object was registered; :class:`InvalidInputError` without one."""
+        if self.found_box is None:
+            raise InvalidInputError("box: the object was not found in this photograph")
+        return self.found_box
 
     def undo(self) -> None:
         """Take back the last change by hand; a second call repeats it."""
@@ -263,11 +272,13 @@ class Shot:
         if result.photographs:
             return views_picture(result.registrar, result.chosen, result.photographs)
         return png(
-            contour_overlay(result.registrar, result.answer.pose, self.photo.image, self.found_box)
+            contour_overlay(
+                result.registrar, result.answer.pose, self.photo.image, self.require_box()
+            )
         )
 
 
-def numbers(box: Sequence[float]) -> Numbers:
+def numbers(box: BoxLike) -> Numbers:
     """A box as four numbers."""
     x0, y0, x1, y1 = map(float, box)
     return x0, y0, x1, y1

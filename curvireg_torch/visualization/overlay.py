@@ -3,7 +3,6 @@ was found."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from ..registration.inputs import ImageItem, image_item
 from ..registration.result import pose_in_words, two_decimals
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
+from ..utils.likes import BoxLike, ImageLike
 from .contours import close_up, draw_window
 from .encoding import to_uint8
 
@@ -36,7 +36,7 @@ LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. Whit
 
 
 def contour_overlay(
-    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
 ) -> np.ndarray:
     """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the
     box (white).
@@ -49,6 +49,16 @@ def contour_overlay(
 
     Returns:
         (H, W, 3) uint8 RGB.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> contour_overlay(registrar, result, scene.image, scene.box).shape
+        (720, 960, 3)
     """
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
@@ -102,10 +112,21 @@ def _paste_tiles(
 
 @torch.no_grad()
 def side_pictures(
-    registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any
+    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
 ) -> dict[str, np.ndarray]:
     """(S, S, 3) uint8 RGB of "photograph", "photograph field", "pose", "view field"; see
-    :func:`contour_overlay`."""
+    :func:`contour_overlay`.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> sorted(side_pictures(registrar, result, scene.image, scene.box))
+        ['photograph', 'photograph field', 'pose', 'view field']
+    """
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
     crop = crop_regions(
@@ -130,7 +151,7 @@ def _field_picture(field: Tensor) -> np.ndarray:
 
 @torch.no_grad()
 def registration_sheet(
-    registrar: Registrar, result: Registration, image: Any, box: Any, *, note: str = ""
+    registrar: Registrar, result: Registration, image: ImageLike, box: BoxLike, *, note: str = ""
 ) -> np.ndarray:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared
     fields and the rivals.
@@ -140,6 +161,16 @@ def registration_sheet(
 
     Returns:
         (H', W', 3) uint8 RGB.
+
+    Example:
+        >>> import curvireg_torch as cr
+        >>> scene = cr.synthetic.demo_scene()
+        >>> views = cr.sample_views(azimuth_step=60, elevations=[20])
+        >>> bank = cr.ViewBank.build(scene.mesh, views, image_size=64, progress=False)
+        >>> registrar = cr.Registrar(bank)
+        >>> result = registrar([scene.image], [scene.box], scene.camera_matrix)[0]
+        >>> registration_sheet(registrar, result, scene.image, scene.box).shape[1]
+        960
     """
     item = image_item(image, as_numbers(box, "box"))
     registrar = registrar.of_model(result.model)

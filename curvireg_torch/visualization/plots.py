@@ -7,6 +7,7 @@ from ..errors import MissingDependencyError
 from ..matching import ViewBank
 from ..registration import Hypothesis, Registrar, Registration
 from ..utils.extras import install_command
+from ..utils.likes import BoxLike, ImageLike
 from .overlay import side_pictures
 
 
@@ -34,7 +35,9 @@ def viewpoints(bank: ViewBank, result: Registration) -> Any:
     return figure
 
 
-def fields(registrar: Registrar, result: Registration | Hypothesis, image: Any, box: Any) -> Any:
+def fields(
+    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
+) -> Any:
     """The photograph and its field, the pose and its field; arguments as for
     :func:`.contour_overlay`."""
     pictures = side_pictures(registrar, result, image, box)

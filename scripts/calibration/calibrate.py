@@ -11,7 +11,7 @@ WORK/*.jsonl, of which finished rows are kept, and fits. Everything depends on t
 alone: an interrupted run goes on, with any number of --jobs. FURNITURE, the folder of
 scripts/benchmark/meshes.py, adds real meshes to the procedural ones. Folds are by kind of object,
 so every measure is of kinds that the fit has not seen. --write stores the constants in
-curvireg_torch/registration/calibration.json and their quality in scripts/results/calibration.json.
+curvireg_torch/calibration/calibration.json and their quality in scripts/results/calibration.json.
 """
 
 import argparse
@@ -53,7 +53,7 @@ from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
 
 Row: TypeAlias = dict[str, Any]
 
-CONSTANTS = REPOSITORY / "curvireg_torch" / "registration" / "calibration.json"
+CONSTANTS = REPOSITORY / "curvireg_torch" / "calibration" / "calibration.json"
 FURNITURE = ("--kind", "furniture", "--bare", "0.2")
 SHAPES = ("--kind", "shapes")
 PRINTED = ("--kind", "printed")
@@ -299,7 +299,7 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
         result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
         lost = not result.ok and isinstance(result.error, LostObjectError)
         found = result.detection if result.ok else result.error.detection if lost else None
-        # not a number of landmarks
+        # not a number of keypoints
         if found is not None and not float(found.response).is_integer():
             query = registrar.matcher.query([shown["image"]], found.box[None].float())
             features = {

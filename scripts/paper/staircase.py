@@ -243,6 +243,8 @@ def climb(name: str, root: Path, options: argparse.Namespace) -> None:
         path = options.out / name / f"{text_digest(request)}.json"
         given = (options.table, root, options.pixel_origin, group, chosen)
         jobs.append(Part(path, given, len(group)))
+    # In a fixed random order: the part that an interrupted run has measured is a fair one.
+    jobs.sort(key=lambda job: job.path.name)
     if options.partial:
         jobs = [job for job in jobs if job.path.exists()]
     complete(jobs, measure, label=name, jobs=options.jobs, quiet=options.quiet)

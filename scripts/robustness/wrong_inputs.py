@@ -14,7 +14,6 @@ is scripts/results/wrong_inputs.json; exit code 1 if anything failed.
 import argparse
 import json
 import re
-import resource
 import shlex
 import shutil
 import subprocess
@@ -163,6 +162,8 @@ def write_files(folder: Path) -> None:
 
 def limited() -> None:
     """Limit the process that is about to start."""
+    import resource  # not on Windows
+
     resource.setrlimit(resource.RLIMIT_CPU, (int(SECONDS) + 20, int(SECONDS) + 20))
     resource.setrlimit(resource.RLIMIT_DATA, (MEGABYTES << 20, MEGABYTES << 20))
 

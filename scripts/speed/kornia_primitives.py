@@ -5,13 +5,15 @@ backward pass.
     python scripts/speed/kornia_primitives.py --compiled       # also compiled, which takes several
     minutes
 
-Writes scripts/results/kornia_primitives.json and the table of docs/kornia.md. Both functions run in
+Writes scripts/results/kornia_primitives.json and the table of docs/kornia.md after each
+measurement; those that are not repeated (--only, --sizes) stay. Both functions run in
 turn in one process on one thread, on batches of eight images, and the least time of each counts, so
 that the ratio holds on a busy machine.
 """
 
 import argparse
 import functools
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -265,21 +267,41 @@ def main() -> None:
     parser.add_argument(
         "--only", nargs="+", default=[p.name for p in PRIMITIVES], help="names of primitives"
     )
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="of images, px")
     parser.add_argument(
         "--out", type=Path, help="JSON file, instead of record and page of the project"
     )
     options = parser.parse_args()
     torch.set_num_threads(1)
-    entries = []
+    out = options.out or OUT
+    entries = json.loads(out.read_text())["entries"] if out.is_file() else []
     for primitive in PRIMITIVES:
-        for size in SIZES if primitive.name in options.only else ():
+        for size in options.sizes if primitive.name in options.only else ():
             how = {
                 "compiled": options.compiled,
                 "rounds": options.rounds,
                 "seconds": options.seconds,
             }
-            entries.append(measure(primitive, size, **how))
-            print(entries[-1], flush=True)
+            entry = measure(primitive, size, **how)
+            print(entry, flush=True)
+            entries = with_entry(entries, entry)
+            write(out, entries)
+
+
+def with_entry(entries: Sequence[dict[str, Any]], entry: dict[str, Any]) -> list[dict[str, Any]]:
+    """The entries in the order of the table, with a new one in the place of the one before."""
+    names = [primitive.name for primitive in PRIMITIVES]
+    others = [one for one in entries if place(one) != place(entry)]
+    return sorted([*others, entry], key=lambda one: (names.index(one["primitive"]), one["size"]))
+
+
+def place(entry: dict[str, Any]) -> tuple[str, int]:
+    """What an entry is of."""
+    return entry["primitive"], entry["size"]
+
+
+def write(out: Path, entries: Sequence[dict[str, Any]]) -> None:
+    """Write the record and, if it is the project's, the table of its page."""
     record = {
         "date": _shared.today(),
         "commit": _shared.commit(),
@@ -289,8 +311,8 @@ def main() -> None:
         "batch": BATCH,
         "entries": entries,
     }
-    _shared.write_json(options.out or OUT, record)
-    if options.out is None:
+    _shared.write_json(out, record)
+    if out == OUT:
         versions = (
             f"kornia {record['kornia']}, torch {record['torch']}, {record['processor']}, "
             f"{record['date']}"

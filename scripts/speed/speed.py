@@ -53,21 +53,28 @@ HERE = (
 """Import of this file in a process that imports another checkout's package."""
 
 
+def dented_sphere(subdivisions: int) -> Any:
+    """A mesh of 20 x 4^subdivisions faces."""
+    import numpy as np
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    waves = np.random.default_rng(0).normal(size=(3, 6)) * 3
+    bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
+    mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
+    return mesh
+
+
 def write_inputs(folder: str, photographs: int) -> None:
     """Write a dented sphere, photographs of it in random poses and their boxes; runs in this
     checkout."""
     import cv2
-    import numpy as np
     import torch
-    import trimesh
 
     import curvireg_torch as cr
     from curvireg_torch.synthetic import random_pose, synthesize_photograph
 
-    mesh = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
-    waves = np.random.default_rng(0).normal(size=(3, 6)) * 3
-    bumps = np.sin(mesh.vertices @ waves).mean(axis=1)
-    mesh.vertices = mesh.vertices * (1 + 0.35 * bumps[:, None]) * [1.0, 0.7, 0.5]
+    mesh = dented_sphere(SUBDIVISIONS)
     mesh.export(Path(folder, "mesh.ply"))
     K = cr.camera_matrix(*CAMERA, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)

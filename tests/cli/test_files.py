@@ -17,7 +17,7 @@ import pytest
 import trimesh
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.jobs import ros
+from curvireg_torch.jobs import outputs, ros
 from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.visualization import sheet
 from tests._support.lists import CAMERA, box_of, table, written
@@ -76,6 +76,10 @@ def test_register_writes_the_mesh_at_its_pose(folder, register, tmp_path, monkey
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names & {"pose.glb", *ros.FILES} >= {"pose.yaml", "tf.yaml"}
     assert "pose.glb" not in names
+    for tool, files in (("m3t", outputs.M3T_FILES), ("visp", outputs.VISP_FILES)):
+        assert register(*words, "--format", tool) == 0
+        names = {path.name for path in (tmp_path / "out").iterdir()}
+        assert names & {*outputs.FOR_TOOLS} == {*files}
     assert register(*words) == 0
     assert not {"pose.glb", *ros.FILES} & {path.name for path in (tmp_path / "out").iterdir()}
 

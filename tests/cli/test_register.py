@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.register import _advice
+from curvireg_torch.cli.register import _advice, _print_rivals, print_result
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
@@ -154,11 +155,12 @@ def test_a_bank_has_the_unit_and_the_axis_that_the_options_name(
     bank = {"mesh": "mm.safetensors"}
     refused(
         register_one("--unit", "m", "--no-refine", **bank),
-        "mm.safetensors: built with --unit mm, not with --unit m",
+        "mm.safetensors: built with unit mm, not m; leave the unit out, or build it again "
+        "(leave --unit out, or curvireg bank)",
     )
     refused(
         register_one("--up=-x", "--no-refine", **bank),
-        "mm.safetensors: built with --up=z, not with --up=-x",
+        "mm.safetensors: built with z up, not -x",
     )
     words = ["--unit", "mm", "--up", "z", "--no-refine"]
     assert register_one(*words, **bank) == 0
@@ -314,3 +316,67 @@ def test_advice_names_what_was_measured_or_says_less():
         ({"confidence_features": {"border": 0, "undetermined": 1.2}}, "rotation open"),
     ):
         assert words in _advice({**document, **change})
+
+
+POSE = {"viewpoint": {"azimuth": 10.0, "elevation": 20.0, "theta": 0.0}, "translation": None}
+PRINTED = {
+    **POSE,
+    "score": 0.5,
+    "confidence": 0.999,
+    "verdict": "reliable",
+    "reliable": True,
+    "corrected_box": None,
+    "standard_deviations": None,
+    "unit": "mm",
+    "hypotheses": [],
+    "ambiguous": None,
+    "seconds": {"bank": 0.0, "register": 0.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, "theta 0.0 degrees (as seen by a camera that looks straight at it)   score 0.500"),
+        ({"translation": [1.0, 2.0, 3.0]}, "theta 0.0 degrees   score 0.500   confidence 0.99,"),
+        ({"confidence": None}, "confidence not calibrated for other terms, fields or views"),
+        (
+            {
+                "translation": [1.0, 2.0, 3.0],
+                "detection": {
+                    "instances": [
+                        {**POSE, "box": [1, 2, 3, 4], "score": 0.9, "translation": [4.0, 5.5, 6.0]}
+                    ]
+                },
+            },
+            "found in box 1 2 3 4: there with probability 0.90; azimuth 10.0, elevation 20.0, "
+            "theta 0.0 degrees, at 4, 5.5, 6 mm",
+        ),
+    ],
+)
+def test_the_command_says_what_numbers_mean(capsys, changes, expected):
+    print_result({**PRINTED, **changes}, Path("out"))
+    assert expected in capsys.readouterr().out
+
+
+def test_rivals_and_hidden_features_are_named(capsys):
+    viewpoint = {"azimuth": 30.0, "elevation": 10.0, "theta": 0.0}
+    tied = {
+        "ambiguous": "half turn",
+        "confidence": 0.45,
+        "no_match_probability": 0.1,
+        "hypotheses": [{"viewpoint": viewpoint}] * 3,
+        "probabilities": [0.45, 0.44, 0.01],
+    }
+    _print_rivals(tied)
+    printed = capsys.readouterr().out
+    assert printed.count("could also be") == 1
+    assert "flipped by 180 degrees" in printed
+    certain = {"confidence": 0.95, "probabilities": [0.95, 0.01, 0.01]}
+    _print_rivals(tied | certain | {"ambiguous": "several"})
+    printed = capsys.readouterr().out
+    assert (
+        printed == "right up to turns that only a small feature tells apart, which is not in view\n"
+    )
+    _print_rivals(tied | {"ambiguous": None})
+    assert capsys.readouterr().out == ""

@@ -2,6 +2,7 @@
 say so."""
 
 import json
+from pathlib import Path
 
 import kornia
 import pytest
@@ -88,3 +89,25 @@ def test_measurements_run(name: str) -> None:
         {"forward and backward"} if not primitive.differentiable else set()
     )
     assert all(values["ratio"] > 0 for values in measured["eager"].values())
+
+
+def test_measurements_that_are_not_repeated_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def measured(primitive: script.Primitive, size: int, **_: object) -> dict[str, object]:
+        return {"primitive": primitive.name, "size": size, "same": False, "run": next(runs)}
+
+    runs = iter(range(9))
+    monkeypatch.setattr(script, "measure", measured)
+    out = tmp_path / "record.json"
+    words = ["script", "--out", str(out), "--only", "grey levels", "first derivatives"]
+    for more in ([], ["--sizes", "256"]):
+        monkeypatch.setattr("sys.argv", [*words, *more])
+        script.main()
+    found = [(e["primitive"], e["size"], e["run"]) for e in json.loads(out.read_text())["entries"]]
+    assert found == [
+        ("first derivatives", 128, 0),
+        ("first derivatives", 256, 4),
+        ("grey levels", 128, 2),
+        ("grey levels", 256, 5),
+    ]

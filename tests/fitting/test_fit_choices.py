@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from curvireg_torch.fitting import contour_fit
-from curvireg_torch.fitting.contour_fit import KEPT_STARTS, fit_to_edges
+from curvireg_torch.fitting.contour_fit import fit_to_edges
 from curvireg_torch.fitting.contour_problem import COARSE_DENSITY, ContourProblem, ContourState
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.mesh.mesh import mesh_centre
+from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration import ContourFit
 from curvireg_torch.rendering.contours import MeshContours
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
@@ -83,7 +84,7 @@ def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
     monkeypatch.setattr(ContourProblem, "descend", descended)
     monkeypatch.setattr(contour_fit, "_two_best", watched)
     fitted(monkeypatch, starts(6.0), weigh)
-    assert KEPT_STARTS == 3
+    assert FitSettings().kept_starts == 3
     assert first[0].equal(begun[0][[-1, -2, -3]])
     torch.testing.assert_close(went_on[0].flatten(), refined[0])
 

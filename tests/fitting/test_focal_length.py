@@ -45,7 +45,7 @@ def test_a_longer_focal_length_keeps_place_and_size_of_the_image():
     centre = truck_registrar().describer.centre
     T[0, 0, 3] += 0.3  # off the axis
     zoom = torch.tensor([0.01], dtype=torch.float64)
-    moved = focal_length._moved_away(T, zoom, centre)
+    moved = focal_length.moved_away(T, zoom, centre)
     longer = focal_length.scaled_cameras(NEAR[None], zoom)
     assert longer[0].tolist() == [
         [150.0 * zoom.exp().item(), 0, 119.5],
@@ -72,7 +72,7 @@ def test_derivative_by_the_focal_length():
     step = torch.tensor([1e-5], dtype=torch.float64)
 
     def pixels(sign):
-        moved = focal_length._moved_away(T, sign * step, problem.centre)
+        moved = focal_length.moved_away(T, sign * step, problem.centre)
         K = focal_length.scaled_cameras(problem.K, sign * step)
         return project(state.points.model, state.points.normals, moved, K, problem.centre)[0]
 
@@ -89,7 +89,7 @@ def test_strong_perspective_shows_the_focal_length(wrong):
     image, box, T = near_scene()
     guess = focal_length.scaled_cameras(NEAR[None], torch.tensor([wrong]).double().log())[0]
     problem = fitting_problem(image, box, guess)
-    start = focal_length._moved_away(T[None], torch.tensor([wrong]).double().log(), problem.centre)
+    start = focal_length.moved_away(T[None], torch.tensor([wrong]).double().log(), problem.centre)
     fit = focal_length.fit_focal_length(
         problem, start, focal_length.FocalPrior.usual(guess[None], SIZE), FULL_SIZE_RADII
     )
@@ -115,7 +115,7 @@ def test_the_focal_length_stays_within_its_limits():
     problem = fitting_problem(image, box, guess)
     none = torch.zeros(1, dtype=torch.float64)
     prior = focal_length.FocalPrior(none, 0.5, none - 0.05, none + 0.05)
-    start = focal_length._moved_away(T[None], torch.tensor([1.35]).double().log(), problem.centre)
+    start = focal_length.moved_away(T[None], torch.tensor([1.35]).double().log(), problem.centre)
     fit = focal_length.fit_focal_length(problem, start, prior, FULL_SIZE_RADII)
     assert float(fit.log_zoom) == pytest.approx(-0.05, abs=1e-9)
 

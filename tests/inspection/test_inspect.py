@@ -1,6 +1,5 @@
 """What is said of a mesh before a photograph is taken."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,20 +8,27 @@ import torch
 import trimesh
 
 import curvireg_torch as cr
-from curvireg_torch.cli import main
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.inspection.facts import mesh_facts
-from curvireg_torch.inspection.look_alikes import look_alikes
+from curvireg_torch.inspection.look_alikes import (
+    LookAlike,
+    confused_sides,
+    look_alikes,
+    print_difference,
+)
 from curvireg_torch.inspection.page import report_lines, report_page
 from curvireg_torch.inspection.photographs import (
     SIZE,
     Photograph,
     PhotographGenerator,
+    photographed_mesh,
     trial_camera,
     with_print,
     without_colours,
 )
-from curvireg_torch.inspection.trial import Expected, Outcome
+from curvireg_torch.inspection.report import Inspection
+from curvireg_torch.inspection.surface import look_symmetries
+from curvireg_torch.inspection.trial import Expected, Outcome, run_trial
 from curvireg_torch.matching import ViewBank
 from curvireg_torch.mesh import has_colours
 from curvireg_torch.mesh.mesh import as_mesh
@@ -89,9 +95,14 @@ def test_open_doubled_and_loose_faces_are_counted():
 @pytest.mark.parametrize(
     ("size", "unit", "text"),
     [
-        (80.0, None, "suggests mm or cm"),
-        (80.0, "m", "really m?"),
-        (0.3, "mm", "really mm?"),
+        (80.0, None, "suggests mm (0.11 m) or cm (1.1 m); give the unit"),
+        (
+            80.0,
+            "m",
+            "106 m across: is its unit really m; usual would be mm (0.11 m) or cm (1.1 m)?",
+        ),
+        (0.3, "mm", "really mm; usual would be m (0.4 m)?"),
+        (1000.0, "m", "1,319 m across"),
         (0.3, "m", None),
     ],
 )
@@ -112,6 +123,37 @@ def test_a_sphere_and_a_wire_are_hopeless():
     facts = mesh_facts(wire)
     assert facts.is_hopeless
     assert any("wire" in text for text in facts.warnings)
+
+
+def test_a_room_is_hopeless_and_a_large_object_is_not():
+    box = trimesh.creation.box((5.0, 4.0, 2.6))
+    room = trimesh.util.concatenate(
+        [trimesh.Trimesh(box.vertices, box.faces[:, ::-1]), plate((1.8, 0.9, 0.7), (0, 0, -0.9))]
+    )
+    room.units = box.units = "m"
+    facts = mesh_facts(room)
+    assert facts.is_hopeless
+    assert "as a room's do" in facts.warnings[-1]
+    assert not mesh_facts(box).is_hopeless
+    small = room.copy()
+    small.units = "cm"
+    assert not mesh_facts(small).is_hopeless, "a box that is inside out"
+
+
+def test_thin_parts_and_flipped_faces_are_told():
+    body = trimesh.creation.box((1, 2, 3))
+    assert mesh_facts(body).thin == 0.0
+    assert mesh_facts(example_mesh()).thin == 0.0, "its parts reach into one another"
+    sheet = plate((3.0, 3.0, 0.01), (0, 0, 2))
+    facts = mesh_facts(trimesh.util.concatenate([trimesh.creation.box((0.5, 0.5, 0.5)), sheet]))
+    assert 0.8 < facts.thin < 1.0
+    assert any("thinner than 1 %" in text for text in facts.warnings)
+    assert facts.has_consistent_faces
+    faces = body.faces.copy()
+    faces[0] = faces[0, ::-1]
+    flipped = mesh_facts(trimesh.Trimesh(body.vertices, faces, process=False))
+    assert not flipped.has_consistent_faces
+    assert any("flipped" in text for text in flipped.warnings)
 
 
 def test_symmetry_deviation_grows_with_the_asymmetry():
@@ -204,6 +246,28 @@ def test_a_print_varies_over_the_surface_and_leaves_the_shape():
     assert not has_colours(without_colours(printed))
 
 
+@pytest.mark.parametrize("is_coloured", [False, True])
+def test_photographs_of_many_faces_show_a_simplified_mesh(monkeypatch, is_coloured):
+    fine = trimesh.creation.icosphere(5, 2.0)
+    assert photographed_mesh(fine) is fine
+    fine = fine.copy()
+    if is_coloured:
+        colours = np.where(fine.triangles_center[:, :1] > 0.0, (250, 0, 0, 255), (0, 0, 250, 255))
+        fine.visual.face_colors = colours
+    fine.units = "cm"
+    fine = as_mesh(fine)
+    for name, value in (("MANY_FACES", 9_000), ("COLOURED_FACES", 2_000)):
+        monkeypatch.setattr(f"curvireg_torch.inspection.photographs.{name}", value)
+    simple = photographed_mesh(fine)
+    assert len(simple.faces) <= (2_000 if is_coloured else 8_000)
+    assert simple.bounds == pytest.approx(fine.bounds, abs=0.05)
+    assert has_colours(simple) == is_coloured
+    if is_coloured:
+        reds = simple.visual.vertex_colors[:, 0] > 125
+        sides = simple.vertices[:, 0]
+        assert (reds == (sides > 0.0))[np.abs(sides) > 0.1].all()
+
+
 def test_trial_counts_right_and_reliable_and_stages_are_reported_in_order(registrar):
     calls = []
     report = cr.inspect(
@@ -225,6 +289,7 @@ def outcome(error: float, *, elevation: float = 0.0) -> Outcome:
         torch.zeros(3, 4, 4, dtype=torch.uint8),
         torch.tensor([0.0, 0, 200, 100]),
         torch.eye(4, dtype=torch.float64),
+        trial_camera(),
     )
     return Outcome(photograph, None, error, elevation)
 
@@ -236,60 +301,109 @@ def test_expected_shares():
     assert expected.median_deg == 4.0
 
 
-def test_report_of_a_hopeless_mesh_registers_nothing(tmp_path, capsys):
-    trimesh.creation.icosphere(2, 10.0).export(tmp_path / "ball.stl")
-    command = [
-        "inspect",
-        str(tmp_path / "ball.stl"),
-        "--unit",
-        "mm",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main([*command, "--strict"]) == 3
-    assert "rotation cannot be seen" in capsys.readouterr().out
-    document = json.loads((tmp_path / "out" / "inspect.json").read_text())
-    assert document["hopeless"]
-    assert document["expected"] is None
-    assert main(command) == 0
-
-
-def test_command_writes_report_and_page(tmp_path, capsys):
-    example_mesh().export(tmp_path / "truck.ply")
-    command = [
-        "inspect",
-        str(tmp_path / "truck.ply"),
-        "--unit",
-        "m",
-        "--pose",
-        "upright",
-        "--n",
-        "4",
-        "--out",
-    ]
-    assert main([*command, str(tmp_path / "out")]) == 0
-    document = json.loads((tmp_path / "out" / "inspect.json").read_text())
-    assert {"n", "right", "reliable", "median_deg"} <= document["expected"].keys()
-    assert document["expected"]["n"] == 4
-    assert document["symmetries"] == []
-    assert isinstance(document["warnings"], list)
-    assert set(document["expected"]["compared"]) == {
-        "without a camera",
-        "with a pose prior: azimuth within 45 degrees",
-        "with a second photograph from another side",
-        "with a print, also in the mesh: orientations that look alike without count as wrong",
-    }
-    page = (tmp_path / "out" / "inspect.html").read_text()
-    assert page.count("data:image/jpeg") >= 12, "six pairs of views"
-    assert "expected: right in" in capsys.readouterr().out
-
-
 def test_number_below_zero_is_refused():
     with pytest.raises(InvalidInputError, match="n"):
         cr.inspect(trimesh.creation.box((1, 2, 3)), n=-1)
+
+
+def test_page_groups_symmetries_by_their_turn():
+    can = mesh_facts(trimesh.creation.cylinder(0.3, 1.0, sections=72))
+    page = report_page(Inspection(can), None, title="can")
+    assert page.count("<tr><td>180°</td><td>37</td>") == 1
+    assert page.count("<tr><td>10°</td><td>2</td>") == 1
+    assert "in 1 part, closed" in page
 
 
 def test_page_escapes_names(registrar):
     report = cr.inspect(registrar, n=0)
     assert "<b>" not in report_page(report, registrar, title="<b>x").replace("<body>", "")
     assert any(line.startswith("size:") for line in report_lines(report))
+
+
+def test_symmetries_of_colours_are_told_from_those_of_shape():
+    bands = trimesh.creation.cylinder(0.3, 1.0, sections=72).subdivide().subdivide().subdivide()
+    height = bands.triangles_center[:, 2]
+    bands.visual.face_colors = np.where(
+        height[:, None] > 0.2, (200, 30, 30, 255), (30, 30, 200, 255)
+    )
+    assert len(look_symmetries(bands)) == 36, "no half turn upside down"
+    facts = mesh_facts(bands)
+    assert facts.is_coloured
+    assert any("body of revolution" in text for text in facts.warnings)
+    label = bands.copy()
+    beside = (bands.triangles_center[:, 0] > 0.2) & (np.abs(height) < 0.1)
+    label.visual.face_colors[beside] = (250, 250, 250, 255)
+    label.visual.face_colors = np.where(beside[:, None], (250,) * 4, bands.visual.face_colors)
+    assert len(look_symmetries(label)) == 1
+    assert len(mesh_facts(label).symmetries) == 71
+
+
+def pair_of(rotation, rival, **more) -> LookAlike:
+    return LookAlike(rotation, rival, 180.0, 0.9, 0.8, **more)
+
+
+def test_sides_that_are_confused_are_named():
+    view = cr.rotation_from_viewpoint(20.0, 30.0, 0.0).double()
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    upside_down = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+    around = pair_of(view, view @ half_turn)
+    over = pair_of(view, view @ upside_down)
+    quarter = pair_of(view, cr.rotation_from_viewpoint(110.0, 30.0, 0.0).double())
+    assert confused_sides([around, around, over], "z") == "front and back"
+    assert confused_sides([around, over, over], "z") == "top and bottom"
+    assert confused_sides([around], "y") == "top and bottom"
+    assert confused_sides([quarter], "z") == "several sides"
+
+
+def test_one_sentence_says_what_looks_alike_and_what_helps():
+    facts = mesh_facts(example_mesh())
+    view = cr.rotation_from_viewpoint(20.0, 30.0, 0.0).double()
+    turned = view @ torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+    alike = pair_of(view, turned, hint="--azimuth")
+    other = LookAlike(view, turned, 180.0, 0.2, 0.8)
+    brief = Inspection(facts, (alike, alike, alike, *[other] * 7)).in_brief
+    remedy = "give a texture or a pose prior (--azimuth)"
+    assert brief == f"grey mesh: front and back look alike from 30 % of the views; {remedy}"
+    assert Inspection(facts, (other,)).in_brief == "grey mesh: its sides differ in shape"
+    told = replace(alike, print_differs=0.5)
+    painted = mesh_facts(example_mesh(painted=True))
+    brief = Inspection(painted, (told, told, other)).in_brief
+    assert brief.endswith("look alike in shape from 67 % of the views; its print tells them apart")
+    brief = Inspection(painted, (told, alike)).in_brief
+    assert "its print tells 50 % of these apart, a pose prior (--azimuth) the others" in brief
+
+
+def test_a_print_tells_sides_of_a_box_apart_and_a_plain_one_does_not():
+    views = cr.sample_views(azimuth_step=30, elevations=[-30, 0, 30])
+    box = trimesh.creation.box((1, 2, 3)).subdivide().subdivide()
+    middles = box.triangles_center
+    red, blue, white = (200, 30, 30, 255), (30, 30, 200, 255), (250, 250, 250, 255)
+    coloured = {
+        "print": np.where(middles[:, :1] > 0, red, blue),
+        "stripe": np.where(np.abs(middles[:, 2:]) > 1, red, white),
+    }
+    sides = {}
+    for name, colours in coloured.items():
+        box.visual.face_colors = colours
+        mesh = as_mesh(box)
+        bank = ViewBank.build(mesh, views, progress=False)
+        describer = Registrar(bank, mesh_is="exact").describer
+        half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))
+        view = cr.rotation_from_viewpoint(60.0, 20.0, 0.0).double()
+        distance = bank.distances.median().double().cpu()
+        sides[name] = print_difference(describer, view, view @ half_turn, distance)
+    assert sides["print"] > 0.5
+    assert sides["stripe"] < 0.01
+
+
+@pytest.mark.slow
+def test_a_printed_can_is_predicted_better_with_its_texture_than_without():
+    printed = as_mesh(with_print(trimesh.creation.cylinder(0.033, 0.12)))
+    views = cr.sample_views(azimuth_step=30, elevations=[-60, -30, 0, 30, 60])
+    generate = PhotographGenerator(printed, 2, upright=True)
+    right = {}
+    for name, mesh in (("texture", printed), ("grey", without_colours(printed))):
+        bank = ViewBank.build(mesh, views, progress=False)
+        registrar = Registrar(bank, mesh_is="exact", symmetries=torch.eye(4)[None].double())
+        right[name] = run_trial(registrar, generate, 6, compare=False).expected.right
+    assert right["texture"] > right["grey"] + 0.3

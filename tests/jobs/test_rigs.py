@@ -190,6 +190,14 @@ def test_ground_truth_of_bop_of_another_shape_is_refused(tmp_path, truth):
         read_rig(tmp_path, Path("obj_000005.ply"))
 
 
+def test_a_scene_of_bop_without_poses_of_its_cameras_is_no_rig(tmp_path):
+    K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]
+    (tmp_path / "scene_camera.json").write_text(json.dumps({"7": {"cam_K": K}}))
+    message = r"image 7: no cam_R_w2c in scene_camera\.json.* register these photographs one by one"
+    with pytest.raises(InvalidInputError, match=message):
+        read_rig(tmp_path)
+
+
 @pytest.mark.parametrize("place", [1, 3, 6])
 def test_cameras_of_bop_with_skew_are_refused(tmp_path, place):
     K = [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0]

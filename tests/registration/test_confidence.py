@@ -7,11 +7,11 @@ import torch
 import trimesh
 
 from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
-from curvireg_torch.evidence import Evidence
+from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.measured_fit import contour_support
 from curvireg_torch.mesh import mesh_symmetries
-from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import confidence
 from curvireg_torch.synthetic import procedural_background
 from tests._support.scenes import (
@@ -158,6 +158,9 @@ def test_only_the_default_pipeline_is_calibrated():
         (replace(Pipeline(), contours=False), False),
         (Pipeline().with_term("appearance", weight=0), False),
         (Pipeline().with_term("appearance", top=8), True),
+        (replace(Pipeline(), fit=FitSettings(reliable=0.5)), True),
+        (replace(Pipeline(), fit=FitSettings(screened_views=20)), False),
+        (replace(Pipeline(), fit=FitSettings(weights=EvidenceWeights(details=2.0))), False),
         *((PRESETS[name], False) for name in ("classical", "paper", "fast")),
     ):
         assert confidence.is_calibrated(pipeline) == calibrated

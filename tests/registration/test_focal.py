@@ -5,12 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from curvireg_torch import camera_matrix
 from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import rotation_error
-from curvireg_torch.registration import focal
+from curvireg_torch.registration import focal, unknown_camera
 from curvireg_torch.registration.inputs import image_item
-from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.poses import Poses, projected_box
+from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import SIZE, learned_registrar, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
 
@@ -49,6 +51,63 @@ def test_an_unknown_camera_is_estimated():
     given = learned_registrar()([image], box[None], NEAR)[0]
     assert (given.camera.source, given.camera.focal_deviation) == ("given", 0.0)
     assert result.standard_deviations[1][2] > given.standard_deviations[1][2]
+
+
+@pytest.mark.slow
+def test_focal_lengths_with_small_deviations_are_right():
+    """Within 10 % where the deviation is below 5 %, which near objects allow; errors are those that
+    the deviations say."""
+    mesh = example_mesh()
+    describer = learned_registrar().describer
+    size = (480, 640)
+    small = []
+    ratios = []
+    for seed in range(6):
+        generator = torch.Generator().manual_seed(seed)
+        widths = (0.7, 1.0, 1.4)[seed % 3]
+        K = camera_matrix(640 * widths, 640 * widths, 319.5, 239.5, dtype=torch.float64)
+        T = random_pose(mesh, K, size, generator, elevations=(5.0, 50.0))
+        near = torch.tensor([0.0, 0.0, 2.5 * describer.radius], dtype=torch.float64)
+        T[:3, 3] = near - T[:3, :3] @ describer.centre
+        image, box = synthesize_photograph(mesh, T, K, size, generator)
+        result = learned_registrar()([image], box[None])[0]
+        assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
+        error = abs(float((result.camera.matrix[0, 0] / K[0, 0]).log()))
+        ratios.append(error / result.camera.focal_deviation)
+        if result.camera.focal_deviation < 0.05:
+            small.append(error)
+    assert len(small) >= 3
+    assert max(small) < 0.1
+    assert max(ratios) < 2.5
+
+
+@pytest.mark.parametrize(("factor", "first"), [(2.0, 1), (1.1, 0)])
+def test_rivals_are_also_tried_with_the_focal_length_of_the_best(factor, first):
+    """One camera took the photograph: each begins from the other's, where these differ."""
+    focal_lengths = torch.tensor([500.0, 100.0, 500.0 * factor])
+    index, starts = unknown_camera._focal_starts(torch.tensor([2, 0]), focal_lengths)
+    assert index.tolist() == [2, 0, *[2, 0] * first]
+    assert starts.tolist() == pytest.approx(
+        [500.0 * factor, 500.0, *[500.0, 500.0 * factor] * first]
+    )
+
+
+def test_zoomed_poses_keep_their_images():
+    T = near_scene()[2]
+    describer = truck_registrar().describer
+    one = torch.zeros(1, dtype=torch.long)
+    poses = Poses.at(T[None], NEAR[None], describer.centre, one, one.double())
+    moved = focal.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
+    assert float(moved.cameras[0, 0, 0]) == pytest.approx(2.0 * float(NEAR[0, 0]))
+    assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
+    before = projected_box(describer, (T, NEAR))
+    after = projected_box(describer, (moved.T[0], moved.cameras[0]))
+    assert float((before - after).abs().max()) < 0.2 * float((before[2:] - before[:2]).max())
+    centre = [
+        (K @ (P[:3, :3] @ describer.centre + P[:3, 3]))
+        for P, K in ((T, NEAR), (moved.T[0], moved.cameras[0]))
+    ]
+    assert torch.allclose(centre[0][:2] / centre[0][2], centre[1][:2] / centre[1][2])
 
 
 def test_fields_of_view_are_across_the_longer_side():

@@ -2,12 +2,14 @@
 like mistakes."""
 
 import weakref
+from dataclasses import replace
 
 import torch
 
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import camera_matrix
-from curvireg_torch.registration import inputs
+from curvireg_torch.pipeline import FitSettings
+from curvireg_torch.registration import Registrar, inputs
 from curvireg_torch.registration.inputs import ImageItem, camera_warnings, image_items
 from tests._support.scenes import (
     CAMERA,
@@ -54,11 +56,12 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         assert not refused or "at least 12 are needed" in str(item)
 
 
-def test_result_with_a_questionable_camera_is_never_reliable(monkeypatch):
-    monkeypatch.setattr("curvireg_torch.registration.result.RELIABLE", 0.0)
+def test_result_with_a_questionable_camera_is_never_reliable():
     image, box, T = scene(0)
     far = camera_matrix(260.0, 260.0, 300.0, 400.0)
-    registrar = learned_registrar()
+    bank = learned_registrar().bank
+    pipeline = replace(bank.pipeline, fit=FitSettings(reliable=0.0))
+    registrar = Registrar(bank, pipeline=pipeline)
     good, bad = (registrar([image], box[None], K)[0] for K in (CAMERA, far))
     assert good.reliable
     assert good.warnings == ()

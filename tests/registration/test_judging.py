@@ -70,7 +70,7 @@ def judgement(
     target: Any = SimpleNamespace(
         score_weights=lambda **_: EvidenceWeights(),
         pipeline=pipeline or Pipeline(),
-        bank=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float()),
+        bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
         describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
         mesh_warnings=("of the mesh",),
         mesh_notes=("note",),

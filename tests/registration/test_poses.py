@@ -30,7 +30,7 @@ def test_distinct_poses():
         ([0.0, 14.0, 16.0, 180.0], [0.9, 0.8, 0.7, 0.6], [True, False, True, True]),
         ([0.0, 10.0], [0.1, 0.2], [False, True]),
     ):
-        assert distinct_poses(poses(degrees), torch.tensor(score)).tolist() == expected
+        assert distinct_poses(poses(degrees), torch.tensor(score), angle=15.0).tolist() == expected
 
 
 def test_best_views_are_distinct_and_ranked_relative_to_the_best():

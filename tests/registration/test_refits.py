@@ -10,6 +10,7 @@ from torch import Tensor
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import refits
 from curvireg_torch.registration.poses import Poses
 from tests._support.scenes import CAMERA
@@ -69,7 +70,9 @@ class Refits:
         symmetries: Tensor | None = None,
     ) -> tuple[list[bool], Evidence]:
         """Which poses moved, and the evidence."""
-        target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights())
+        target: Any = SimpleNamespace(
+            score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline()
+        )
         work: Any = SimpleNamespace(limits=None, symmetries=symmetries)
         crops: Any = None
         excluded = torch.tensor(outside or [False] * len(poses))

@@ -1,6 +1,6 @@
 import math
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import cv2
 import pytest
@@ -17,11 +17,11 @@ from curvireg_torch import (
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.evidence import Evidence
-from curvireg_torch.fitting import contour_fit
+from curvireg_torch.fitting import contour_fit, together
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
-from curvireg_torch.pipeline import PRESETS
+from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import (
     FailedRegistration,
     Follower,
@@ -30,9 +30,7 @@ from curvireg_torch.registration import (
     work,
 )
 from curvireg_torch.registration import described as described_module
-from curvireg_torch.registration import poses as poses_module
 from curvireg_torch.registration import registrar as registrar_module
-from curvireg_torch.registration import result as result_module
 from curvireg_torch.registration.inputs import ImageItem, check_crop
 from curvireg_torch.rendering import make_renderer
 from curvireg_torch.synthetic import example_mesh, synthesize_photograph
@@ -136,8 +134,8 @@ def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
 @pytest.mark.parametrize(
     ("lowered_within", "weight", "right"),
     [
-        (30.0, photograph.SCREENING_WEIGHT, True),
-        (50.0, photograph.SCREENING_WEIGHT, True),
+        (30.0, FitSettings().screening_weight, True),
+        (50.0, FitSettings().screening_weight, True),
         (50.0, 0.0, False),
     ],
 )
@@ -146,7 +144,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
 ):
     """Without it, only views beyond 50 degrees are too far: from one 21 degrees off the true pose,
     which is 30 degrees from the best view, the fit ends 0.8 degrees off all the same."""
-    registrar = truck_registrar()
+    registrar = truck_registrar(fit=FitSettings(screening_weight=weight))
     item = ImageItem(IMAGE, BOX, CAMERA)
     query = registrar.matcher.query([IMAGE], BOX[None])
     ranking = registrar.matcher.rank(query)
@@ -158,7 +156,6 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     lowered = replace(
         ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True)
     )
-    monkeypatch.setattr(photograph, "SCREENING_WEIGHT", weight)
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
     result = photograph.register(registrar, item, query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == right
@@ -167,9 +164,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
 
 def test_the_best_pose_is_not_one_outside_the_limits():
     similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    nothing = torch.zeros_like(similarity)
-    evidence = Evidence(*[nothing] * len(fields(Evidence)))
-    evidence = replace(evidence, similarity=similarity)
+    evidence = replace(Evidence.zeros(4), similarity=similarity)
     outside = torch.tensor([False, False, True, False])
     assert refits.best_inside(truck_registrar(), evidence, outside).tolist() == [1]
 
@@ -194,12 +189,12 @@ def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
         described.append(len(seen.rank))
         return measure(seen)
 
-    for module in (contour_fit, poses_module):
+    for module in (contour_fit, together):
         monkeypatch.setattr(module, "quick_fit", counted)
     monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
-    assert fits == [photograph.SCREENED_VIEWS, 1]
+    assert fits == [FitSettings().screened_views, 1]
     assert len(described) == calls
 
 
@@ -304,10 +299,11 @@ def test_registrar_uses_and_records_a_custom_field():
     assert registrar([IMAGE], BOX[None])[0].ranking.scores.equal(gradient.scores)
 
 
-@pytest.mark.parametrize("limit", [0.0, 1.01])
-def test_covariance_needs_a_reliable_result_and_a_camera(monkeypatch, limit):
-    monkeypatch.setattr(result_module, "RELIABLE", limit)
-    registrar = learned_registrar()
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+def test_covariance_needs_a_reliable_result_and_a_camera(limit):
+    bank = learned_registrar().bank
+    pipeline = replace(bank.pipeline, fit=FitSettings(reliable=limit))
+    registrar = Registrar(bank, pipeline=pipeline)
     result = registrar([IMAGE], BOX[None], CAMERA)[0]
     assert result.reliable == (limit == 0.0)
     assert (

@@ -14,10 +14,11 @@ from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.evidence import Evidence
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.geometry import rotation_from_axis_angle, transform
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import rig as rig_module
-from curvireg_torch.registration.refinement import LOST_CONFIDENCE
 from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
 
+LOST_CONFIDENCE = Pipeline().fit.lost_confidence
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
 RADIUS = 2.0
 ORIGIN = torch.eye(4, dtype=torch.float64)
@@ -36,6 +37,7 @@ def rig_of(eyes: Tensor, **attributes: Any) -> Rig:
     rig = object.__new__(Rig)
     rig.eyes = eyes + CENTRE
     rig.describer = SimpleNamespace(centre=CENTRE, radius=RADIUS, hull=None)
+    rig.target = SimpleNamespace(pipeline=Pipeline())
     rig.symmetries = torch.eye(3).double()[None]
     for name, value in attributes.items():
         setattr(rig, name, value)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.fitting.landmarks import LandmarkMatches
+from curvireg_torch.fitting.keypoints import KeypointMatches
 from curvireg_torch.geometry import (
     PosePrior,
     paper_views,
@@ -89,11 +89,22 @@ class Peak:
         return self.scores(views)
 
 
+class TwoPeaks(Peak):
+    """A second view, 10 degrees of azimuth farther, is nearly as good as the best."""
+
+    def scores(self, views: Any) -> Tensor:
+        farther = rotation_from_viewpoint(10.0, 0.0) @ rotation_from_viewpoint(0.0, 0.0).T
+        angle = rotation_error(views.rotations, farther @ self.truth.float())
+        second = -(angle.square()) / 100.0 - (views.distance - self.distance).square() - 0.01
+        return torch.maximum(super().scores(views), second)
+
+
 def searched(
     *truth: float,
     camera: str = "perspective",
     frame: str = "own",
     allowed: tuple[float, float] = (0.0, 360.0),
+    kind: type[Peak] = Peak,
 ) -> tuple[float, float, Any]:
     """Error of the rotation in degrees and distance in radii that the search finds on a bank of
     neighbours, some of which are allowed, and the matcher."""
@@ -107,7 +118,7 @@ def searched(
     bank = ViewBank.build(mesh, views, pipeline=pipeline, progress=False)
     azimuth, elevation, distance = truth
     R = rotation_from_viewpoint(azimuth, elevation).double() @ turn
-    matcher: Any = Peak(bank, R, distance)
+    matcher: Any = kind(bank, R, distance)
     matcher.turn = turn
     order = matcher.scores(views).argsort(descending=True, stable=True)[None]
     inside = ((grid.azimuth >= allowed[0]) & (grid.azimuth <= allowed[1]))[None]
@@ -123,6 +134,24 @@ def test_search_looks_between_the_least_and_greatest_angles_and_distances():
     assert sorted(set(first.distance.tolist())) == [3.0, 3.25, 3.5, 3.75, 4.0, 4.25, 4.5]
     assert error < 2.0
     assert distance == pytest.approx(3.7, abs=0.1)
+
+
+def test_further_rounds_are_between_views_that_are_neighbours_on_the_finer_grid():
+    """Of the three best views of the first round one is two of its steps away."""
+    _, _, matcher = searched(205.0, 0.0, 3.75, kind=TwoPeaks)
+    first, second = matcher.compared[:2]
+    assert sorted(set(first.azimuth.round().tolist())) == [200, 205, 210, 215, 220]
+    best = matcher.scores(first).argsort(descending=True)[:3]
+    assert sorted(first.azimuth[best].round().tolist()) == [205, 205, 215]
+    assert set(second.azimuth.round().tolist()) == {205}
+
+
+def test_different_views_differ_in_rotation_however_little():
+    azimuths = torch.tensor([10.0, 10.0, 11.0, 190.0, 11.0, 300.0])
+    rotations = rotation_from_viewpoint(azimuths.double(), 20.0)
+    order = torch.tensor([2, 4, 1, 0, 3, 5])
+    assert search.different_views(rotations, order, 3).tolist() == [2, 1, 3]
+    assert search.different_views(rotations, order, 9).tolist() == [2, 1, 3, 5]
 
 
 def test_search_is_between_allowed_views():
@@ -143,7 +172,7 @@ def test_search_is_in_the_frame_of_the_views():
 def test_search_stops_by_the_motion(monkeypatch):
     rounds = []
     errors = []
-    for stop in (1e9, 0.2, 0.05):
+    for stop in (1e9, 0.2, search.STOP_MOTION):
         monkeypatch.setattr(search, "STOP_MOTION", stop)
         error, distance, matcher = searched(207.0, 0.0, 3.7)
         rounds.append(len(matcher.compared))
@@ -177,7 +206,7 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
     ):
         monkeypatch.setattr(module, name, refused)
     monkeypatch.setattr(poses, "fit_to_edges", refused)
-    monkeypatch.setattr(LandmarkMatches, "agreeing", refused)
+    monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
     stages: list[str] = []

@@ -1,7 +1,7 @@
 """Siblings of a pose in closed cases: which is better, and which is a rival."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -36,9 +36,8 @@ def four(similarity: list[float], compare: list[list[float]], angles: list[float
 
 
 def evidence(*similarity: float) -> Evidence:
-    nothing = torch.zeros(len(similarity), dtype=torch.float64)
-    values = Evidence(*[nothing] * len(fields(Evidence)))
-    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
+    nothing = Evidence.zeros(len(similarity))
+    return replace(nothing, similarity=torch.tensor(similarity, dtype=torch.float64))
 
 
 def test_a_sibling_is_better_by_its_score_and_by_details():
@@ -99,7 +98,7 @@ class Case:
         different = ~torch.eye(3, dtype=torch.bool)
         monkeypatch.setattr(siblings, "fitted_poses", self.fit)
         monkeypatch.setattr(
-            siblings, "compare_details", lambda *_: (torch.zeros(3, 3).double(), different)
+            siblings, "details_together", lambda *_: (torch.zeros(3, 3).double(), different)
         )
         monkeypatch.setattr(
             siblings,
@@ -118,7 +117,7 @@ class Case:
         """``keeps``: what the limits say, one call after the other."""
         target: Any = SimpleNamespace(
             telling_symmetries=TellingSymmetries(self.symmetries),
-            describer=SimpleNamespace(contours=None, centre=torch.zeros(3).double()),
+            describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
             score_weights=lambda **_: EvidenceWeights(),
         )
         answers = iter(keeps or [])

@@ -112,6 +112,28 @@ def test_poses_that_the_shape_makes_equal_are_rivals_where_a_small_feature_diffe
     assert float(rotation_error(turned, result.hypotheses[1].rotation).min()) < 10.0
 
 
+@pytest.mark.parametrize(("side", "notable"), [(14.0, False), (24.0, True)])
+def test_poses_that_only_a_hidden_feature_tells_apart_are_named(side, notable):
+    """A block on the top of a box that is seen from below; a large one makes the answer unsure."""
+    box = trimesh.creation.box((200, 120, 80))
+    cube = trimesh.creation.box((side, side, 14))
+    cube.apply_translation((75, 0, 47))
+    mesh = trimesh.util.concatenate([box, cube])
+    views = sample_views(azimuth_step=15, elevations=[-50, -35])
+    registrar = Registrar(ViewBank.build(mesh, views, image_size=96, progress=False))
+    assert registrar.telling_symmetries.notable == notable
+    result, _ = registered(registrar, 30.0, -40.0, 3)
+    assert result.feature_is_hidden
+    assert result.to_dict()["feature_is_hidden"]
+    assert result.ambiguous is not None
+    if notable:
+        assert result.confidence <= 0.5
+        assert result.probabilities[0] == pytest.approx(result.probabilities[1], rel=0.3)
+    else:
+        assert result.ambiguous == "several"
+        assert result.confidence > 0.5 > 5 * result.probabilities[1]
+
+
 def test_given_symmetries_are_trusted():
     bank = registrar_of(marked_box()).bank
     group = mesh_symmetries(marked_box())

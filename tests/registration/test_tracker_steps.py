@@ -167,6 +167,7 @@ def test_features_in_closed_form():
 def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(confidences, expected):
     guesses = dict(zip("ab", confidences, strict=True))
     follow: Any = SimpleNamespace(
+        reliable=0.9,
         predictions=lambda: list(guesses),
         _fit=lambda _, __, T: SimpleNamespace(confidence=guesses[T]),
     )

@@ -19,6 +19,7 @@ from curvireg_torch.fitting.focal_length import (
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.geometry.cameras import point_in_cameras
+from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import focal, unknown_camera
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.poses import Poses
@@ -70,14 +71,14 @@ def test_starts_are_the_best_view_of_each_camera_and_the_best_views(monkeypatch)
     monkeypatch.setattr(
         focal, "with_quick_fit", lambda _, __, poses: (poses, support.flatten().clone())
     )
-    ranked = support * focal.SCREENING_WEIGHT - torch.arange(4)
-    chosen = focal.starts_of_fields(NOTHING, NOTHING, given, 2)
+    ranked = support * 20.0 - torch.arange(4)
+    chosen = focal.starts_of_fields(NOTHING, NOTHING, given, 2, screening_weight=20.0)
     camera = (chosen.cameras[:, 0, 0] / CAMERA[0, 0] - 1.0).round().int().tolist()
     found = list(zip(camera, chosen.view.tolist(), strict=True))
     # the best view of each camera, and the third view with its best camera, the second best of all
     expected = [(1, 0), (1, 2), (0, 1), (2, 3)]
     assert found == sorted(expected, key=lambda place: -float(ranked[place]))
-    every = focal.starts_of_fields(NOTHING, NOTHING, given, 4)
+    every = focal.starts_of_fields(NOTHING, NOTHING, given, 4, screening_weight=20.0)
     assert len(every) == 4
     assert every.view.sort().values.tolist() == [0, 1, 2, 3]
 
@@ -124,7 +125,8 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
     item = replace(item, focal_deviation=0.2)
     covariance, deviation = focal.focal_covariance(describer, NOTHING, pose, item)
-    variance = 1.0 / (1.0 / 0.04 + 1.0 / 0.2**2)
+    measured = focal.REPORTED_VARIANCE * 0.04
+    variance = 1.0 / (1.0 / measured + 1.0 / 0.2**2)
     assert deviation == pytest.approx(math.sqrt(variance))
     step = 1e-6
     # a twist turns about the centre, and moves it
@@ -160,9 +162,11 @@ def refitted(
     monkeypatch.setattr(unknown_camera, "with_focal_length", fit)
     monkeypatch.setattr(unknown_camera, "evidence_of", measure)
     target: Any = SimpleNamespace(
-        score_weights=lambda **_: EvidenceWeights(), describer=None, is_exact=True
+        score_weights=lambda **_: EvidenceWeights(),
+        describer=SimpleNamespace(centre=CENTRE),
+        pipeline=Pipeline(),
     )
-    work: Any = SimpleNamespace(starts=starts, item=None, limits=None)
+    work: Any = SimpleNamespace(starts=starts, item=None, limits=None, symmetries=None)
     excluded = torch.tensor(outside or [False] * len(poses))
     after, changed = unknown_camera.with_fitted_focal_lengths(
         target, work, NOTHING, poses, evidence, excluded
@@ -173,17 +177,30 @@ def refitted(
 
 def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
     """By 0.2, which is 0.02 of similarity."""
-    evidence = evidence_of(0.7, 0.9, 0.8)
-    new = {0: 0.7, 1: 0.885, 2: 0.775}
+    evidence = evidence_of(0.6, 0.9, 0.8)
+    new = {0: 0.6, 1: 0.885, 2: 0.775}
     tried, changed, after = refitted(monkeypatch, evidence, new, starts="several cameras")
     assert (tried, changed) == ([1, 2], [1])
-    assert after.similarity.tolist() == pytest.approx([0.7, 0.885, 0.8])
+    assert after.similarity.tolist() == pytest.approx([0.6, 0.885, 0.8])
     assert refitted(monkeypatch, evidence, new, starts=None)[0] == [1], "of a known camera"
     excluded = [False, True, False]
     tried, changed, _ = refitted(monkeypatch, evidence, new, starts="some", outside=excluded)
     assert (tried, changed) == ([2, 0], [0])
     excluded = [True, True, False]
     assert refitted(monkeypatch, evidence, new, starts="some", outside=excluded)[0] == [2]
+    close = evidence_of(0.7, 0.9, 0.8)
+    assert refitted(monkeypatch, close, new, starts="some")[0] == [1, 2, 0], "a close rival"
+
+
+def test_fits_also_begin_from_the_focal_length_of_another_pose():
+    """If it differs by more than 0.2 of log f; the first pose from that of the second such."""
+    focal_lengths = 500.0 * torch.tensor([1.0, 1.1, 1.3, 0.7]).double()
+    chosen = torch.tensor([0, 1, 2, 3])
+    index, starts = unknown_camera._focal_starts(chosen, focal_lengths)
+    assert index.tolist() == [0, 1, 2, 3, 0, 2, 3]
+    assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
+    alone = torch.tensor([2])
+    assert unknown_camera._focal_starts(alone, focal_lengths)[0].tolist() == [2]
 
 
 def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):

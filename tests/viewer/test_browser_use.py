@@ -337,6 +337,9 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
         lambda: browser.text("photograph-facts") == "photo.png: 240 x 180 px", "photograph"
     )
     browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
+    browser.wait(
+        lambda: browser.text("mesh-advice") == "grey mesh: its sides differ in shape", "advice", 300
+    )
     (folder / "other.png").write_bytes((folder / "photo.png").read_bytes())
     for name in ("other.png", "photo.png"):  # photo.png for the second time
         browser.upload("photograph", folder / name)

@@ -8,7 +8,7 @@ from typing import Any
 # ``resolution``, see
 # :func:`curvireg_torch.registration.confidence.shares`
 CALIBRATION: dict[str, Any] = json.loads(
-    (Path(__file__).parent / "registration" / "calibration.json").read_text(encoding="utf-8")
+    (Path(__file__).parent / "calibration.json").read_text(encoding="utf-8")
 )
 # Factor of the least-squares covariance, which ignores edges that do not belong to the object: with
 # it, nine in ten true poses lie in the 90 % ellipsoid of a reliable result, on generated

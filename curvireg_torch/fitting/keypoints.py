@@ -1,8 +1,8 @@
-"""Landmarks: local features of a mesh's print, found again in photographs; where enough agree, they
+"""Keypoints: local features of a mesh's print, found again in photographs; where enough agree, they
 give a pose.
 
 The ranking compares whole views; print that is seen at a slant, small or half hidden still shows
-some landmarks. They need colours, and the camera of the photograph.
+some keypoints. They need colours, and the camera of the photograph.
 """
 
 import math
@@ -17,12 +17,12 @@ from ..filters.operations import resized
 from ..geometry.cameras import pose_around
 from ..geometry.viewpoint import uniform_views
 from ..matching import ViewDescriber
+from ..pipeline import FitSettings
 from ..utils.rows import Rows
 from ..utils.threads import map_on_threads
 from .least_squares import nearest_rigid
 
-MIN_LANDMARKS = 8  # that must agree on a pose
-# Number of views that landmarks are taken from, and their side in px
+# Number of views that keypoints are taken from, and their side in px
 VIEWS = 48
 VIEW_SIZE = 192
 VIEW_DISTANCE = 4.0  # of the camera from the object's centre in these views, in object radii
@@ -32,7 +32,7 @@ SILHOUETTE_BORDER = 4
 MIN_CONTRAST = 0.02
 # px in x and y by which features lie too far right and down, since OpenCV halves the coordinates of
 # a picture that it has doubled. Its option enable_precise_upscale avoids that, but an eighth fewer
-# features find their landmark.
+# features find their keypoint.
 UPSCALING_SHIFT = 0.25
 # Quantiles of grey that become black and white in a crop, which the object fills, and in a whole
 # photograph, where it may be brighter than all else; and the least distance of the two
@@ -43,8 +43,8 @@ MIN_TONES = 0.05
 CROP_SIDE = 400
 MAX_SIDE = 1920
 CROP_MARGIN = 0.05  # Space around a given box, as a fraction of its longer side
-SAME_PLACE = 0.1  # Distance in object radii within which landmarks may look alike
-# Nearest landmarks of a feature, and Lowe's ratio of those at two places
+SAME_PLACE = 0.1  # Distance in object radii within which keypoints may look alike
+# Nearest keypoints of a feature, and Lowe's ratio of those at two places
 NEIGHBOURS = 8
 MAX_DISTANCE_RATIO = 0.8
 # Distance in object radii, and factor between sizes, within which two matches predict the same
@@ -57,7 +57,7 @@ MAX_CLUSTERS = 20  # Groups of matches in a photograph that are tried
 REPROJECTION_ERROR = 0.03
 AGREEMENT = 0.06  # The same of poses that were fitted to edges as well
 RANSAC_ROUNDS = 500
-FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all landmarks
+FEATURES_AT_A_TIME = 1000  # of a photograph that are compared with all keypoints
 
 
 @dataclass(frozen=True)
@@ -99,19 +99,19 @@ class _Features(Rows):
 
 
 @dataclass(frozen=True)
-class LandmarkPose:
-    """A pose ``T`` (4, 4) and the number of landmarks that agree with it."""
+class KeypointPose:
+    """A pose ``T`` (4, 4) and the number of keypoints that agree with it."""
 
     T: Tensor
     count: int
 
 
 @dataclass(frozen=True)
-class LandmarkMatches:
-    """Features of a photograph that resemble landmarks of a mesh with a ``centre`` (3,) and a
+class KeypointMatches:
+    """Features of a photograph that resemble keypoints of a mesh with a ``centre`` (3,) and a
     ``radius``: pixels ``uv`` (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has
     the object: ``centres`` (M,) in px, x + iy, and ``radii`` (M,) in px. ``K`` (3, 3) is the
-    camera."""
+    camera; ``least`` must agree on a pose."""
 
     uv: np.ndarray
     points: np.ndarray
@@ -120,9 +120,10 @@ class LandmarkMatches:
     K: np.ndarray
     centre: np.ndarray
     radius: float
+    least: int
 
-    def poses(self) -> list[LandmarkPose]:
-        """Poses on which at least ``MIN_LANDMARKS`` agree, the largest number first."""
+    def poses(self) -> list[KeypointPose]:
+        """Poses on which at least ``least`` agree, the largest number first."""
         near = np.abs(self.centres[:, None] - self.centres) < CLUSTER_DISTANCE * np.sqrt(
             self.radii[:, None] * self.radii
         )
@@ -131,7 +132,7 @@ class LandmarkMatches:
         left = np.ones(len(self.uv), dtype=bool)
         for _ in range(MAX_CLUSTERS):
             votes = (near & left).sum(axis=1) * left
-            if not len(votes) or votes.max() < MIN_LANDMARKS:
+            if not len(votes) or votes.max() < self.least:
                 break
             cluster = near[votes.argmax()] & left
             size = float(np.median(self.radii[cluster]))
@@ -140,17 +141,18 @@ class LandmarkMatches:
                 self.uv[cluster],
                 self.K,
                 REPROJECTION_ERROR * size,
+                self.least,
             )
             left &= ~cluster
             if pose is not None:  # what is left at its place has no other one
                 centre = torch.from_numpy(self.centre)
                 T = pose_around(pose.T[:3, :3], pose.T[:3, 3], centre)
-                poses.append(LandmarkPose(T, pose.count))
+                poses.append(KeypointPose(T, pose.count))
                 left &= np.abs(self.centres - self.centres[cluster].mean()) > size
         return sorted(poses, key=lambda pose: -pose.count)
 
     def agreeing(self, T: Tensor, cameras: Tensor | None = None) -> Tensor:
-        """(N,) float64 number of landmarks that agree with fitted poses (N, 4, 4); ``cameras`` (N,
+        """(N,) float64 number of keypoints that agree with fitted poses (N, 4, 4); ``cameras`` (N,
         3, 3) if they have other ones."""
         counts = []
         matrices = [self.K] * len(T) if cameras is None else cameras.double().cpu().numpy()
@@ -163,10 +165,14 @@ class LandmarkMatches:
         return torch.tensor(counts, dtype=torch.float64)
 
 
-class Landmarks:
-    """Features of the views of a mesh with colours, with their places on its surface."""
+class Keypoints:
+    """Features of the views of a mesh with colours, with their places on its surface; ``least`` of
+    them must agree on a pose."""
 
-    def __init__(self, describer: ViewDescriber) -> None:
+    def __init__(
+        self, describer: ViewDescriber, *, least: int = FitSettings().min_keypoints
+    ) -> None:
+        self._least = least
         self._centre = describer.centre.numpy()
         self._radius = describer.radius
         R = uniform_views(VIEWS).rotations.double()
@@ -203,22 +209,29 @@ class Landmarks:
         self._to_centre = (middle * (1 + 1j) - self._features.uv @ [1, 1j]) * turn
         self._radii = focal / VIEW_DISTANCE / self._features.size
 
-    def matches(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> LandmarkMatches:
+    def matches(self, image: Tensor, K: Tensor, box: Tensor | None = None) -> KeypointMatches:
         """Compare a photograph (C, H, W), floating in [0, 1] or uint8, with camera ``K`` (3, 3), or
-        a box (4,) of it, with the landmarks."""
+        a box (4,) of it, with the keypoints."""
         found = self._photograph_features(image, box)
-        landmark, ratio = self._nearest(found)
+        keypoint, ratio = self._nearest(found)
         clear = np.argsort(ratio, kind="stable")[:MAX_MATCHES]
         clear = clear[ratio[clear] < MAX_DISTANCE_RATIO]
         found = found[clear]
-        landmark = landmark[clear]
-        centres = found.uv @ [1, 1j] + self._to_centre[landmark] * found.size * np.exp(
+        keypoint = keypoint[clear]
+        centres = found.uv @ [1, 1j] + self._to_centre[keypoint] * found.size * np.exp(
             1j * found.angle
         )
-        radii = self._radii[landmark] * found.size
+        radii = self._radii[keypoint] * found.size
         camera = K.double().cpu().numpy()
-        return LandmarkMatches(
-            found.uv, self._points[landmark], centres, radii, camera, self._centre, self._radius
+        return KeypointMatches(
+            uv=found.uv,
+            points=self._points[keypoint],
+            centres=centres,
+            radii=radii,
+            K=camera,
+            centre=self._centre,
+            radius=self._radius,
+            least=self._least,
         )
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:
@@ -250,14 +263,14 @@ class Landmarks:
         return _Features(uv, found.size / scale, found.angle, found.vectors)
 
     def _nearest(self, found: _Features) -> tuple[np.ndarray, np.ndarray]:
-        """(F,) the most similar landmark of each feature, and its distance as a fraction of that to
+        """(F,) the most similar keypoint of each feature, and its distance as a fraction of that to
         the most similar one at another place."""
         known = torch.from_numpy(self._features.vectors)
         points = torch.from_numpy(self._points)
         count = min(NEIGHBOURS, len(points))
         if count < 2 or not len(found.uv):
             return np.zeros(len(found.uv), dtype=int), np.ones(len(found.uv))
-        landmark = []
+        keypoint = []
         ratio = []
         for vectors in torch.from_numpy(found.vectors).split(FEATURES_AT_A_TIME):
             similarity, index = (vectors @ known.T).topk(count, dim=1)
@@ -265,14 +278,16 @@ class Landmarks:
             apart = (points[index] - points[index[:, :1]]).norm(dim=2) > SAME_PLACE * self._radius
             apart[:, -1] |= ~apart.any(dim=1)
             other = distance.masked_fill(~apart, torch.inf).amin(dim=1)
-            landmark.append(index[:, 0])
+            keypoint.append(index[:, 0])
             ratio.append((distance[:, 0] / other.clamp(min=1e-9)).sqrt())
-        return torch.cat(landmark).numpy(), torch.cat(ratio).numpy()
+        return torch.cat(keypoint).numpy(), torch.cat(ratio).numpy()
 
 
-def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> LandmarkPose | None:
+def _pose(
+    points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float, least: int
+) -> KeypointPose | None:
     """The pose on which most matches of points (M, 3) and pixels (M, 2) agree within ``error`` px;
-    None if few do."""
+    None if fewer than ``least`` do."""
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,
@@ -290,11 +305,11 @@ def _pose(points: np.ndarray, uv: np.ndarray, K: np.ndarray, error: float) -> La
     count = _places(uv[inliers[:, 0]], error)
     T = torch.eye(4, dtype=torch.float64)
     T[:3, :3], T[:3, 3] = torch.from_numpy(cv2.Rodrigues(turn)[0]), torch.from_numpy(shift[:, 0])
-    if count < MIN_LANDMARKS or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
+    if count < least or not bool(T.isfinite().all()) or float(T[2, 3]) <= 0.0:
         return None
-    return LandmarkPose(nearest_rigid(T[None])[0], count)
+    return KeypointPose(nearest_rigid(T[None])[0], count)
 
 
 def _places(uv: np.ndarray, error: float) -> int:
-    """Number of places of pixels (M, 2): several features at one place are one landmark."""
+    """Number of places of pixels (M, 2): several features at one place are one keypoint."""
     return len(np.unique((uv / max(error, 1e-9)).round(), axis=0))

@@ -8,18 +8,18 @@ import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
-from curvireg_torch.fitting import landmarks as landmarks_module
-from curvireg_torch.fitting.landmarks import MIN_LANDMARKS, LandmarkMatches, Landmarks, _pose
+from curvireg_torch.fitting import keypoints as keypoints_module
+from curvireg_torch.fitting.keypoints import KeypointMatches, Keypoints, _pose
 from curvireg_torch.fitting.least_squares import apply_twist
 from curvireg_torch.geometry import box_iou, camera_matrix, projected_boxes, rotation_error
 from curvireg_torch.geometry.cameras import transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
-from curvireg_torch.pipeline import BankSettings
+from curvireg_torch.pipeline import BankSettings, FitSettings
 from curvireg_torch.registration import photograph as photograph_module
 from curvireg_torch.registration import work
-from curvireg_torch.registration.confidence import LANDMARK_PROBABILITY, detection_probability
+from curvireg_torch.registration.confidence import KEYPOINT_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
 from curvireg_torch.registration.inputs import image_items
 from curvireg_torch.registration.poses import fit_poses, placed
@@ -58,8 +58,8 @@ def mesh() -> trimesh.Trimesh:
 
 
 @cache
-def landmarks() -> Landmarks:
-    return Landmarks(ViewDescriber(mesh(), BankSettings()))
+def keypoints() -> Keypoints:
+    return Keypoints(ViewDescriber(mesh(), BankSettings()))
 
 
 def pose(azimuth: float, x: float, z: float) -> torch.Tensor:
@@ -85,7 +85,7 @@ def box_of(T: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("with_box", [True, False])
 def test_pose_is_that_of_the_print(azimuth, with_box):
     T = pose(azimuth, 0.4, 4.0)
-    best, *others = landmarks().matches(photograph(T), K, box_of(T) if with_box else None).poses()
+    best, *others = keypoints().matches(photograph(T), K, box_of(T) if with_box else None).poses()
     assert all(other.count < 12 for other in others)
     assert best.count >= 15
     assert float(rotation_error(best.T[:3, :3], T[:3, :3])) < 2.0
@@ -96,8 +96,8 @@ def test_photograph_may_be_large_and_of_any_dtype(monkeypatch):
     """Features are those of a smaller copy, in px of the photograph."""
     T = pose(20.0, 0.4, 4.0)
     image = (255.0 * photograph(T)).round().to(torch.uint8)
-    monkeypatch.setattr(landmarks_module, "MAX_SIDE", 400)
-    (found,) = landmarks().matches(image, K).poses()
+    monkeypatch.setattr(keypoints_module, "MAX_SIDE", 400)
+    (found,) = keypoints().matches(image, K).poses()
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
     assert float((found.T - T)[:3, 3].norm()) < 0.02 * 4.0
 
@@ -106,17 +106,17 @@ def test_photograph_may_be_dark():
     T = pose(20.0, 0.3, 6.0)
     bright = photograph(T)
     dark = (255 * 0.1 * bright).round() / 255
-    most, found = (landmarks().matches(image, K, box_of(T)).poses()[0] for image in (bright, dark))
+    most, found = (keypoints().matches(image, K, box_of(T)).poses()[0] for image in (bright, dark))
     assert found.count > 0.5 * most.count
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 3.0
     # nor does one of a single colour fail
-    assert not len(landmarks().matches(torch.full_like(bright, 0.3), K).uv)
+    assert not len(keypoints().matches(torch.full_like(bright, 0.3), K).uv)
     alone = render_colour(mesh(), T[None], K[None], SIZE)[0]
     alone = torch.where(alone.amin(dim=0) < 0.999, alone, torch.full_like(alone, 0.1))
     # the bright object covers 0.3 %
     wide = torch.nn.functional.pad(alone, (800, 800, 600, 600), value=0.1)
     assert (
-        landmarks()
+        keypoints()
         .matches(wide, K + torch.tensor([[0, 0, 800], [0, 0, 600], [0, 0, 0]]))
         .poses()[0]
         .count
@@ -126,7 +126,7 @@ def test_photograph_may_be_dark():
 
 def test_each_copy_has_a_pose():
     there = [pose(20.0, -0.9, 4.5), pose(150.0, 0.9, 4.5)]
-    found = landmarks().matches(photograph(*there), K).poses()
+    found = keypoints().matches(photograph(*there), K).poses()
     assert len(found) == 2
     assert found[0].count >= found[1].count
     errors = torch.stack(
@@ -142,15 +142,15 @@ def test_nothing_is_found_where_the_print_is_not():
     plain = torch.full((1, 40, 40), 0.5)
     missing = torch.full((3, 40, 40), torch.nan)
     for image, box in ((photograph(), None), (other, box_of(T)), (plain, None), (missing, None)):
-        matches = landmarks().matches(image, K, box)
+        matches = keypoints().matches(image, K, box)
         assert matches.poses() == []
         assert float(matches.agreeing(T[None])) < 4
 
 
-def test_landmarks_agree_with_the_poses_of_their_object():
+def test_keypoints_agree_with_the_poses_of_their_object():
     T = pose(20.0, -0.9, 4.5)
     other = pose(150.0, 0.9, 4.5)
-    matches = landmarks().matches(photograph(T, other), K)
+    matches = keypoints().matches(photograph(T, other), K)
     off = torch.stack(
         [
             apply_twist(T[None], twist[None], mesh_centre(mesh()))[0]
@@ -158,7 +158,7 @@ def test_landmarks_agree_with_the_poses_of_their_object():
         ]
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
-    assert float(counts[:2].min()) >= MIN_LANDMARKS
+    assert float(counts[:2].min()) >= FitSettings().min_keypoints
     assert float(counts[2:].max()) < 0.5 * float(counts[0])
     twice = replace(
         matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0)
@@ -167,7 +167,7 @@ def test_landmarks_agree_with_the_poses_of_their_object():
     assert matches.agreeing(-T[None]) < 4  # behind the camera
 
 
-def test_landmarks_decide_where_most_of_the_object_is_hidden():
+def test_keypoints_decide_where_most_of_the_object_is_hidden():
     T = pose(65.0, 0.4, 4.0)
     around = cr.sample_views(azimuth_step=45, elevations=[0, 45])
     image = photograph(T)
@@ -182,7 +182,7 @@ def test_landmarks_decide_where_most_of_the_object_is_hidden():
     )
 
 
-def test_a_fit_that_leaves_the_landmarks_is_not_kept(monkeypatch):
+def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
     T = pose(65.0, 0.4, 4.0)
 
     def fit_elsewhere(describer, crops, poses, **options):
@@ -202,16 +202,17 @@ def test_a_fit_that_leaves_the_landmarks_is_not_kept(monkeypatch):
     assert result.covariance is not None
 
 
-def test_a_pose_needs_enough_landmarks_at_different_places():
+def test_a_pose_needs_enough_keypoints_at_different_places():
     points = np.random.default_rng(0).uniform(-1, 1, (14, 3))
     camera = K.numpy()
     seen = (points + np.array([0, 0, 6])) @ camera.T
     uv = seen[:, :2] / seen[:, 2:]
-    assert _pose(points, uv, camera, 2.0).count == 14
-    assert _pose(points[:7], uv[:7], camera, 2.0) is None
+    assert _pose(points, uv, camera, 2.0, 8).count == 14
+    assert _pose(points[:7], uv[:7], camera, 2.0, 8) is None
+    assert _pose(points[:7], uv[:7], camera, 2.0, 7).count == 7
     twice = np.repeat(np.arange(7), 2)
-    assert _pose(points[twice], uv[twice], camera, 2.0) is None
-    assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0) is None
+    assert _pose(points[twice], uv[twice], camera, 2.0, 8) is None
+    assert _pose(points[[0] * 14], uv[[0] * 14], camera, 2.0, 8) is None
 
 
 def test_origin_of_the_mesh_may_be_far_away():
@@ -219,7 +220,7 @@ def test_origin_of_the_mesh_may_be_far_away():
     T = pose(20.0, 0.4, 4.0)
     away = torch.tensor([0.0, 0.0, 1000.0], dtype=torch.float64)
     moved = as_mesh(carton().apply_translation(away.numpy()))
-    (found,) = Landmarks(ViewDescriber(moved, BankSettings())).matches(photograph(T), K).poses()
+    (found,) = Keypoints(ViewDescriber(moved, BankSettings())).matches(photograph(T), K).poses()
     assert float(rotation_error(found.T[:3, :3], T[:3, :3])) < 2.0
     assert float((found.T[:3, :3] @ away + found.T[:3, 3] - T[:3, 3]).norm()) < 0.02 * 4.0
 
@@ -232,13 +233,13 @@ def registrar() -> cr.Registrar:
     )
 
 
-def test_registration_starts_from_landmarks_too(monkeypatch):
+def test_registration_starts_from_keypoints_too(monkeypatch):
     """No view of the bank is near the pose."""
     T = pose(65.0, 0.4, 4.0)
     image = photograph(T)
     box = box_of(T)
     assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) < 1.0
-    monkeypatch.setattr(LandmarkMatches, "poses", lambda *_: [])
+    monkeypatch.setattr(KeypointMatches, "poses", lambda *_: [])
     assert float(rotation_error(registrar()([image], box[None], K)[0].rotation, T[:3, :3])) > 10.0
 
 
@@ -253,38 +254,38 @@ def test_a_pose_outside_the_limits_is_no_start():
     assert min(float(rotation_error(h.rotation, T[:3, :3])) for h in result.hypotheses) > 40.0
 
 
-def test_meshes_without_colours_and_photographs_without_a_camera_have_no_landmarks():
+def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoints():
     T = pose(65.0, 0.4, 4.0)
     item = image_items([photograph(T)], box_of(T)[None], K)[0]
     grey = cr.Registrar(
         trimesh.creation.box(), views=cr.sample_views(azimuth_step=180, elevations=[0])
     )
-    assert grey.landmark_matches(item) is None
-    assert registrar().landmark_matches(replace(item, camera_matrix=None)) is None
-    poses, count = work.landmark_poses(grey, None)
+    assert grey.keypoint_matches(item) is None
+    assert registrar().keypoint_matches(replace(item, camera_matrix=None)) is None
+    poses, count = work.keypoint_poses(grey, None)
     assert len(poses) == len(count) == 0
 
 
-def test_boxes_of_landmarks_are_the_first_proposals_less_certain_with_a_rival():
+def test_boxes_of_keypoints_are_the_first_proposals_less_certain_with_a_rival():
     T = pose(65.0, 0.4, 4.0)
     item = image_items([photograph(T)], None, K)[0]
     proposals = propose(registrar(), item)
     assert float(box_iou(proposals.boxes[:1], box_of(T)[None])) > 0.9
-    counts = [found.count for found in landmarks().matches(item.image, K).poses()]
-    assert proposals.by_landmarks == len(counts)
+    counts = [found.count for found in keypoints().matches(item.image, K).poses()]
+    assert proposals.by_keypoints == len(counts)
     assert proposals.responses[: len(counts)].tolist() == counts
     (found,) = detect(registrar(), [item.image], K)[0]
     assert found.detection.score == detection_probability(
         counts[0], 0.5, rival=max(counts[1:], default=0)
     )
     near = replace(item, prior=cr.PosePrior(distance=(1.0, 2.0)))
-    assert propose(registrar(), near).by_landmarks == 0
+    assert propose(registrar(), near).by_keypoints == 0
     assert len(proposals.boxes) == len(proposals.responses) == len(proposals.views) > 1
     # As two objects with similar prints do.
     alone, first, second = (
         detection_probability(n, 0.5, rival=m) for n, m in ((40, 0), (40, 20), (20, 40))
     )
-    assert alone == LANDMARK_PROBABILITY
+    assert alone == KEYPOINT_PROBABILITY
     assert (first, second) == pytest.approx((0.8 * alone, 0.5 * alone))
 
 
@@ -303,7 +304,7 @@ def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
             size = random.uniform(1.5, 6.0)
             picture += torch.exp(-((axis - u) ** 2 + (axis[:, None] - v) ** 2) / (2 * size**2))
             centres.append((u, v))
-    found = landmarks_module._Features.of(picture.float()[None], tones=(0.0, 1.0)).uv
+    found = keypoints_module._Features.of(picture.float()[None], tones=(0.0, 1.0)).uv
     away = found[:, None] - np.array(centres)
     nearest = away[np.arange(len(found)), np.linalg.norm(away, axis=2).argmin(axis=1)]
     nearest = nearest[np.linalg.norm(nearest, axis=1) < 1.5]
@@ -311,9 +312,9 @@ def test_features_lie_where_blobs_are(shift: tuple[float, float]) -> None:
     assert np.abs(np.median(nearest, axis=0)).max() < 0.03
 
 
-def test_landmarks_are_where_the_mesh_shows_them() -> None:
+def test_keypoints_are_where_the_mesh_shows_them() -> None:
     """Of several photographs: the median distance in px of matched features from their
-    landmarks."""
+    keypoints."""
     residuals = []
     for turn, side, distance in (
         (20.0, 0.4, 4.0),
@@ -322,7 +323,7 @@ def test_landmarks_are_where_the_mesh_shows_them() -> None:
         (260.0, -0.2, 3.5),
     ):
         T = pose(turn, side, distance)
-        matches = landmarks().matches(photograph(T), K)
+        matches = keypoints().matches(photograph(T), K)
         projected = (torch.from_numpy(matches.points) @ T[:3, :3].T + T[:3, 3]) @ K.T
         away = matches.uv - (projected[:, :2] / projected[:, 2:]).numpy()
         residuals.append(np.median(away[np.linalg.norm(away, axis=1) < 3.0], axis=0))

@@ -1,0 +1,63 @@
+"""What callers may pass for images, boxes, cameras, poses and meshes: the types of public
+parameters.
+
+Each is checked where it is read, with an error that says what was expected.
+"""
+
+from collections.abc import Sequence
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, Union
+
+import numpy as np
+from torch import Tensor
+
+if TYPE_CHECKING:
+    import trimesh
+    from PIL.Image import Image
+
+__all__ = [
+    "ArrayLike",
+    "BoxLike",
+    "BoxesLike",
+    "CalibratedCamera",
+    "CameraLike",
+    "ImageLike",
+    "ImagesLike",
+    "MaskLike",
+    "MeshLike",
+]
+
+
+class CalibratedCamera(Protocol):
+    """A :class:`curvireg_torch.Camera`."""
+
+    @property
+    def matrix(self) -> Tensor:
+        """(3, 3) camera matrix in px."""
+
+
+ArrayLike: TypeAlias = Tensor | np.ndarray[Any, Any] | Sequence[Any]
+"""Numbers: a tensor, an array, or nested lists of these."""
+
+ImageLike: TypeAlias = Union[Tensor, np.ndarray[Any, Any], "Image", str, PathLike[str]]
+"""A photograph: a (1 or 3, H, W) tensor or an (H, W) or (H, W, 3) array, RGB, floating in [0, 1] or
+uint8, a Pillow picture, or the path of a file."""
+
+ImagesLike: TypeAlias = Tensor | Sequence[ImageLike]
+"""Photographs: a (B, C, H, W) tensor, or a list."""
+
+BoxLike: TypeAlias = Tensor | np.ndarray[Any, Any] | Sequence[float]
+"""A box: x0, y0, x1, y1 in px."""
+
+BoxesLike: TypeAlias = Tensor | np.ndarray[Any, Any] | Sequence[BoxLike | None]
+"""(B, 4) boxes, or a list of them."""
+
+CameraLike: TypeAlias = ArrayLike | CalibratedCamera
+"""A (3, 3) camera matrix in px, a :class:`curvireg_torch.Camera`, or one of these for each
+photograph."""
+
+MaskLike: TypeAlias = ArrayLike | str | PathLike[str]
+"""An (H, W) mask of the object, white, or the path of a picture."""
+
+MeshLike: TypeAlias = Union["trimesh.Trimesh", "trimesh.Scene", str, PathLike[str]]
+"""A mesh, a scene whose parts are joined, or the path of a file."""

@@ -1,0 +1,136 @@
+"""The command ``curvireg inspect``: its files, and what it says of bad input."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from curvireg_torch.cli import main
+from curvireg_torch.errors import CurviregError
+from curvireg_torch.pipeline import Pipeline, ViewPolicy
+from curvireg_torch.synthetic import example_mesh
+
+FEW_VIEWS = ViewPolicy(pose="upright", azimuth_step=30.0, elevations=(10.0, 40.0))
+
+
+@pytest.fixture
+def inspect(tmp_path, monkeypatch):
+    """Runs the command with few views; returns its exit code and the folder of the report."""
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "few.json").write_text(replace(Pipeline(), views=FEW_VIEWS).to_json())
+
+    def run(mesh, *words):
+        out = tmp_path / "out"
+        few = ["--pipeline", str(tmp_path / "few.json")]
+        return main(["inspect", str(mesh), *few, "--out", str(out), *words]), out
+
+    return run
+
+
+@pytest.mark.slow
+def test_report_and_page(tmp_path, capsys, inspect):
+    example_mesh().export(tmp_path / "truck.ply")
+    code, out = inspect(tmp_path / "truck.ply", "--unit", "m", "--n", "2", "--clutter")
+    assert code == 0
+    document = json.loads((out / "inspect.json").read_text())
+    expected = document["expected"]
+    assert {"n", "right", "reliable", "median_deg"} <= expected.keys()
+    assert (expected["n"], expected["clutter"], expected["with_camera"]) == (2, True, True)
+    low, high = expected["right_interval"]
+    assert 0.0 <= low <= expected["right"] <= high <= 1.0
+    assert document["symmetries"] == []
+    assert isinstance(document["warnings"], list)
+    assert set(expected["compared"]) == {
+        "without a camera",
+        "with a pose prior within 45 degrees",
+        "with a second photograph from another side",
+        "with a print, also in the mesh: orientations that look alike without count as wrong",
+    }
+    assert all(pair["n"] == 1 for both in expected["compared"].values() for pair in both.values())
+    page = (out / "inspect.html").read_text()
+    assert page.count("data:image/jpeg") >= 4, "two pairs of views"
+    assert "other objects around it" in page
+    printed, shown = capsys.readouterr()
+    assert "expected: right in" in printed
+    stages = [line.split(":")[0] for line in shown.replace("\r", "\n").split("\n") if ":" in line]
+    order = ["mesh", "views", "look-alikes", "photographs"]
+    assert [name for name in dict.fromkeys(stages) if name in order] == order
+
+
+def test_backgrounds_are_ones_own_photographs(tmp_path, inspect, monkeypatch):
+    example_mesh().export(tmp_path / "truck.ply")
+    (tmp_path / "places").mkdir()
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "places" / "wall.png"), np.full((60, 80, 3), (0, 0, 200), np.uint8))
+    seen = []
+
+    def trial(*arguments, **_):
+        seen.append(arguments[1](0).image[:, 0, 0].tolist())
+        raise CurviregError("seen")
+
+    monkeypatch.setattr("curvireg_torch.inspection.report.run_trial", trial)
+    inspect(tmp_path / "truck.ply", "--unit", "m", "--photo", str(tmp_path / "places"))
+    red, green, blue = seen[0]
+    assert red > 180
+    assert green < 20
+    assert blue < 20
+
+
+@pytest.mark.parametrize("kind", ["sphere", "wire", "room"])
+def test_a_mesh_that_cannot_work_ends_with_code_3_if_strict(tmp_path, capsys, inspect, kind):
+    if kind == "sphere":
+        mesh = trimesh.creation.icosphere(2, 0.1)
+        said = "rotation cannot be seen"
+    elif kind == "wire":
+        rods = np.diag([0.3, 0.3, 0.3]) + 3e-4
+        mesh = trimesh.util.concatenate([trimesh.creation.box(size) for size in rods])
+        said = "as of a wire"
+    else:
+        box = trimesh.creation.box((5.0, 4.0, 2.6))
+        mesh = trimesh.Trimesh(box.vertices, box.faces[:, ::-1])
+        said = "as a room's do"
+    mesh.export(tmp_path / "mesh.ply")
+    code, out = inspect(tmp_path / "mesh.ply", "--unit", "m", "--strict")
+    assert code == 3
+    assert said in capsys.readouterr().out
+    document = json.loads((out / "inspect.json").read_text())
+    assert document["hopeless"]
+    assert document["expected"] is None
+    assert inspect(tmp_path / "mesh.ply", "--unit", "m")[0] == 0
+
+
+def test_a_mesh_without_area_is_refused_in_one_line(tmp_path, capsys, inspect):
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
+    assert inspect(tmp_path / "flat.obj", "--unit", "m")[0] == 2
+    said = capsys.readouterr().err.strip().split("\n")
+    assert "flat.obj" in said[-1]
+    assert "Traceback" not in "".join(said)
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_kilometre_and_missing_textures_are_warned_of(tmp_path, capsys, inspect):
+    text = example_mesh().apply_scale(4000.0).export(file_type="obj")
+    (tmp_path / "truck.obj").write_text("mtllib paint.mtl\nusemtl red\n" + text)
+    code, out = inspect(tmp_path / "truck.obj", "--unit", "m", "--n", "0")
+    assert code == 0
+    warnings = json.loads((out / "inspect.json").read_text())["warnings"]
+    assert any("m across: is its unit really m; usual would be mm" in text for text in warnings)
+    assert any("paint.mtl" in text for text in warnings)
+    assert "warning:" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_million_faces_take_bounded_time_and_are_said(tmp_path, inspect):
+    mesh = trimesh.creation.icosphere(8)
+    stretch = 1.0 + 0.3 * (mesh.vertices[:, :1] > 0.3) * mesh.vertices[:, 1:2]
+    mesh.vertices = 0.1 * mesh.vertices * stretch * (1.0, 0.8, 0.6)
+    assert len(mesh.faces) > 1_000_000
+    mesh.export(tmp_path / "fine.ply")
+    code, out = inspect(tmp_path / "fine.ply", "--unit", "m", "--n", "2")
+    assert code == 0
+    document = json.loads((out / "inspect.json").read_text())
+    assert document["expected"]["n"] == 2
+    assert any("1,310,720 faces: contours use 8,000" in text for text in document["warnings"])

@@ -1,0 +1,98 @@
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.geometry import camera_matrix
+from curvireg_torch.rendering import make_renderer
+from curvireg_torch.rendering.contours import MeshContours
+from curvireg_torch.rendering.device_contours import DeviceContours
+from curvireg_torch.rendering.zbuffer import DeviceRenderer, _groups
+from curvireg_torch.synthetic import example_mesh, random_pose
+
+MESHES = {
+    "truck": example_mesh,
+    "sphere": lambda: trimesh.creation.icosphere(subdivisions=3),
+    "torus": lambda: trimesh.creation.torus(1.0, 0.4),
+    "open": lambda: trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]], [[0, 1, 2], [1, 3, 2]], process=False
+    ),
+}
+
+
+def poses_of(mesh, size, count):
+    generator = torch.Generator().manual_seed(0)
+    K = camera_matrix(2.5 * size, 2.4 * size, 0.5 * size, 0.45 * size, dtype=torch.float64)
+    T = [random_pose(mesh, K, (size, size), generator) for _ in range(count)]
+    return torch.stack(T), K
+
+
+@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize(("size", "density"), [(64, 0.25), (128, 0.5)])
+def test_contours_of_both_backends_agree(name, size, density):
+    """99.5 % of the points are the same; the others are grazed by their rays."""
+    mesh = MESHES[name]()
+    contours = MeshContours(mesh)
+    T, K = poses_of(mesh, size, 6)
+    expected = contours.points(T, K[None], size, density=density)
+    found = DeviceContours(contours, "cpu").points(T, K[None], size, density=density)
+    gaps = []
+    same_side = []
+    for k in range(len(T)):
+        mine = found.valid[k]
+        theirs = expected.valid[k]
+        distance = torch.cdist(expected.model[k][theirs], found.model[k][mine])
+        gap, nearest = distance.min(dim=1)
+        gaps.append(gap)
+        normals = found.normals[k][mine][nearest]
+        same_normal = (normals - expected.normals[k][theirs]).norm(dim=1) < 1e-3
+        same_outline = found.outline[k][mine][nearest] == expected.outline[k][theirs]
+        same_side.append((same_normal & same_outline)[gap < 1e-4 * contours.radius])
+    is_found = torch.cat(gaps) < 1e-4 * contours.radius
+    assert len(is_found) > 50
+    assert float(is_found.float().mean()) >= 0.995
+    assert float(torch.cat(same_side).float().mean()) >= 0.995
+    assert abs(int(found.valid.sum()) - int(expected.valid.sum())) <= 0.005 * len(is_found)
+
+
+def test_contours_do_not_depend_on_the_batch(monkeypatch):
+    contours = DeviceContours(MeshContours(example_mesh()), "cpu")
+    T, K = poses_of(example_mesh(), 64, 4)
+    together = contours.points(T, K[None], 64)
+    monkeypatch.setattr("curvireg_torch.rendering.device_contours.EDGES_AT_A_TIME", 1)
+    monkeypatch.setattr("curvireg_torch.rendering.device_contours.TESTS_AT_A_TIME", 1)
+    alone = contours.points(T, K[None], 64)
+    assert torch.equal(alone.valid, together.valid)
+    torch.testing.assert_close(alone.model, together.model, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_depth_of_the_device_is_that_of_rays(name, orthographic):
+    mesh = MESHES[name]()
+    T, K = poses_of(mesh, 96, 3)
+    if orthographic:
+        K = torch.diag(torch.tensor([0.2, 0.2, 1.0], dtype=torch.float64)) @ K
+        K[:2, 2] *= 5.0
+    given = T, K, (90, 100)
+    expected = make_renderer(mesh, "embree").render(*given, orthographic=orthographic)
+    depth = DeviceRenderer(mesh, "cpu").render(*given, orthographic=orthographic)
+    both = (depth > 0) & (expected > 0)
+    assert int(both.sum()) > 150
+    assert int(((depth > 0) != (expected > 0)).sum()) <= 0.002 * int(both.sum())
+    error = (depth - expected)[both].abs()
+    assert float((error > 1e-3 * T[:, 2, 3].max()).float().mean()) < 0.002
+
+
+def test_views_that_the_camera_plane_cuts_are_drawn_by_rays():
+    mesh = example_mesh()
+    T, K = poses_of(mesh, 96, 2)
+    T[0, :3, 3] = 0.0  # the camera is within the object
+    expected = make_renderer(mesh, "embree").render(T, K, (64, 64))
+    depth = DeviceRenderer(mesh, "cpu").render(T, K, (64, 64))
+    assert torch.equal(depth[0], expected[0])
+    assert bool((depth[1] > 0).any())
+
+
+def test_groups_of_views_have_few_fragments():
+    assert _groups([3, 4, 9, 1, 1], 8) == [(0, 2), (2, 3), (3, 5)]
+    assert _groups([], 8) == []

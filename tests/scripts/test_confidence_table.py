@@ -1,0 +1,39 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from scripts.confidence_table import measured, table
+
+
+def run(folder: Path, column: str) -> Path:
+    results = [
+        {"key": "a", "confidence": 0.95, "reliable": True, "ambiguous": None},
+        {"key": "b", "confidence": 0.97, "reliable": True, "ambiguous": "several"},
+        {"key": "c", "confidence": 0.31, "reliable": False, "ambiguous": "half turn"},
+        {"key": "d", "verdict": "failed"},
+    ]
+    folder.mkdir()
+    lines = [json.dumps(row) + "\n" for row in results]
+    (folder / "results.jsonl").write_text("".join(lines), encoding="utf-8")
+    errors = f"key,group,{column}\na,1,29.9\nb,1,30.1\nc,2,3.0\nd,2,\n"
+    (folder / "errors.csv").write_text(errors, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("column", ["rotation", "symmetric_error_deg"])
+def test_confidences_are_counted(tmp_path, column):
+    row = measured(run(tmp_path / "set", column))
+    assert (row["n"], row["reliable"], row["reliable_right"], row["ambiguous"]) == (4, 2, 1, 2)
+    assert row["mean_confidence"] == pytest.approx((0.95 + 0.97 + 0.31) / 4)
+    assert row["right"] == 0.5
+    assert row["auc"] == 0.5  # of the pairs of right and wrong: ab -, ad +, cb -, cd +
+    assert "| `set` | 4 | 0.56 | 0.50 | 2 | 1 | 2 | 0.50 |" in table([row])
+
+
+def test_one_kind_of_answers_has_no_order(tmp_path):
+    folder = run(tmp_path / "set", "rotation")
+    (folder / "errors.csv").write_text("key,group,rotation\na,1,1.0\nc,2,3.0\n", encoding="utf-8")
+    row = measured(folder)
+    assert row["auc"] is None
+    assert table([row]).splitlines()[-1].endswith("|  |")
