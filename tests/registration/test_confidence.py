@@ -51,7 +51,9 @@ def test_logistic_model_in_closed_form():
     assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(
         1 / (1 + math.exp(-(2.1 + 1.0 - 2.0)))
     )
-    assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
+    tied = pytest.approx(1 / (1 + math.exp(-(0.3 - 2.0))))
+    assert model({"similarity": 0.1, "margin": None}) == tied, "as a margin of 0"
+    assert model({"similarity": 0.1, "margin": 0.0}) == tied
     assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, (
         "bounded without a rival"
     )
