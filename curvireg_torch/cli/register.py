@@ -79,9 +79,8 @@ def add_register(commands: Any) -> None:
         nargs="*",
         metavar="PHOTO... MESH",
         help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj "
-        ".ply .stl .off .glb "
-        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh "
-        "without colours is grey",
+        ".ply .stl .off .glb .gltf .3mf .urdf; with extras .step .iges .dae .usdz) or a bank. "
+        "Textures and colours are compared too; a mesh without colours is grey",
     )
     candidates = "a candidate mesh; repeat the option, and the best of them is reported"
     add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
