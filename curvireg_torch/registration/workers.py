@@ -21,7 +21,7 @@ COMPUTED = (
     "detector",
     "mesh_warnings",
     "telling_symmetries",
-    "_landmarks",
+    "_keypoints",
     "_workers",
 )
 SECONDS_TO_END = 20.0  # within which a process stores the features of views that it has described
