@@ -173,7 +173,12 @@ class MissingDependencyError(CurviregError, ImportError):
 
 
 class WorkerError(CurviregError, RuntimeError):
-    """A process that registers photographs ended before it was done."""
+    """A process that registers photographs ended before it was done.
+
+    Example:
+        >>> issubclass(WorkerError, RuntimeError)
+        True
+    """
 
 
 class RenderingError(CurviregError, RuntimeError):

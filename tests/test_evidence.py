@@ -30,6 +30,14 @@ def test_the_score_is_the_weighted_sum(name):
     assert evidence(**{name: [0.5, -1.0, 3.0]}).scores(weights).tolist() == [1.0, -2.0, 6.0]
 
 
+@pytest.mark.parametrize("name", ["rank", "edge_support"])
+def test_how_near_a_view_was_and_support_alone_are_no_evidence_for_a_fitted_pose(name):
+    """Else of two poses that fit equally well the one with the nearer view would win by chance."""
+    tied = evidence(2, similarity=[0.7, 0.7], **{name: [0.0, -1.335]})
+    first, second = tied.scores(EvidenceWeights()).tolist()
+    assert first == second
+
+
 def test_a_similar_mesh_keeps_the_order_of_the_ranking():
     seen = evidence(rank=[-1.0, -2.0, 0.0], **{name: [5.0, 4.0, 3.0] for name in NAMES[1:]})
     assert seen.scores(RANK_ALONE).tolist() == [-1.0, -2.0, 0.0]

@@ -79,9 +79,8 @@ def add_register(commands: Any) -> None:
         nargs="*",
         metavar="PHOTO... MESH",
         help="photographs, folders of them, patterns ('shots/*.jpg') or videos; last a mesh (.obj "
-        ".ply .stl .off .glb "
-        ".gltf) or a bank. Textures and colours of .glb .obj .ply are compared too; a mesh "
-        "without colours is grey",
+        ".ply .stl .off .glb .gltf .3mf .urdf; with extras .step .iges .dae .usdz) or a bank. "
+        "Textures and colours are compared too; a mesh without colours is grey",
     )
     candidates = "a candidate mesh; repeat the option, and the best of them is reported"
     add("--mesh", type=Path, action="append", default=[], metavar="MESH", help=candidates)
@@ -531,6 +530,8 @@ def _advice(document: Mapping[str, Any]) -> str:
         return "correct what the warning names"
     if document["ambiguous"] is not None:
         return "more than one pose fits"
+    if document.get("confidence", 0.0) is None:
+        return "look at the overlay, or leave --preset and other settings out to have a confidence"
     if "distance" in document.get("prior", {}):
         return f"check --distance, --camera, and {mesh}"
     if "detection" in document:

@@ -183,6 +183,13 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     )
 
 
+def _filled(images: Tensor) -> Tensor:
+    """Images (N, C, S, S) and empty ones, a power of two: cuDNN chooses its kernels for each number
+    anew, which takes a second and more."""
+    missing = (1 << (len(images) - 1).bit_length()) - len(images)
+    return torch.cat([images, images.new_zeros(missing, *images.shape[1:])])
+
+
 @torch.no_grad()
 def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> Tensor:
     """Appearance descriptors (N, D), float16 of unit length, of photograph crops and of shaded
@@ -192,9 +199,14 @@ def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> T
     unit length, and both strides equal weight. On a CPU the images are described one by one, since
     rounding depends on the number, or ``together``, in five sixths of the time."""
 
+    on_cpu = images.device.type == "cpu"
+
     def describe_chunk(images: Tensor) -> Tensor:
+        count = len(images)
         levels = []
-        for features, spread in zip(backbone(images), backbone.spreads, strict=True):
+        inputs = images if on_cpu else _filled(images)
+        for all_features, spread in zip(backbone(inputs), backbone.spreads, strict=True):
+            features = all_features[:count]
             centred = features - features.mean(dim=(2, 3), keepdim=True)
             cells = F.normalize(centred / spread[:, None, None], dim=1)
             levels.append(
@@ -202,7 +214,6 @@ def describe(images: Tensor, backbone: Backbone, *, together: bool = False) -> T
             )
         return torch.cat(levels, dim=1).half()
 
-    on_cpu = images.device.type == "cpu"
     at_a_time = (IMAGES_AT_A_TIME if together else 1) if on_cpu else IMAGES_ON_DEVICE
     chunks = images.split(at_a_time)
     return torch.cat(map_on_threads(describe_chunk, chunks, device=images.device))

@@ -13,7 +13,7 @@ from ..matching import ViewDescriber
 from ..registration import Registrar
 from ..visualization.contours import close_up, draw_window
 from ..visualization.encoding import jpeg, to_uint8
-from .facts import MeshFacts
+from .facts import CONTINUOUS_TURN, MeshFacts
 from .look_alikes import LookAlike
 from .report import ELEVATIONS, PIXELS_ACROSS, Inspection
 from .trial import Expected, Outcome
@@ -96,13 +96,16 @@ def _fact_rows(facts: MeshFacts) -> list[tuple[str, str]]:
         ("faces", f"{facts.faces:,} in {facts.parts:,} part{'s' * (facts.parts > 1)}, {closed}"),
         ("colours", colours),
         ("thin parts", f"{100 * facts.thin:.0f} % of the surface, thinner than 1 % of the size"),
-        (
-            "symmetries",
-            f"{len(facts.symmetries) + 1} orientations look the same"
-            if facts.symmetries
-            else "none",
-        ),
+        ("symmetries", _symmetries_in_words(facts)),
     ]
+
+
+def _symmetries_in_words(facts: MeshFacts) -> str:
+    if not facts.symmetries:
+        return "none"
+    if min(symmetry.angle for symmetry in facts.symmetries) < CONTINUOUS_TURN:
+        return "any turn about an axis leaves the shape; steps of 10 degrees stand for them"
+    return f"{len(facts.symmetries) + 1} orientations have the same shape"
 
 
 def _table(rows: Sequence[tuple[Any, ...]]) -> str:
@@ -185,7 +188,7 @@ def _expectation(report: Inspection) -> str:
     for ranges, name in ((by_elevation, "elevation {}°"), (by_pixels, "{} px across")):
         rows += [_row(name.format(interval), expected) for interval, expected in ranges.items()]
     for name, (before, after) in report.trial.compared.items():
-        rows += [_row("the first of them", before), _row(name, after)]
+        rows += [_row(f"the first {before.n} of them", before), _row(name, after)]
     surroundings = "other objects around it" if report.clutter else "no clutter, nothing in front"
     note = (
         f"Right: within 30 degrees. Generated photographs ({surroundings}) are simpler than real "

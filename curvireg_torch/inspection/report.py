@@ -1,5 +1,6 @@
 """``curvireg inspect``: one report of a mesh, before anyone takes a photograph."""
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +25,8 @@ from .look_alikes import LookAlike, confused_sides, look_alikes
 from .photographs import SIZE, UPRIGHT, PhotographGenerator
 from .trial import Report, Trial, report_nothing, run_trial
 
-ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.01)  # Borders of the ranges of the report, degrees
-PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, 1e4)
+ELEVATIONS = (-90.0, -45.0, 0.0, 45.0, 90.0)  # Borders of the ranges of the report, degrees
+PIXELS_ACROSS = (0.0, 128.0, 192.0, 256.0, math.inf)
 MIN_RIGHT = 0.5  # Expected share of right answers below which a warning says so
 MANY_ALIKE = 0.1  # Share of directions with a look-alike from which a warning says so
 

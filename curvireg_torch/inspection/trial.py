@@ -126,9 +126,14 @@ class Trial:
         left out."""
         ranges = {}
         for low, high in itertools.pairwise(borders):
-            inside = [outcome for outcome in self.outcomes if low <= key(outcome) < high]
+            inside = [
+                outcome
+                for outcome in self.outcomes
+                if low <= key(outcome) < high or key(outcome) == high == borders[-1]
+            ]
+            name = f"{low:g} or more" if math.isinf(high) else f"{low:g} to {high:g}"
             if inside:
-                ranges[f"{low:g} to {high:g}"] = Expected.of(inside)
+                ranges[name] = Expected.of(inside)
         return ranges
 
 

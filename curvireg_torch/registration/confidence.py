@@ -196,7 +196,7 @@ def confidence_features(
 
     Args:
         evidence: of the H hypotheses, the best first.
-        scores: (H,) by which they are ordered.
+        scores: (H,) theirs, without keypoints, which a similar print beside the object has too.
         share: :func:`concentration` of the ranking.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
         outside: fraction of the object that lies outside the photograph.

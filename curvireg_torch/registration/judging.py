@@ -23,8 +23,8 @@ from .target import Target
 from .work import Work
 
 OUTSIDE_MARGIN = 1.0
-"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity or
-edge support."""
+"""Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity, or
+of the evidence of contours."""
 
 
 def judged(
@@ -34,8 +34,11 @@ def judged(
     evidence: Evidence,
     distinct: Tensor,
     outside: Tensor,
+    *,
+    siblings: int = 0,
 ) -> Registration:
-    """Hypotheses, best first, those that merged last, and their probabilities.
+    """Hypotheses, best first, then its rivals, then those that are near the best or merged with
+    another, and their probabilities.
 
     Args:
         target: the object.
@@ -45,19 +48,28 @@ def judged(
         distinct: (H,) bool, False of poses that merged with a better one and returned to their
             views.
         outside: (H,) bool, those that lie outside the limits and are not reported.
+        siblings: how many of the last poses a symmetry of the shape makes of the best one, which a
+            feature of the mesh tells apart.
     """
-    scores = evidence.scores(target.score_weights(exact=work.exact))
+    weights = target.score_weights(exact=work.exact)
+    scores = evidence.scores(weights)
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]
     best = own[:1]
+    # Poses that merged, and those near the best, which are right if it is, have no probability of
+    # their own.
+    is_rival = distinct[own] & ~_near_best(work, poses[own], own >= len(poses) - siblings)
+    is_rival[0] = True
+    rivals = own[is_rival]
+    own = torch.cat([rivals, own[~is_rival]])
+    # where all are near, the nearest tell how clear the best one is
+    compared = rivals if len(rivals) > 1 else own[distinct[own]]
     reported = own[: target.pipeline.hypotheses].tolist()
     fraction = _outside_fraction(target, work, poses[best])
-    # Poses that merged have no probability of their own.
-    rivals = own[distinct[own]]
     near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
-        evidence[rivals],
-        scores[rivals],
+        evidence[compared],
+        evidence[compared].scores(replace(weights, landmarks=0.0)),
         concentration(work.ranking.scores[0], near),
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,
@@ -66,7 +78,7 @@ def judged(
     )
     gain = _gain_outside(target, evidence, best, order[outside[order]])
     # limits that leave no rival do not make a pose uncertain
-    if gain is not None and len(rivals) == 1:
+    if gain is not None and len(compared) == 1:
         share = measured["concentration"] or 1.0
         measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
     probabilities: tuple[float, ...] = ()
@@ -91,6 +103,14 @@ def judged(
         camera=item.camera,
         reliable_from=target.pipeline.fit.reliable,
     )
+
+
+def _near_best(work: Work, poses: Poses, is_sibling: Tensor) -> Tensor:
+    """(H,) bool: poses near the first one, up to symmetries of the object, which siblings (H,) are
+    not: a feature of the mesh tells them apart."""
+    R = poses.rotation
+    near = are_near(R, R[0], work.symmetries)
+    return torch.where(is_sibling | is_sibling[0], are_near(R, R[0]), near)
 
 
 def _outside_fraction(target: Target, work: Work, best: Poses) -> float:

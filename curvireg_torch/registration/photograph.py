@@ -133,7 +133,8 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
     evidence = Evidence.cat([evidence, sibling.evidence])
     distinct = F.pad(distinct, (0, len(sibling.poses)), value=True)
     outside = F.pad(outside, (0, len(sibling.poses)))
-    result = judged(target, work, poses, evidence, distinct, outside)
+    siblings = len(sibling.poses)
+    result = judged(target, work, poses, evidence, distinct, outside, siblings=siblings)
     return replace(result, feature_is_hidden=sibling.feature_is_hidden)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from copy import copy
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeVar
 
 import torch
 
@@ -15,16 +15,13 @@ from ..errors import CurviregError, WorkerError
 from .inputs import ImageItem
 from .result import FailedRegistration, Registration
 
-if TYPE_CHECKING:
-    from .registrar import Registrar
-
 # attributes of a registrar that follow from the others
 COMPUTED = (
     "describer",
     "detector",
     "mesh_warnings",
     "telling_symmetries",
-    "_landmarks",
+    "_keypoints",
     "_workers",
 )
 SECONDS_TO_END = 20.0  # within which a process stores the features of views that it has described
@@ -34,6 +31,22 @@ ENDED = (
 )
 
 Results = list[Registration | FailedRegistration]
+
+
+class RegistersItems(Protocol):
+    """What a process needs of a :class:`.Registrar`."""
+
+    @property
+    def others(self) -> Sequence[Any]:
+        """Registrars of further meshes."""
+
+    def register_items(
+        self, items: Sequence[ImageItem | CurviregError], *, detects: bool = False
+    ) -> list[Registration | FailedRegistration]:
+        """See :meth:`.Registrar.register_items`."""
+
+
+Copied = TypeVar("Copied", bound=RegistersItems)
 
 
 class Workers:
@@ -47,7 +60,7 @@ class Workers:
         count: of processes.
     """
 
-    def __init__(self, registrar: "Registrar", count: int) -> None:
+    def __init__(self, registrar: RegistersItems, count: int) -> None:
         context = multiprocessing.get_context("spawn")
         content = pickle.dumps(_without_renderers(registrar))
         self._connections: list[Connection] = []
@@ -115,22 +128,23 @@ def _end(processes: Sequence[BaseProcess], connections: Sequence[Connection]) ->
             process.terminate()
 
 
-def _without_renderers(registrar: "Registrar") -> "Registrar":
+def _without_renderers(registrar: Copied) -> Copied:
     """A copy without what is computed from the rest, and cannot be pickled."""
-    other = copy(registrar)
+    other: Any = copy(registrar)
     for name in COMPUTED:
         other.__dict__.pop(name, None)
     other.progress = False
     other.workers = 1
     other.others = [_without_renderers(one) for one in registrar.others]
-    return other
+    copied: Copied = other
+    return copied
 
 
 def _work(connection: Connection) -> None:
     """Register photographs until the connection is closed."""
     torch.set_num_threads(1)
     try:
-        registrar: Registrar = pickle.loads(connection.recv_bytes())
+        registrar: RegistersItems = pickle.loads(connection.recv_bytes())
         while True:
             item, index, detects = pickle.loads(connection.recv_bytes())
             connection.send_bytes(pickle.dumps(_result(registrar, item, index, detects)))
@@ -139,7 +153,7 @@ def _work(connection: Connection) -> None:
 
 
 def _result(
-    registrar: "Registrar", item: ImageItem | CurviregError, index: int, detects: bool
+    registrar: RegistersItems, item: ImageItem | CurviregError, index: int, detects: bool
 ) -> Registration | FailedRegistration | Exception:
     try:
         result = registrar.register_items([item], detects=detects)[0]

@@ -52,7 +52,8 @@ def map_in_company(job: Callable[[Item], Result], items: Sequence[Item]) -> list
     """``job`` of every item, in order, ``JOBS_TOGETHER`` at a time, each on a thread of its own.
 
     Where all jobs that have not ended wait for :func:`compute_together`, what they wait for is
-    computed at once. Within a job, items follow each other.
+    computed at once, on the thread of the caller: cuDNN chooses its kernels again for each thread,
+    which takes longer than they do. Within a job, items follow each other.
     """
     if getattr(_this_thread, "company", None) is not None:
         return [job(item) for item in items]
@@ -63,7 +64,6 @@ def map_in_company(job: Callable[[Item], Result], items: Sequence[Item]) -> list
         company = _Company(len(some))
 
         def run(item: Item, company: _Company = company) -> Result:
-            # to its end: the last one to wait, or to leave, computes for the others
             with torch.set_grad_enabled(with_gradients), full_precision():
                 _this_thread.company = company
                 try:
@@ -73,7 +73,10 @@ def map_in_company(job: Callable[[Item], Result], items: Sequence[Item]) -> list
                     company.leave()
 
         with single_threaded_pool(len(some)) as pool:
-            results += pool.map(run, some)
+            running = pool.map(run, some)
+            with full_precision():
+                company.serve()
+            results += running
     return results
 
 
@@ -89,20 +92,22 @@ class _Place:
 
 
 class _Company:
-    """Jobs of which the last one to wait computes for all."""
+    """Jobs that wait until :meth:`serve` computes for all."""
 
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
         self._waiting: list[_Place] = []
         self._changed = threading.Condition()
+        self._failure: BaseException | None = None
 
     def result(self, function: Callable[[Sequence[Any]], Sequence[Any]], request: Any) -> Any:
         place = _Place(function, request)
         with self._changed:
             self._waiting.append(place)
-            self._compute_if_all_wait()
-            while not place.is_done:
-                self._changed.wait()
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: place.is_done or self._failure is not None)
+        if self._failure is not None:
+            raise self._failure
         if place.error is not None:
             raise place.error
         return place.result
@@ -110,14 +115,22 @@ class _Company:
     def leave(self) -> None:
         with self._changed:
             self._jobs -= 1
-            self._compute_if_all_wait()
+            self._changed.notify_all()
 
-    def _compute_if_all_wait(self) -> None:
-        if not self._waiting or len(self._waiting) < self._jobs:
-            return
-        by_key(self._waiting, lambda place: place.function, _compute)
-        self._waiting = []
-        self._changed.notify_all()
+    def serve(self) -> None:
+        """Compute, each time when all jobs wait, until they have ended; if this is interrupted,
+        they are too."""
+        with self._changed:
+            try:
+                while self._jobs:
+                    self._changed.wait_for(lambda: len(self._waiting) >= self._jobs)
+                    by_key(self._waiting, lambda place: place.function, _compute)
+                    self._waiting = []
+                    self._changed.notify_all()
+            except BaseException as failure:
+                self._failure = failure
+                self._changed.notify_all()
+                raise
 
 
 def _compute(places: Sequence[_Place]) -> Sequence[_Place]:

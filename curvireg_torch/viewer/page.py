@@ -179,7 +179,7 @@ class Steps:
         path = self.session.mesh_path
         if path is None:
             return (
-                "The object's 3D model: .obj, .ply, .stl, .off, .glb, or .gltf with its parts "
+                "The object's 3D model: .obj, .stl, .glb, .step, .usdz, or .gltf with its parts "
                 "as "
                 "a .zip."
             )

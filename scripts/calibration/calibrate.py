@@ -47,6 +47,7 @@ from curvireg_torch.registration.confidence import (
     EVIDENCE_FEATURES,
     RELIABLE,
     LogisticModel,
+    are_near,
 )
 from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
 from scripts._shared import REPOSITORY, RESULTS, commit, today, write_json
@@ -86,14 +87,14 @@ ESTIMATED = {
 SCENES_PER_MESH = 2.0
 
 SHARES = {
-    "tied": 0.1,
+    "tied": 0.05,
     "cut": 0.1,
     "cut_packages": 0.05,
-    "print": 0.05,
-    "mirrored": 0.02,
-    "wrong": 0.08,
+    "print": 0.03,
+    "mirrored": 0.01,
+    "wrong": 0.03,
+    "estimated_wrong": 0.03,
 }
-SHARES |= {"estimated_wrong": 0.08}
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each
 the same weight."""
 
@@ -139,7 +140,8 @@ STARTS = (
 """Degrees and fraction of the distance by which the starts of refinements are off."""
 
 FOLDS = 5
-RESOLUTIONS = np.arange(0.0, 1.55, 0.1).round(2).tolist()  # that are tried
+RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
+"""Those that are tried. Scores of two poses that look the same differ by up to 0.5."""
 MODELS = {
     "instance": (
         *("furniture", "shapes", "packages", "shelves", "tied", "cut", "cut_packages", *ABSENT),
@@ -237,9 +239,12 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
         }
     evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
     scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
-    row = {"features": dict(result.confidence_features), "scores": scores.tolist()}
     S = symmetries_of(sample, registrar if registrar.is_exact else None)
-    row |= {"errors": errors_of(R, seen, S).tolist(), "evidence": evidence.table.tolist()}
+    # near the best one up to symmetries, they are right if it is
+    is_rival = ~are_near(R.float(), R[0].float(), S)
+    is_rival[0] = True
+    row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
+    row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
@@ -517,7 +522,8 @@ def fit_registrations(
     rows: list[Row], *, exact: bool, present: Row | None = None
 ) -> tuple[Row, Row]:
     """Constants of a model of registrations, and their quality on held-out folds, in all and by
-    set. With the ``present`` constants only their level is fitted, see :func:`fit_level`."""
+    set. With the ``present`` constants only their scale and level are fitted, see
+    :func:`fit_level`."""
     for row in rows:
         is_present = row["set"] not in ABSENT
         row["right"] = is_present and min(row["errors"]) < RIGHT
@@ -532,11 +538,10 @@ def fit_registrations(
 
     def fit(train: np.ndarray) -> Row:
         some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
-        if present is not None:
-            return fit_level(some, weight[train], present)
-        return fit_logistic(some, weight[train], signs) | fit_shares(
+        fitted = present or fit_logistic(some, weight[train], signs) | fit_shares(
             some, weight[train], ties=exact
         )
+        return fit_level(some, weight[train], fitted)
 
     fold = folds_of(rows)
     p = np.zeros(len(rows))

@@ -339,6 +339,10 @@ PRINTED = {
     [
         ({}, "theta 0.0 degrees (as seen by a camera that looks straight at it)   score 0.500"),
         ({"translation": [1.0, 2.0, 3.0]}, "theta 0.0 degrees   score 0.500   confidence 0.99,"),
+        (
+            {"confidence": None, "reliable": False, "warnings": [], "confidence_features": {}},
+            "take the pose as a guess; look at the overlay, or leave --preset",
+        ),
         ({"confidence": None}, "confidence not calibrated for other terms, fields or views"),
         (
             {

@@ -1,5 +1,7 @@
 """Masks as programs write them: white, labels, palettes, transparency."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -104,3 +106,11 @@ def test_soft_borders_of_a_white_object_are_kept(tmp_path):
     file = written(tmp_path / "soft.png", soft)
     assert np.allclose(read_mask(file), soft / 255.0)
     assert len(np.unique(read_mask(file))) > 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no colons in names of files")
+def test_a_file_whose_name_ends_like_a_label_is_read(tmp_path):
+    file = tmp_path / "labels.png:2"
+    assert mask_file(file) == (tmp_path / "labels.png", 2)
+    file.write_bytes(b"")
+    assert mask_file(file) == (file, None)

@@ -96,3 +96,11 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
     assert (d.dtype, d.shape) == (torch.float16, (3, 40 * 8 * 8 + 112 * 4 * 4))
     torch.testing.assert_close(similarity(d, d), expected, atol=2e-3, rtol=0)
     torch.testing.assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("count", "filled"), [(1, 1), (3, 4), (4, 4), (5, 8)])
+def test_images_are_filled_up_to_a_power_of_two(count, filled):
+    images = torch.rand(count, 1, 8, 8)
+    more = backbone._filled(images)
+    assert len(more) == filled
+    assert torch.equal(more[:count], images)

@@ -1,6 +1,8 @@
 """Poses of nearly the same look: what only one of them predicts."""
 
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -100,3 +102,83 @@ def test_contours_that_are_not_there_count_against_their_pose():
     )
     assert bool(differ[0, 1])
     assert float(scores[0, 1]) < -0.5
+
+
+def closed_case(
+    monkeypatch: pytest.MonkeyPatch,
+    places: list[list[float]],
+    *,
+    strength: float = 0.8,
+    padding: list[list[float]] | None = None,
+    outside: float = -1.0,
+) -> tuple[float, bool]:
+    """Score of the first of two poses with contour points at ``places`` in px along a line, where
+    all edges have a ``strength``; ``padding`` are places of points that are not valid, and at
+    ``outside`` the photograph ends."""
+    rows = [[*some, *more] for some, more in zip(places, padding or [[], []], strict=True)]
+    P = max(map(len, rows))
+    x = torch.tensor([row + [900.0] * (P - len(row)) for row in rows]).double()
+    valid = torch.tensor([[k < len(some) for k in range(P)] for some in places])
+    uv = torch.stack([x, torch.zeros_like(x)], dim=-1)
+    points = SimpleNamespace(model=None, normals=None, valid=valid)
+    problem = SimpleNamespace(
+        state=lambda _: SimpleNamespace(points=points),
+        strength_near=lambda uv, _: torch.full(uv.shape[:2], strength).double(),
+        edges=SimpleNamespace(counts=lambda uv, valid, _: valid & (uv[..., 0] > outside)),
+        K=None,
+        centre=None,
+    )
+    monkeypatch.setattr(details.ContourProblem, "of", lambda *_: problem)
+    monkeypatch.setattr(details, "pixels", lambda *_: uv)
+    nothing: Any = None
+    T = torch.eye(4).double().repeat(2, 1, 1)
+    scores, differ = details.compare_details(nothing, nothing, nothing, T, nothing)
+    torch.testing.assert_close(scores, -scores.T)
+    assert torch.equal(differ, differ.T)
+    return float(scores[0, 1]), bool(differ[0, 1])
+
+
+def line(start: float, count: int) -> list[float]:
+    return [start + 10.0 * k for k in range(count)]
+
+
+SHARED = line(0.0, 20)
+
+
+@pytest.mark.parametrize(
+    ("alone", "expected"),
+    [
+        (0, 0.0),
+        (5, 0.0),  # too few to look different
+        (8, 10.0 * 8 * 0.4 / 16),  # half of their weight
+        (20, 10.0 * 0.4),
+    ],
+)
+def test_points_of_one_pose_alone_count_by_their_strength_beyond_half_of_the_shared_ones(
+    monkeypatch, alone, expected
+):
+    """Also where padding of the other pose happens to lie there."""
+    own = line(400.0, alone)
+    found = closed_case(monkeypatch, [SHARED + own, SHARED], padding=[[], own])
+    assert found == (pytest.approx(expected), alone >= 6)
+    found = closed_case(monkeypatch, [SHARED, SHARED + own], padding=[own, []])
+    assert found == (pytest.approx(-expected), alone >= 6)
+
+
+@pytest.mark.parametrize(("apart", "differs"), [(3.9, False), (4.1, True)])
+def test_points_a_few_pixels_apart_are_the_same(monkeypatch, apart, differs):
+    moved = [x + apart for x in SHARED]
+    _, found = closed_case(monkeypatch, [SHARED, moved])
+    assert found == differs
+
+
+def test_a_pose_without_contours_shares_none(monkeypatch):
+    """Then a contour counts against nothing."""
+    found = closed_case(monkeypatch, [SHARED, []], padding=[[], SHARED])
+    assert found == (pytest.approx(10.0 * 0.8), True)
+
+
+def test_points_outside_the_photograph_are_no_details(monkeypatch):
+    own = line(-200.0, 12)
+    found = closed_case(monkeypatch, [SHARED + own, SHARED], outside=-95.0)
+    assert found == (0.0, False), "one of twelve is inside"

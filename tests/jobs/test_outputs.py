@@ -139,3 +139,20 @@ def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):
     check_output_file(file, [], mark=b"curvireg")
     with pytest.raises(InvalidInputError, match=r"overlay\.png: an input"):
         check_output_file(file, [file], mark=b"curvireg")
+
+
+@pytest.mark.parametrize(("rank", "checks"), [(None, True), ("0", True), ("1", False)])
+def test_the_first_of_several_processes_checks(tmp_path, monkeypatch, rank, checks):
+    """The others find files of the first one, which has begun."""
+    if rank is not None:
+        monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
+        monkeypatch.setenv("RANK", rank)
+    (tmp_path / "results.csv").write_text("of others")
+    context = output_folder(tmp_path, "register several")
+    if checks:
+        with pytest.raises(InvalidInputError, match="not written by this command"):
+            context.__enter__()
+    else:
+        with context:
+            pass
+    assert not (tmp_path / MARKER).exists()

@@ -51,7 +51,9 @@ def test_logistic_model_in_closed_form():
     assert model({"similarity": 0.7, "margin": 2.0}) == pytest.approx(
         1 / (1 + math.exp(-(2.1 + 1.0 - 2.0)))
     )
-    assert model({"similarity": 0.1, "margin": None}) == model({"similarity": 0.1, "margin": 0.0})
+    tied = pytest.approx(1 / (1 + math.exp(-(0.3 - 2.0))))
+    assert model({"similarity": 0.1, "margin": None}) == tied, "as a margin of 0"
+    assert model({"similarity": 0.1, "margin": 0.0}) == tied
     assert model({"similarity": 5.0, "margin": None}) == confidence.UNCOMPARED_CONFIDENCE, (
         "bounded without a rival"
     )
@@ -191,10 +193,15 @@ def test_confidence_is_that_of_the_reported_features(seed, camera):
     scores = [
         sum(weights[name] * value for name, value in h.evidence.items()) for h in result.hypotheses
     ]
+    # those near the best one, which come last, have no probability of their own
+    R = torch.stack([h.allocentric_rotation for h in result.hypotheses])
+    rivals = ~confidence.are_near(R[1:], R[0])
+    far = int(rivals.sum()) + 1
+    assert rivals.tolist() == [True] * (far - 1) + [False] * (len(R) - far)
     expected = confidence.hypothesis_probabilities(
-        any_right, torch.tensor(scores), exact=camera is not None
+        any_right, torch.tensor(scores[:far]), exact=camera is not None
     )
-    assert result.probabilities == pytest.approx(expected, abs=1e-5)
+    assert result.probabilities == pytest.approx((*expected, *[0.0] * (len(R) - far)), abs=1e-5)
     assert result.confidence_features["similarity"] == result.score
     assert (
         result.confidence_features["edge_support"] == result.hypotheses[0].evidence["edge_support"]

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.fitting import together
 from curvireg_torch.fitting.keypoints import KeypointMatches
 from curvireg_torch.geometry import (
     PosePrior,
@@ -21,7 +22,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration import photograph, poses, search, work
+from curvireg_torch.registration import photograph, search, work
 from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -205,7 +206,7 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
         (photograph, "EdgeCrops"),
     ):
         monkeypatch.setattr(module, name, refused)
-    monkeypatch.setattr(poses, "fit_to_edges", refused)
+    monkeypatch.setattr(together, "fit_to_edges", refused)
     monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)

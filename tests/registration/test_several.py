@@ -94,7 +94,7 @@ def test_half_turns_in_doubt_are_decided_together():
         for r, c in zip(alone, cameras, strict=True)
     ]
     assert sorted(errors)[1] > 150, "two of three"
-    check_pose(registered(images, boxes, cameras), degrees=3.0, shift=0.2)
+    check_pose(registered(images, boxes, cameras), degrees=4.0, shift=0.2)
 
 
 def test_the_joint_fit_begins_at_each_pose_and_where_a_coarse_fit_moves_it(monkeypatch):

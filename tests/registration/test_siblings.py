@@ -1,13 +1,23 @@
 """Siblings of a pose in closed cases: which is better, and which is a rival."""
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from curvireg_torch.evidence import Evidence, EvidenceWeights
-from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.geometry import (
+    rotation_from_axis_angle,
+    rotation_from_viewpoint,
+    transform,
+)
+from curvireg_torch.registration import siblings
 from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.shape_symmetries import TellingSymmetries
 from curvireg_torch.registration.siblings import Siblings
 from tests._support.scenes import CAMERA
 
@@ -69,3 +79,90 @@ def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     notable = family.rival(0, evidence(0.9), notable=True)
     assert torch.equal(notable.poses.T[0], family.poses.T[2])
     assert notable.feature_is_hidden
+
+
+def turns_about_z(count: int) -> Tensor:
+    angles = torch.arange(count).double() * (2.0 * math.pi / count)
+    R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
+    return transform(R, torch.zeros(count, 3).double())
+
+
+class Case:
+    """A pose at 0 degrees that lies outside the limits, the best at 40, and another at 80; three
+    siblings of the best have the similarities ``measured``, a sibling that is fitted 0.95."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, measured: list[float]) -> None:
+        self.fitted: list[Poses] = []
+        self.symmetries = turns_about_z(3)
+        self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
+        different = ~torch.eye(3, dtype=torch.bool)
+        monkeypatch.setattr(siblings, "fitted_poses", self.fit)
+        monkeypatch.setattr(
+            siblings, "details_together", lambda *_: (torch.zeros(3, 3).double(), different)
+        )
+        monkeypatch.setattr(
+            siblings,
+            "evidence_of",
+            lambda _, __, poses: evidence(*measured) if len(poses) == 3 else evidence(0.95),
+        )
+
+    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, again: bool) -> Poses:
+        assert again
+        self.fitted.append(starts)
+        moved = starts.T.clone()
+        moved[:, 0, 3] += 1e-3
+        return replace(starts, T=moved)
+
+    def run(self, keeps: list[bool] | None = None) -> tuple[Poses, Evidence, siblings.Rival]:
+        """``keeps``: what the limits say, one call after the other."""
+        target: Any = SimpleNamespace(
+            telling_symmetries=TellingSymmetries(self.symmetries),
+            describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
+            score_weights=lambda **_: EvidenceWeights(),
+        )
+        answers = iter(keeps or [])
+        limits = SimpleNamespace(keeps=lambda poses: torch.tensor([next(answers)] * len(poses)))
+        work: Any = SimpleNamespace(limits=limits if keeps else None)
+        crops: Any = None
+        outside = torch.tensor([True, False, False])
+        similarity = evidence(0.99, 0.9, 0.5)
+        return siblings.with_siblings(target, work, crops, self.poses, similarity, outside)
+
+
+def test_the_best_pose_stays_and_its_sibling_is_its_rival(monkeypatch):
+    case = Case(monkeypatch, [0.80, 0.75, 0.70])
+    poses, changed, rival = case.run()
+    assert poses is case.poses
+    assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
+    # a symmetry turns the model, before it is posed
+    torch.testing.assert_close(rival.poses.T[0], case.poses.T[1] @ case.symmetries[1])
+    assert float(rival.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
+    assert not case.fitted
+
+
+def test_a_better_sibling_is_fitted_and_the_pose_before_is_its_rival(monkeypatch):
+    case = Case(monkeypatch, [0.80, 0.70, 0.90])
+    poses, changed, rival = case.run()
+    (start,) = case.fitted
+    torch.testing.assert_close(start.T[0], case.poses.T[1] @ case.symmetries[2])
+    assert float(poses.T[1, 0, 3] - start.T[0, 0, 3]) == pytest.approx(1e-3)
+    assert torch.equal(poses.T[[0, 2]], case.poses.T[[0, 2]])
+    assert changed.similarity.tolist() == pytest.approx([0.99, 0.95, 0.5])
+    torch.testing.assert_close(rival.poses.T[0], case.poses.T[1])
+    assert float(rival.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
+
+
+def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
+    case = Case(monkeypatch, [0.80, 0.70, 0.90])
+    poses, changed, rival = case.run(keeps=[False, False])
+    assert torch.equal(poses.T, case.poses.T)
+    assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
+    assert len(rival.poses) == len(rival.evidence) == 0
+
+
+def test_meshes_without_a_telling_feature_have_no_siblings(monkeypatch):
+    case = Case(monkeypatch, [0.80, 0.75, 0.70])
+    case.symmetries = torch.eye(4).double()[None]
+    poses, _, rival = case.run()
+    assert poses is case.poses
+    assert len(rival.poses) == 0

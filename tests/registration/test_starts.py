@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from curvireg_torch.registration.inputs import MIN_BOX_SIDE
 from curvireg_torch.registration.starts import OPENGL, why_outside
 
 SIZE = (180, 240)
@@ -38,3 +39,30 @@ def test_the_likely_mistake_is_named(scale):
     assert (str(mirrored), mirrored.kind) == (OPENGL, "opengl")
     assert why_outside(hull, pose(5.0 * scale, 0.0, 0.4 * scale), K, SIZE) is None
     assert why_outside(hull, pose(5.0 * scale, 0.0, -0.4 * scale), K, SIZE) is None
+
+
+@pytest.mark.parametrize(
+    ("side", "centre", "named"),
+    [
+        (100.0, (119.5, 89.5), True),
+        (2 * max(SIZE) - 1.0, (119.5, 89.5), True),
+        (2 * max(SIZE) + 1.0, (119.5, 89.5), False),
+        (MIN_BOX_SIDE + 0.1, (119.5, 89.5), True),
+        (MIN_BOX_SIDE - 0.1, (119.5, 89.5), False),
+        (100.0, (1.0, 89.5), True),
+        (100.0, (-1.0, 89.5), False),
+        (100.0, (119.5, -1.0), False),
+        (100.0, (239.0, 179.0), True),
+        (100.0, (241.0, 89.5), False),
+        (100.0, (119.5, 181.0), False),
+    ],
+)
+def test_a_mistake_is_named_if_without_it_the_mesh_fills_a_sensible_part(side, centre, named):
+    """A plate, whose box has this side and centre in px once its translation is divided by 1000."""
+    plate = 0.05 * torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]).double()
+    z = 260.0 * 0.1 / side
+    right = pose(*((torch.tensor(centre) - K[:2, 2]) * z / 260.0).tolist(), z)
+    wrong = right.clone()
+    wrong[:3, 3] *= 1000.0
+    error = why_outside(plate, wrong, K, SIZE)
+    assert (error is not None) == named

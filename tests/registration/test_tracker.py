@@ -253,5 +253,5 @@ def test_a_prediction_among_unusable_pixels_does_not_hide_another():
             raise ImageError("pixels outside [0, 1]")
         return SimpleNamespace(confidence=0.5)
 
-    guesses = SimpleNamespace(predictions=lambda: ["right", "beside"], _fit=fit)
+    guesses = SimpleNamespace(predictions=lambda: ["right", "beside"], _fit=fit, reliable=0.9)
     assert Tracker.track(guesses, None, None).confidence == 0.5

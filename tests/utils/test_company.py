@@ -111,3 +111,25 @@ def test_few_jobs_run_at_a_time(monkeypatch):
 def test_requests_of_a_key_are_computed_together():
     found = by_key(range(7), lambda x: x % 3, lambda some: [(x, len(some)) for x in some])
     assert found == [(0, 3), (1, 2), (2, 2), (3, 3), (4, 2), (5, 2), (6, 3)]
+
+
+def test_the_caller_computes_for_all():
+    """cuDNN chooses kernels for each thread anew."""
+    threads = set()
+
+    def where(requests):
+        threads.add(threading.current_thread())
+        return requests
+
+    for _ in range(3):
+        assert map_in_company(lambda x: compute_together(where, x), range(4)) == [0, 1, 2, 3]
+    assert threads == {threading.current_thread()}
+
+
+def test_an_interrupted_caller_ends_its_jobs(monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(company, "_compute", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        map_in_company(lambda x: compute_together(Doubling(), x), range(3))

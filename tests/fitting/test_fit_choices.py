@@ -1,0 +1,137 @@
+"""Which of several fits counts: the one with the most support, by the weights of the mask."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.fitting import contour_fit
+from curvireg_torch.fitting.contour_fit import fit_to_edges
+from curvireg_torch.fitting.contour_problem import COARSE_DENSITY, ContourProblem, ContourState
+from curvireg_torch.fitting.edges import EdgeCrops
+from curvireg_torch.fitting.least_squares import apply_twist
+from curvireg_torch.mesh.mesh import mesh_centre
+from curvireg_torch.pipeline import FitSettings
+from curvireg_torch.registration import ContourFit
+from curvireg_torch.rendering.contours import MeshContours
+from tests.fitting.cube import BOX, CUBE_POSE, K, cube, silhouette
+
+Weigh = Callable[[ContourProblem, ContourState, Tensor], Tensor]
+
+
+def starts(*degrees: float) -> Tensor:
+    """Poses of the cube, turned about the y axis."""
+    twist = torch.zeros(len(degrees), 6, dtype=torch.float64)
+    twist[:, 1] = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    return apply_twist(CUBE_POSE.repeat(len(degrees), 1, 1), twist, mesh_centre(cube()))
+
+
+def fitted(monkeypatch: pytest.MonkeyPatch, T: Tensor, weigh: Weigh, **options: Any) -> ContourFit:
+    """A fit to the cube where ``weigh`` gives the weighted support, from the plain one."""
+    measure = ContourProblem.supports
+
+    def supports(problem: ContourProblem, state: ContourState) -> tuple[Tensor, Tensor]:
+        plain, _ = measure(problem, state)
+        return plain, weigh(problem, state, plain)
+
+    monkeypatch.setattr(ContourProblem, "supports", supports)
+    crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
+    cameras = K.expand(len(T), 3, 3)
+    index = torch.zeros(len(T), dtype=torch.long)
+    return fit_to_edges(MeshContours(cube()), crops, cameras, T, index, quick=T, **options)
+
+
+def test_the_weighted_support_decides_and_the_plain_one_is_reported(monkeypatch):
+    """By these weights the start is better than all fits of it."""
+    start = starts(6.0)
+    fit = fitted(monkeypatch, start, lambda _, __, plain: 1.0 - plain)
+    assert fit.transform.equal(start)
+    assert float(fit.edge_support) == float(fit.start_support)
+    fit = fitted(monkeypatch, start, lambda _, __, plain: plain)
+    assert not fit.transform.equal(start)
+    assert float(fit.edge_support) > float(fit.start_support)
+
+
+def test_the_starts_with_the_most_weighted_support_go_on(monkeypatch):
+    """By these weights the last ones."""
+    begun: list[Tensor] = []
+    went_on: list[Tensor] = []
+    refined: list[Tensor] = []
+
+    def weigh(problem: ContourProblem, state: ContourState, plain: Tensor) -> Tensor:
+        if problem.density == COARSE_DENSITY and not begun:
+            begun.append(state.T)
+            return torch.arange(len(plain), dtype=torch.float64)
+        return 1.0 - plain
+
+    two_best = contour_fit._two_best
+
+    def watched(half: Any, fits: ContourState, supports: Tensor, index: Tensor) -> Any:
+        went_on.append(supports)
+        plain, _ = half.supports(fits)
+        refined.append(1.0 - plain)
+        return two_best(half, fits, supports, index)
+
+    descend = ContourProblem.descend
+    first: list[Tensor] = []
+
+    def descended(problem: ContourProblem, state: ContourState, radii: Any) -> ContourState:
+        first.append(state.T)
+        return descend(problem, state, radii)
+
+    monkeypatch.setattr(ContourProblem, "descend", descended)
+    monkeypatch.setattr(contour_fit, "_two_best", watched)
+    fitted(monkeypatch, starts(6.0), weigh)
+    assert FitSettings().kept_starts == 3
+    assert first[0].equal(begun[0][[-1, -2, -3]])
+    torch.testing.assert_close(went_on[0].flatten(), refined[0])
+
+
+def test_a_start_that_is_not_finished_has_its_fit_if_that_is_better_by_weight(monkeypatch):
+    """Weights are a tenth of the plain support, which no fit reaches by weight."""
+    given = starts(2.0, 6.0)
+
+    def weigh(_: ContourProblem, state: ContourState, plain: Tensor) -> Tensor:
+        near = (state.T - CUBE_POSE).flatten(1).norm(dim=1)
+        return 0.1 * plain + torch.where(near < 1e-2, 0.01, 0.0)
+
+    fit = fitted(monkeypatch, given, weigh, finish=1)
+    moved = (fit.transform != given).flatten(1).any(dim=1)
+    assert moved.tolist() == [True, True]
+
+
+class Half:
+    """A problem where poses shift by their x, and stay where they are."""
+
+    def __getitem__(self, index: Tensor) -> "Half":
+        return self
+
+    def mean_shift(self, points: Any, before: Tensor, after: Tensor) -> Tensor:
+        return (after - before)[:, 0, 3].abs()
+
+    def descend(self, state: ContourState, radii: Any) -> ContourState:
+        return state
+
+
+@pytest.mark.parametrize(
+    ("x", "support", "expected"),
+    [
+        ([0.0, 0.2, 0.6, 3.0], [0.9, 0.8, 0.5, 0.6], [0.0, 3.0]),
+        ([0.0, 0.2, 0.6, 3.0], [0.9, 0.8, 0.7, 0.6], [0.0, 0.6]),
+        ([0.0, 0.2, 0.4, 0.45], [0.9, 0.8, 0.7, 0.6], [0.0]),
+        ([3.0, 0.2, 0.0, 0.45], [0.7, 0.8, 0.9, 0.6], [0.0, 3.0]),
+    ],
+)
+def test_the_next_best_fit_is_another_pose(x, support, expected):
+    T = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)
+    T[:, 0, 3] = torch.tensor(x, dtype=torch.float64)
+    points: Any = torch.zeros(4, 1)
+    fits = ContourState(T, T, points)
+    half: Any = Half()
+    index = torch.zeros(1, dtype=torch.long)
+    supports = torch.tensor([support], dtype=torch.float64)
+    source, chosen = contour_fit._two_best(half, fits, supports, index)
+    assert chosen[:, 0, 3].tolist() == pytest.approx(expected)
+    assert source.tolist() == [0] * len(expected)

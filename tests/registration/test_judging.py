@@ -1,0 +1,207 @@
+"""Judgement of fitted poses in closed cases: order, rivals, limits, doubts."""
+
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence, EvidenceWeights
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.matching import Ranking
+from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.registration.judging import better_of, judged
+from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.result import FailedRegistration, Registration
+from tests._support.scenes import CAMERA, SIZE
+
+HULL = 0.3 * torch.tensor(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=torch.float64
+)
+BOX = torch.tensor([90.0, 60.0, 150.0, 120.0])
+HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
+
+
+def turned(*degrees: float) -> Tensor:
+    """(N, 3, 3) rotations of views about the vertical axis."""
+    return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
+
+
+def poses_at(*degrees: float, x: float = 0.0) -> Poses:
+    R = turned(*degrees)
+    H = len(R)
+    T = transform(R, torch.tensor([x, 0.0, 5.0]).double().expand(H, 3))
+    rank = torch.zeros(H, dtype=torch.float64)
+    return Poses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
+
+
+def evidence_of(**columns: list[float]) -> Evidence:
+    H = len(next(iter(columns.values())))
+    values = {field.name: torch.zeros(H, dtype=torch.float64) for field in fields(Evidence)}
+    given = {name: torch.tensor(column, dtype=torch.float64) for name, column in columns.items()}
+    return Evidence(**{**values, **given})
+
+
+class Limits:
+    """Limits that remember what they are asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Poses, bool]] = []
+
+    def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
+        self.asked.append((best, better_outside))
+        return "better outside" if better_outside else None
+
+
+def judgement(
+    poses: Poses,
+    evidence: Evidence,
+    *,
+    distinct: list[bool] | None = None,
+    outside: list[bool] | None = None,
+    pipeline: Pipeline | None = None,
+    scores: list[float] | None = None,
+    **changes: Any,
+) -> Registration:
+    H = len(poses)
+    target: Any = SimpleNamespace(
+        score_weights=lambda **_: EvidenceWeights(),
+        pipeline=pipeline or Pipeline(),
+        bank=SimpleNamespace(views=SimpleNamespace(rotations=turned(0.0, 90.0, 180.0).float())),
+        describer=SimpleNamespace(hull=HULL, centre=torch.zeros(3).double()),
+        mesh_warnings=("of the mesh",),
+        mesh_notes=("note",),
+    )
+    item = SimpleNamespace(
+        box=BOX,
+        size=SIZE,
+        camera_matrix=CAMERA,
+        focal_deviation=0.0,
+        prior=None,
+        warnings=("of the photograph",),
+        camera=None,
+    )
+    ranking = Ranking(torch.tensor([scores or [1.0, 0.5, 0.25]]), torch.arange(3)[None], {})
+    known = {"limits": None, "symmetries": None}
+    known |= {name: changes.pop(name) for name in list(changes) if name in known}
+    vars(item).update(changes)
+    work: Any = SimpleNamespace(exact=True, item=item, ranking=ranking, **known)
+    return judged(
+        target,
+        work,
+        poses,
+        evidence,
+        torch.tensor(distinct or [True] * H),
+        torch.tensor(outside or [False] * H),
+    )
+
+
+def order_of(result: Registration) -> list[int]:
+    return [hypothesis.view for hypothesis in result.hypotheses]
+
+
+def test_poses_that_merged_come_last_and_are_no_rivals():
+    evidence = evidence_of(similarity=[0.6, 0.8, 0.9, 0.85])
+    poses = poses_at(0.0, 90.0, 180.0, 270.0)
+    result = judgement(poses, evidence, distinct=[True, True, False, False])
+    assert order_of(result) == [1, 0, 2, 3]
+    assert result.confidence_features["margin"] == pytest.approx(2.0)
+    assert result.confidence_features["similarity"] == 0.8
+    assert result.probabilities[2:] == (0.0, 0.0)
+    assert result.probabilities[0] > result.probabilities[1] > 0.0
+
+
+def test_only_so_many_are_reported_and_the_others_keep_their_shares():
+    evidence = evidence_of(similarity=[0.6, 0.6, 0.6])
+    every = judgement(poses_at(0.0, 90.0, 180.0), evidence)
+    one = judgement(
+        poses_at(0.0, 90.0, 180.0), evidence, pipeline=replace(Pipeline(), hypotheses=1)
+    )
+    assert len(one.probabilities) == len(one.hypotheses) == 1
+    assert one.probabilities == every.probabilities[:1]
+    assert one.confidence <= 1.0 / 3.0 + 1e-9
+
+
+def test_poses_outside_the_limits_are_not_reported_and_contradict_them_if_they_are_better():
+    poses = poses_at(0.0, 90.0, 180.0)
+    for better, expected in ((0.09, None), (0.11, "better outside"), (-0.2, None)):
+        limits = Limits()
+        evidence = evidence_of(similarity=[0.7, 0.6, 0.7 + better], rank=[0.0, 0.0, -3.0])
+        result = judgement(poses, evidence, outside=[False, False, True], limits=limits)
+        assert order_of(result) == [0, 1]
+        assert result.prior_contradiction == expected
+        ((best, _),) = limits.asked
+        assert best.view.tolist() == [0]
+
+
+@pytest.mark.parametrize(("outside", "margin"), [(0.9, 0.0), (0.5, 1.0)])
+def test_without_a_rival_inside_the_one_outside_is_compared(outside, margin):
+    evidence = evidence_of(similarity=[0.6, outside])
+    poses = poses_at(0.0, 90.0)
+    result = judgement(poses, evidence, outside=[False, True], limits=Limits())
+    assert result.confidence_features["margin"] == pytest.approx(margin)
+    alone = judgement(poses[:1], evidence[:1])
+    assert alone.confidence_features["margin"] is None
+    assert alone.confidence <= 0.5
+
+
+def test_views_up_to_symmetries_are_near():
+    """Of views at 0, 90 and 180 degrees."""
+    evidence = evidence_of(similarity=[0.6, 0.5])
+    poses = poses_at(0.0, 90.0)
+    plain = judgement(poses, evidence).confidence_features["concentration"]
+    assert plain == pytest.approx(1.0 / (1.0 + 0.5**4 + 0.25**4))
+    two = torch.stack([torch.eye(4), HALF_TURN])
+    both = judgement(poses, evidence, symmetries=two).confidence_features["concentration"]
+    assert both == pytest.approx((1.0 + 0.25**4) / (1.0 + 0.5**4 + 0.25**4))
+
+
+def test_doubts_are_those_of_the_best_pose():
+    poses = poses_at(0.0, 90.0)
+    known = torch.diag(torch.tensor([0.01, 0.04, 0.09, 1.0, 1.0, 1.0], dtype=torch.float64))
+    poses.covariance[1] = known
+    evidence = evidence_of(similarity=[0.5, 0.6])
+    box = torch.tensor([-0.5, 60.0, 150.0, 120.0])
+    features = judgement(poses, evidence, focal_deviation=0.25, box=box).confidence_features
+    assert features["undetermined"] == pytest.approx(0.6)
+    assert features["focal"] == 0.25
+    assert features["border"] == 1
+    assert features["outside"] == 0.0
+
+
+def test_a_cut_object_is_doubtful_and_warned_of():
+    """Half of it lies left of the photograph, whose border is 120 px from the optical axis."""
+    x = -5.0 * 120.0 / 260.0
+    result = judgement(poses_at(0.0, 90.0, x=x), evidence_of(similarity=[0.6, 0.5]))
+    assert result.confidence_features["outside"] == pytest.approx(0.5, abs=0.05)
+    assert result.warnings[:2] == ("of the photograph", "of the mesh")
+    assert "outside the photograph" in result.warnings[2]
+    assert result.notes == ("note",)
+
+
+def test_pipelines_without_calibration_have_no_probabilities():
+    evidence = evidence_of(similarity=[0.6, 0.5])
+    result = judgement(poses_at(0.0, 90.0), evidence, pipeline=PRESETS["classical"])
+    assert result.probabilities == ()
+
+
+def test_the_better_of_two_meshes_is_the_more_confident_one():
+    poses = poses_at(0.0, 90.0)
+    doubtful = judgement(poses, evidence_of(similarity=[0.60, 0.60]))
+    certain = judgement(poses, evidence_of(similarity=[0.58, 0.1]))
+    assert certain.score < doubtful.score
+    assert certain.confidence > doubtful.confidence
+    assert better_of(doubtful, certain, 2).model == 2
+    assert better_of(certain, doubtful, 2) is certain
+    assert better_of(certain, certain, 2) is certain, "the first of equal ones"
+    one = replace(certain, probabilities=())
+    rival = replace(doubtful, probabilities=())
+    assert better_of(one, rival, 1).model == 1
+    assert better_of(rival, one, 1) is rival
+    failed = FailedRegistration(LostObjectError("lost"))
+    assert better_of(failed, certain, 3).model == 3
+    assert better_of(certain, failed, 3) is certain
+    assert better_of(failed, failed, 3) is failed

@@ -1,0 +1,235 @@
+"""Parts of a rig in closed cases: votes, places, units, and photographs that do not show the
+pose."""
+
+import math
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evidence import Evidence
+from curvireg_torch.fitting.contour_problem import ContourProblem
+from curvireg_torch.geometry import rotation_from_axis_angle, transform
+from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.registration import rig as rig_module
+from curvireg_torch.registration.rig import ELSEWHERE, Rig, RigPhotograph, RigProblem
+
+LOST_CONFIDENCE = Pipeline().fit.lost_confidence
+CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
+RADIUS = 2.0
+ORIGIN = torch.eye(4, dtype=torch.float64)
+
+
+def turned(*degrees: float, shift: float = 0.0) -> Tensor:
+    """(N, 4, 4) world poses about the z axis through the object's centre."""
+    angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    R = rotation_from_axis_angle(angles[:, None] * torch.tensor([0.0, 0.0, 1.0]).double())
+    moved = torch.tensor([shift, 0.0, 0.0]).double() + CENTRE
+    return transform(R, moved - (R @ CENTRE))
+
+
+def rig_of(eyes: Tensor, **attributes: Any) -> Rig:
+    """A rig of cameras at ``eyes`` (V, 3), relative to the object's centre."""
+    rig = object.__new__(Rig)
+    rig.eyes = eyes + CENTRE
+    rig.describer = SimpleNamespace(centre=CENTRE, radius=RADIUS, hull=None)
+    rig.target = SimpleNamespace(pipeline=Pipeline())
+    rig.symmetries = torch.eye(3).double()[None]
+    for name, value in attributes.items():
+        setattr(rig, name, value)
+    return rig
+
+
+def around(*degrees: float, distance: float = 10.0) -> Tensor:
+    angles = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    return distance * torch.stack([angles.cos(), angles.sin(), 0.0 * angles], dim=1)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "expected"),
+    [
+        ([0.0, 90.0, 180.0], [1.0, 1.0, 1.0]),
+        ([0.0, 30.0, 60.0], [1.0, 1.0, 1.0]),
+        ([0.0, 15.0, 180.0], [1.0 / 1.5, 1.0 / 1.5, 1.0]),
+        ([0.0, 0.0, 0.0], [1.0 / 3.0] * 3),
+        ([0.0, 15.0, -15.0], [0.5, 1.0 / 1.5, 1.0 / 1.5]),
+    ],
+)
+def test_photographs_from_nearly_the_same_side_share_one_vote(degrees, expected):
+    weights = rig_of(around(*degrees)).weights(ORIGIN)
+    assert weights.tolist() == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_photograph_knows_the_place_across_its_ray_better_than_along_it():
+    place = CENTRE[None]
+    precision = rig_of(around(0.0)).precision(place, torch.zeros(1, dtype=torch.long))[0]
+    along = rig_module.DEPTH_ERROR * 10.0
+    across = math.hypot(rig_module.CENTRE_ERROR * RADIUS, rig_module.RIG_ERROR * 10.0)
+    expected = torch.diag(torch.tensor([along, across, across], dtype=torch.float64) ** -2.0)
+    torch.testing.assert_close(precision, expected)
+    assert along > across
+
+
+def test_candidates_that_are_nearly_equal_count_once():
+    """Within 15 degrees and half a radius of a better one, up to symmetries."""
+    T = torch.cat(
+        [
+            turned(0.0),
+            turned(14.0),
+            turned(16.0),
+            turned(0.0, shift=0.45 * RADIUS),
+            turned(0.0, shift=0.55 * RADIUS),
+            turned(180.0),
+        ]
+    )
+    score = torch.tensor([6.0, 5.0, 4.0, 3.0, 2.0, 1.0], dtype=torch.float64)
+    rig = rig_of(around(0.0))
+    assert rig.distinct(T, score).tolist() == [0, 2, 4, 5]
+    assert rig.distinct(T, -score).tolist() == [5, 4, 2, 0]
+    half_turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]).double())
+    rig.symmetries = torch.stack([torch.eye(3).double(), half_turn])
+    assert rig.distinct(T, score).tolist() == [0, 2, 4]
+
+
+def photograph(index: int, sees: bool) -> Any:
+    return SimpleNamespace(index=index, sees=lambda _, T: torch.tensor([sees] * len(T)))
+
+
+def evidence_of(*similarity: float) -> Evidence:
+    nothing = torch.zeros(len(similarity), 1, dtype=torch.float64)
+    values = Evidence(*[nothing] * len(fields(Evidence)))
+    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64)[:, None])
+
+
+@pytest.mark.parametrize(
+    ("sees", "similarity", "lost"),
+    [
+        ([True, True, True], [0.8, 0.7, 0.9], []),
+        ([True, False, True], [0.8, 0.9, 0.8], [5]),
+        ([True, True, True], [0.8, 0.8 * LOST_CONFIDENCE - 0.001, 0.8], [5]),
+        ([True, True, True], [0.8, 0.8 * LOST_CONFIDENCE + 0.001, 0.8], []),
+        ([False, False, True], [0.1, 0.9, 0.01], [3, 5]),
+        ([False, False, False], [0.8, 0.8, 0.8], []),
+    ],
+)
+def test_photographs_that_do_not_show_the_pose_are_named(monkeypatch, sees, similarity, lost):
+    """Their confidence is compared with the best of those that may show it."""
+    monkeypatch.setattr(rig_module, "refinement_confidence", lambda known: known["similarity"])
+    photographs = [photograph(index, seen) for index, seen in zip((3, 5, 8), sees, strict=True)]
+    rig = rig_of(around(0.0, 90.0, 180.0), photographs=photographs)
+    answer: Any = SimpleNamespace(evidence=evidence_of(*similarity), T=ORIGIN[None])
+    reasons = rig.lost(answer)
+    assert sorted(reasons) == lost
+    for index, reason in reasons.items():
+        assert (reason == ELSEWHERE) == (not sees[[3, 5, 8].index(index)])
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e3, 1e-3, 25.0, 0.04])
+def test_cameras_in_another_unit_are_refused(factor):
+    """The rays of three cameras meet ``factor`` times as far away as the object's size says."""
+    eyes = factor * around(0.0, 40.0, 90.0)
+    rig = rig_of(eyes, photographs=[photograph(4, True)])
+    places = CENTRE + eyes * (1.0 - 1.0 / factor)
+    vars(rig)["places"] = places, None
+    if factor in (1e3, 1e-3):
+        with pytest.raises(InvalidInputError, match="unit") as refused:
+            rig.check_unit()
+        assert f"the object is {10.0:.3g} away" in str(refused.value)
+        assert f"{10.0 * factor:.3g}" in str(refused.value)
+    else:
+        rig.check_unit()
+
+
+def test_rays_that_are_nearly_parallel_tell_no_unit():
+    eyes = 1e3 * around(0.0, 2.0)
+    rig = rig_of(eyes, photographs=[photograph(0, True)])
+    vars(rig)["places"] = CENTRE + eyes * (1.0 - 1e-3), None
+    rig.check_unit()
+
+
+def test_a_photograph_lowers_a_pose_by_five_points_at_most():
+    low = -torch.inf
+    scores = torch.tensor([[3.0, 1.0, -9.0, low], [low, low, low, low]]).double()
+    assert rig_module._bounded(scores).tolist() == [[3.0, 1.0, -2.0, -2.0], [0.0] * 4]
+
+
+def test_unknown_covariances_have_nearly_no_precision():
+    known = torch.diag(torch.arange(1.0, 7.0).double())
+    both = torch.stack([known, torch.full((6, 6), torch.nan).double()])
+    precision = rig_module._inverse(both)
+    torch.testing.assert_close(precision[0], torch.linalg.inv(known))
+    assert 0.0 < float(precision[1].diagonal().max()) < 1e-9
+
+
+def test_a_pose_is_seen_where_its_box_overlaps_that_of_the_photograph(monkeypatch):
+    boxes = torch.tensor(
+        [[0.0, 0, 10, 10], [5, 0, 15, 10], [6, 0, 16, 10], [0, 0, 10, 10]]
+    ).double()
+    in_front = torch.tensor([True, True, True, False])
+    monkeypatch.setattr(rig_module, "boxes_at", lambda *_: (boxes, in_front))
+    one: Any = SimpleNamespace(camera=ORIGIN, K=None, size=(20, 20), box=boxes[0])
+    hull: Any = None
+    # the second overlaps by a third, the third by a quarter
+    assert RigPhotograph.sees(one, hull, ORIGIN.repeat(4, 1, 1)).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def problem(**changes: Any) -> RigProblem:
+    """Two world poses in two photographs each."""
+    nothing: Any = None
+    eye = torch.eye(3).double()
+    given: dict[str, Any] = {
+        "contours": SimpleNamespace(centre=CENTRE),
+        "edges": nothing,
+        "image_index": torch.tensor([0, 1, 0, 1]),
+        "K": eye.repeat(4, 1, 1),
+        "size": 256,
+        "axes": eye.repeat(4, 1, 1),
+        "group": torch.tensor([0, 0, 1, 1]),
+        "alone": ORIGIN.repeat(4, 1, 1),
+        "root": torch.eye(6).double().repeat(4, 1, 1),
+    }
+    return RigProblem(**(given | changes))
+
+
+def test_photographs_of_a_pose_take_the_shortest_step_of_all(monkeypatch):
+    fractions = torch.tensor([0.9, 0.4, 0.7, 1.0]).double()
+    monkeypatch.setattr(ContourProblem, "step_fraction", lambda *_: fractions)
+    found = problem().step_fraction(torch.zeros(4, 6), ORIGIN.repeat(4, 1, 1))
+    assert found.tolist() == pytest.approx([0.4, 0.4, 0.7, 0.7])
+
+
+def test_sums_are_over_the_photographs_of_each_pose():
+    assert problem().summed(torch.tensor([1.0, 2.0, 4.0, 8.0])).tolist() == [3.0, 12.0]
+
+
+def test_gaps_are_towards_the_poses_that_photographs_alone_found():
+    """10 degrees about z, and half a unit to the right: in standard deviations of half of each."""
+    alone = torch.cat([turned(10.0), turned(0.0, shift=0.5), turned(0.0), turned(0.0)])
+    found = problem(alone=alone, root=2.0 * torch.eye(6).double().repeat(4, 1, 1)).gaps(
+        turned(0.0).repeat(4, 1, 1)
+    )[..., 0]
+    expected = torch.zeros(4, 6, dtype=torch.float64)
+    expected[0, 2] = 2.0 * math.radians(10.0)
+    expected[1, 3] = 1.0
+    torch.testing.assert_close(found, expected)
+
+
+def test_a_solution_is_common_to_the_photographs_along_their_own_axes():
+    """Each photograph knows one direction of the world well: together they know both."""
+    quarter = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]).double())
+    axes = torch.stack([torch.eye(3).double(), quarter] * 2)
+    wanted = torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]).double()
+    P = rig_module.in_frames(axes)
+    A = torch.stack([torch.diag(torch.tensor([5.0, 1.0, 1.0, 5.0, 1.0, 1.0]))] * 4).double()
+    own = (P @ wanted[:, None])[..., 0]
+    steps = problem(axes=axes).solution(A, (A @ own[..., None]))
+    torch.testing.assert_close(steps, own, rtol=0.05, atol=0.02)

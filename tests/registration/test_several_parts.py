@@ -1,0 +1,197 @@
+"""The joint result of a rig in closed cases: probabilities, contributions, doubts."""
+
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence
+from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.registration import Registration, several
+from curvireg_torch.registration.confidence import hypothesis_probabilities
+from curvireg_torch.registration.rig import Answer
+
+ANY_RIGHT = 0.8
+EYE = torch.eye(4, dtype=torch.float64)
+
+
+def photograph(index: int, **changes: Any) -> Any:
+    """A photograph that was registered alone, with a ``confidence`` and an ``angle`` from the joint
+    pose."""
+    features = {"concentration": changes.pop("concentration", 0.5)}
+    result = {
+        "confidence": 0.5,
+        "probabilities": (0.5,),
+        "detection": None,
+        "warnings": (),
+        "notes": (),
+        "ranking": None,
+        "confidence_features": features,
+    }
+    angle = changes.pop("angle", 0.0)
+    result |= changes
+    return SimpleNamespace(
+        index=index,
+        angle=angle,
+        result=SimpleNamespace(**result),
+        poses=torch.full((2, 4, 4), angle),
+        camera=EYE,
+        K=torch.eye(3).double(),
+        size=(100, 200),
+        box=torch.tensor([10.0, 10.0, 50.0, 50.0]),
+    )
+
+
+class FakeRig:
+    """A rig whose photographs have the ``scores`` (V, M) of M poses; some are ``missing`` the best
+    one."""
+
+    scores: dict[int, list[float]]
+    missing: dict[int, str]
+    vote: dict[int, float]
+    exact = True
+    describer = SimpleNamespace(hull=None)
+    symmetries = torch.eye(3).double()[None]
+
+    def __init__(self, _: Any, photographs: list[Any]) -> None:
+        self.photographs = photographs
+
+    @staticmethod
+    def of(_: Any, found: dict[int, Any]) -> "FakeRig":
+        usable = [one for one in found.values() if not isinstance(one, LostObjectError)]
+        return FakeRig(None, usable)
+
+    def answer(self) -> Answer:
+        rows = torch.tensor([self.scores[p.index] for p in self.photographs]).double()
+        nothing = torch.zeros_like(rows)
+        values = Evidence(*[nothing] * len(fields(Evidence)))
+        M = rows.shape[1]
+        C = torch.full((M, 6, 6), torch.nan).double()
+        return Answer(EYE.repeat(M, 1, 1), replace(values, similarity=0.1 * rows), rows, C)
+
+    def lost(self, _: Answer) -> dict[int, str]:
+        there = [p.index for p in self.photographs]
+        return {index: why for index, why in self.missing.items() if index in there}
+
+    def weights(self, _: Tensor) -> Tensor:
+        return torch.tensor([self.vote.get(p.index, 1.0) for p in self.photographs]).double()
+
+    def angles(self, poses: Tensor, _: Tensor) -> Tensor:
+        return poses[:, 0, 0]
+
+    def hypothesis(self, _: Answer, m: int, mean: Evidence) -> Any:
+        return SimpleNamespace(number=m, similarity=float(mean.similarity[m]))
+
+
+def joint(
+    monkeypatch: pytest.MonkeyPatch,
+    found: dict[int, Any],
+    scores: dict[int, list[float]],
+    *,
+    missing: dict[int, str] | None = None,
+    vote: dict[int, float] | None = None,
+    count: int = 5,
+    pipeline: Pipeline | None = None,
+) -> Registration:
+    FakeRig.scores = scores
+    FakeRig.missing = missing or {}
+    FakeRig.vote = vote or {}
+    monkeypatch.setattr(several, "Rig", FakeRig)
+    monkeypatch.setattr(several, "probability_of_any", lambda *_, **__: ANY_RIGHT)
+    monkeypatch.setattr(several, "outside_fraction", lambda _, __, ___, size: size[0] / 1000.0)
+    target: Any = SimpleNamespace(pipeline=pipeline or Pipeline())
+    return several._registration(target, found, EYE.repeat(len(found), 1, 1), count)
+
+
+def two(**changes: Any) -> dict[int, Any]:
+    return {0: photograph(0, **changes), 1: photograph(1)}
+
+
+SCORES = {0: [9.0, 7.0, 4.0], 1: [8.0, 7.0, 6.0]}
+TOTAL = torch.tensor([17.0, 14.0, 10.0]).double()
+TOGETHER = hypothesis_probabilities(ANY_RIGHT, TOTAL, exact=True)
+
+
+def test_probabilities_are_those_of_the_sums_of_scores(monkeypatch):
+    result = joint(monkeypatch, two(), SCORES)
+    assert result.probabilities == pytest.approx(TOGETHER)
+    assert [view.contribution for view in result.views] == [2.0, 1.0]
+    assert result.hypotheses[0].similarity == pytest.approx(0.85)
+    few = joint(monkeypatch, two(), SCORES, count=2)
+    assert few.probabilities == pytest.approx(TOGETHER[:2])
+    assert len(few.hypotheses) == 2
+    assert joint(monkeypatch, two(), SCORES, pipeline=PRESETS["classical"]).probabilities == (0.5,)
+
+
+def test_votes_weight_scores_and_contributions(monkeypatch):
+    result = joint(monkeypatch, two(), SCORES, vote={0: 0.5, 1: 0.25})
+    total = torch.tensor([6.5, 5.25, 3.5]).double()
+    expected = hypothesis_probabilities(ANY_RIGHT, total, exact=True)
+    assert result.probabilities == pytest.approx(expected)
+    assert [view.contribution for view in result.views] == [1.0, 0.25]
+    assert result.hypotheses[0].similarity == pytest.approx((0.5 * 0.9 + 0.25 * 0.8) / 0.75)
+    assert result.confidence_features["margin"] == pytest.approx(1.25)
+
+
+def test_one_pose_of_all_hypotheses_has_the_largest_margin(monkeypatch):
+    result = joint(monkeypatch, two(), {0: [9.0], 1: [8.0]})
+    assert result.confidence_features["margin"] == 5.0
+    assert [view.contribution for view in result.views] == [5.0, 5.0]
+    one = joint(monkeypatch, {0: photograph(0)}, {0: [9.0]})
+    assert one.confidence_features["margin"] is None
+    assert one.probabilities == (0.5,), "that of the photograph alone"
+
+
+def test_an_object_that_was_searched_for_is_as_likely_as_its_clearest_place(monkeypatch):
+    found = {k: photograph(k, detection=SimpleNamespace(score=s)) for k, s in ((0, 0.5), (1, 0.7))}
+    result = joint(monkeypatch, found, SCORES)
+    assert result.probabilities == pytest.approx([0.7 * p for p in TOGETHER])
+
+
+@pytest.mark.parametrize(
+    ("confidence", "angle", "factor"),
+    [(0.9, 90.0, 1.0 / 9.0), (0.9, 20.0, 1.0), (0.3, 90.0, 1.0), (0.5, 31.0, 1.0)],
+)
+def test_photographs_that_are_confident_of_another_pose_lower_the_odds(
+    monkeypatch, confidence, angle, factor
+):
+    other = photograph(2, confidence=confidence, angle=angle)
+    scores = SCORES | {2: [1.0, 5.0, 1.0]}
+    result = joint(monkeypatch, two() | {2: other}, scores, missing={2: "elsewhere"})
+    odds = factor * TOGETHER[0] / (1.0 - TOGETHER[0])
+    assert result.probabilities[0] == pytest.approx(odds / (1.0 + odds))
+    ratio = result.probabilities[0] / TOGETHER[0]
+    assert result.probabilities[1:] == pytest.approx([ratio * p for p in TOGETHER[1:]])
+    assert [view.failure for view in result.views] == [None, None, "elsewhere"]
+    assert [view.contribution for view in result.views] == [2.0, 1.0, 0.0]
+
+
+def test_failed_photographs_say_why_and_do_not_count(monkeypatch):
+    found = two() | {2: LostObjectError("dark")}
+    result = joint(monkeypatch, found, SCORES)
+    assert [view.failure for view in result.views] == [None, None, "dark"]
+    assert result.probabilities == pytest.approx(TOGETHER)
+
+
+def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
+    """The fraction outside is a thousandth of the height here."""
+    first = photograph(0, concentration=0.2, warnings=("b", "a", "own"))
+    second = photograph(1, concentration=None, warnings=("a", "b"))
+    third = photograph(2, concentration=0.6, warnings=("b", "x", "a"))
+    first.size = (100, 200)
+    second.size = (300, 200)
+    third.size = (100, 200)
+    second.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
+    found = {0: first, 1: second, 2: third}
+    scores = SCORES | {2: [1.0, 1.0, 1.0]}
+    result = joint(monkeypatch, found, scores, vote={0: 0.5, 1: 1.0, 2: 0.5})
+    features = result.confidence_features
+    assert features["concentration"] == pytest.approx(0.4), "of those that know it"
+    assert features["outside"] == pytest.approx(0.25 * 0.1 + 0.5 * 0.3 + 0.25 * 0.1)
+    assert features["border"] == pytest.approx(0.5 * 2)
+    assert features["undetermined"] == 3.0
+    assert result.warnings == ("a", "b")

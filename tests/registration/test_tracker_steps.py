@@ -1,0 +1,271 @@
+"""The tracker's steps in closed cases: predictions, keyframes, features, what is learned."""
+
+import math
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.fitting.edges import CROP_SIZE
+from curvireg_torch.fitting.regions import RegionModel
+from curvireg_torch.registration import tracker
+from curvireg_torch.registration.tracker import Tracker, boxes_at
+from tests.fitting.cube import pose
+
+K = torch.tensor([[200.0, 0, 99.5], [0, 200.0, 49.5], [0, 0, 1]], dtype=torch.float64)
+SIZE = (100, 200)
+
+
+def at(x: float = 0.0, z: float = 5.0) -> Tensor:
+    return pose([0.0, 0.0, 0.0], [x, 0.0, z])[None]
+
+
+HULL = 0.5 * torch.tensor(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=torch.float64
+)
+
+
+def test_boxes_of_meshes_outside_the_image_mean_nothing():
+    """A plate of 40 px, at pixels of its centre; and a cube that reaches behind the camera."""
+    plate = HULL * torch.tensor([1.0, 1.0, 0.0])
+    half = 20.0
+    for pixel, visible in (
+        (99.5, True),
+        (-0.5 - half + 0.1, True),
+        (-0.5 - half - 0.1, False),
+        (199.5 + half - 0.1, True),
+        (199.5 + half + 0.1, False),
+    ):
+        boxes, found = boxes_at(plate, at(x=(pixel - 99.5) / 40.0), K[None], SIZE)
+        assert found.tolist() == [visible], pixel
+        assert float(boxes[0, 0]) < float(boxes[0, 2])
+    for z, visible in ((0.6, True), (0.4, False), (-5.0, False)):
+        assert boxes_at(HULL, at(z=z), K[None], SIZE)[1].tolist() == [visible], z
+
+
+@dataclass
+class Flow:
+    """A flow measured in a crop with camera ``K``; how it was ``scaled``."""
+
+    K: Tensor
+    start: str = ""
+    ratio: float = 0.0
+    scale: list[float] = field(default_factory=list)
+
+    def moved(self, before: Tensor, after: Tensor) -> "Flow":
+        assert before.equal(self.K)
+        return replace(self, K=after)
+
+    def inlier_ratio(self, *_: Any) -> float:
+        return self.ratio
+
+    def measurements(self, *_: Any) -> "Flow":
+        return self
+
+    def scaled(self, weight: float) -> tuple[str, float]:
+        return self.start, weight
+
+
+@dataclass(frozen=True)
+class State:
+    T: Tensor
+    points: Any = None
+
+
+class Problem:
+    def state(self, T: Tensor) -> State:
+        return State(T)
+
+    def step(self, points: Any, T: Tensor, radius: float, others: Any) -> Tensor:
+        return T
+
+    def with_current_contours(self, state: State) -> State:
+        return state
+
+
+def fitted(monkeypatch: pytest.MonkeyPatch, keyframes: list[Any], last: Any) -> list[Any]:
+    """The weighted flows that a fit uses, of the keyframe that is nearest: the second."""
+    cameras = [torch.eye(3), 2.0 * torch.eye(3)]
+    frames = [SimpleNamespace(K=camera, problem=Problem()) for camera in cameras]
+    used: list[Any] = []
+
+    def track(keyframe: Any, frame: Any, *_: Any, levels: int) -> Flow:
+        return Flow(frame.K, f"{keyframe.name} {levels}")
+
+    def measurements(_: Any, __: Any, flows: list[Any], ___: float) -> list[Any]:
+        used[:] = [(weight, flow.start, float(flow.K[0, 0])) for weight, flow in flows]
+        return []
+
+    monkeypatch.setattr(tracker, "track_points", track)
+    monkeypatch.setattr(tracker, "fit_points", lambda _, T, *__: T)
+    angles = torch.tensor([9.0, 2.0, 5.0])
+    follow: Any = SimpleNamespace(
+        _last=last,
+        _keyframes=keyframes,
+        _frame=lambda *_: frames.pop(0),
+        _angles=lambda _: angles[: len(keyframes)],
+        _measurements=measurements,
+        _tracked=lambda frame, _, flows: (float(frame.K[0, 0]), len(flows)),
+        centre=torch.zeros(3),
+    )
+    image: Any = None
+    camera, flows = Tracker._fit(follow, image, K, at())
+    assert camera == 2.0, "the second frame"
+    assert flows == len(used)
+    return used
+
+
+def named(name: str) -> Any:
+    return SimpleNamespace(name=name)
+
+
+def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(monkeypatch):
+    """Both in the crop of the pose that the flow gives."""
+    keyframes = [named("a"), named("b"), named("c")]
+    last = (tracker.POINT_WEIGHT, f"last {tracker.PYRAMID_LAST}", 2.0)
+    from_keyframe = (tracker.KEYFRAME_WEIGHT, f"b {tracker.PYRAMID_KEYFRAME}", 2.0)
+    assert fitted(monkeypatch, keyframes, named("last")) == [last, from_keyframe]
+    alone = (tracker.POINT_WEIGHT, f"b {tracker.PYRAMID_LAST}", 2.0)
+    assert fitted(monkeypatch, keyframes, keyframes[1]) == [alone]
+
+
+def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
+    ends = torch.tensor(mean).double(), torch.tensor(variance).double()
+    follow: Any = SimpleNamespace(_ends=lambda *_: ends, centre=torch.zeros(3))
+    problem = SimpleNamespace(edge_support=lambda _: torch.tensor(0.4))
+    frame: Any = SimpleNamespace(problem=problem, K=K)
+    state: Any = State(at())
+    given: Any = flows
+    return dict(Tracker._tracked(follow, frame, state, given).features)
+
+
+def test_features_in_closed_form():
+    """A flat posterior has a variance of a third of the radius' square."""
+    flat = tracker.REGION_FEATURE_RADIUS**2 / 3.0
+    one, other = Flow(K, ratio=0.8), Flow(K, ratio=0.3)
+    found = features([0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.5 * flat, flat], [one, other])
+    assert found == pytest.approx(
+        {
+            "edge_support": 0.4,
+            "region": (1.0 + math.exp(-0.5) + 0.5) / 4.0,
+            "flow": 0.8,
+            "keyframe": 0.3,
+        }
+    )
+    alone = features([0.0], [2.0 * flat], [one])
+    assert (alone["region"], alone["flow"], alone["keyframe"]) == (0.0, 0.8, 0.8)
+    none = features([], [], [])
+    assert (none["region"], none["flow"], none["keyframe"]) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("confidences", "expected"), [([0.5, 0.8], 0.8), ([0.8, 0.5], 0.8), ([0.95, 0.99], 0.95)]
+)
+def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(confidences, expected):
+    guesses = dict(zip("ab", confidences, strict=True))
+    follow: Any = SimpleNamespace(
+        reliable=0.9,
+        predictions=lambda: list(guesses),
+        _fit=lambda _, __, T: SimpleNamespace(confidence=guesses[T]),
+    )
+    nothing: Any = None
+    assert Tracker.track(follow, nothing, nothing).confidence == expected
+
+
+def test_starting_again_forgets_what_was_seen(monkeypatch):
+    """Of three accepted poses the last two predict the next one."""
+    rendered = SimpleNamespace(render=lambda *_: torch.zeros(1))
+    contours: Any = SimpleNamespace(centre=torch.zeros(3).double(), radius=1.0)
+    renderer: Any = rendered
+    follow = Tracker(renderer, contours, HULL)
+    monkeypatch.setattr(follow, "_learn", lambda *_: None)
+    monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
+    poses = {x: SimpleNamespace(state=State(at(x)), frame=SimpleNamespace(K=K)) for x in (0, 1, 3)}
+    for seen in poses.values():
+        given: Any = seen
+        follow.accept(given)
+    predicted, last = follow.predictions()
+    assert float(last[0, 0, 3]) == 3.0
+    assert float(predicted[0, 0, 3]) == pytest.approx(5.0)
+    regions = follow._regions
+    monkeypatch.setattr(follow, "measure", lambda *_: poses[1])
+    nothing: Any = None
+    follow.start(nothing, nothing, nothing)
+    assert [float(T[0, 0, 3]) for T in follow.predictions()] == [1.0]
+    assert len(follow._keyframes) == 1
+    assert follow._regions is not regions
+    assert isinstance(follow._regions, RegionModel)
+
+
+@pytest.mark.parametrize(("angle", "count"), [(7.9, 1), (8.1, 2)])
+def test_frames_from_other_directions_are_kept(monkeypatch, angle, count):
+    monkeypatch.setattr(tracker, "surface_corners", lambda *_, **__: (None, None))
+    follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([50.0, angle]))
+    frame: Any = SimpleNamespace(grey=None, K=K)
+    nothing: Any = None
+    for _ in range(2):
+        Tracker._remember(follow, frame, at(), nothing)
+    assert len(follow._keyframes) == count
+    assert follow._last is not None
+
+
+def test_so_many_keyframes_are_kept(monkeypatch):
+    monkeypatch.setattr(tracker, "surface_corners", lambda *_, **__: (None, None))
+    follow: Any = SimpleNamespace(_keyframes=[], _angles=lambda _: torch.tensor([90.0]))
+    frame: Any = SimpleNamespace(grey=None, K=K)
+    nothing: Any = None
+    for x in range(40):
+        Tracker._remember(follow, frame, at(float(x)), nothing)
+    kept = [float(keyframe.T[0, 0, 3]) for keyframe in follow._keyframes]
+    assert kept == [float(x) for x in range(40 - tracker.MAX_KEYFRAMES, 40)], "the latest"
+
+
+def test_colours_are_learned_on_both_sides_of_the_outline():
+    """Lines across the left border of an object that fills the right half of the crop."""
+    depth = torch.zeros(1, 1, CROP_SIZE, CROP_SIZE)
+    depth[..., 128:] = 5.0
+    learned: list[Tensor] = []
+
+    def lines(_: Any, __: Any, offsets: Tensor) -> tuple[Tensor, Tensor]:
+        x = 128.0 - offsets.expand(3, -1)
+        return torch.stack([x, torch.full_like(x, 90.0)], dim=-1), torch.zeros(3)
+
+    def learn(_: Any, samples: Tensor, __: Tensor, inside: Tensor) -> None:
+        learned.extend([samples[:, 0], inside])
+
+    follow: Any = SimpleNamespace(_lines=lines, _regions=SimpleNamespace(learn=learn))
+    frame: Any = SimpleNamespace(bins=None)
+    state: Any = None
+    Tracker._learn(follow, frame, state, depth)
+    x, inside = learned
+    first, last = tracker.LEARNED_BAND
+    count = last - first + 1
+    assert len(x) == 3 * 2 * count
+    assert int(inside.sum()) == 3 * count
+    assert bool((inside == (x > 128)).all())
+    assert float((x - 128.0).abs().min()) == first
+    assert float((x - 128.0).abs().max()) == last
+
+
+def test_lines_along_which_colours_say_nothing_do_not_count(monkeypatch):
+    """A variance as flat as a search of 4 px has: 16 / 3, of which half a px² is the tracker's."""
+    radius = 4.0
+    flat = radius**2 / 3.0 - tracker.REGION_VARIANCE
+    mean = torch.tensor([1.0, 2.0, -1.0]).double()
+    variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
+    J = torch.ones(1, 3, 6).double()
+    monkeypatch.setattr(tracker, "_silhouette", lambda _: (torch.zeros(3, 3), torch.zeros(3, 2)))
+    monkeypatch.setattr(tracker, "project", lambda *_: (None, J))
+    follow: Any = SimpleNamespace(_ends=lambda *_: (mean, variance), centre=torch.zeros(3))
+    frame: Any = SimpleNamespace(K=K)
+    state: Any = State(at())
+    flows: Any = [(0.3, Flow(K, "last")), (0.5, Flow(K, "keyframe"))]
+    colours, *points = Tracker._measurements(follow, frame, state, flows, radius)
+    information = 1.0 / tracker.REGION_VARIANCE - 3.0 / radius**2
+    expected = [tracker.REGION_WEIGHT * information, 0.0, 0.0]
+    assert colours.weight.flatten().tolist() == pytest.approx(expected)
+    assert colours.distance.flatten().tolist() == mean.tolist()
+    assert points == [("last", 0.3), ("keyframe", 0.5)]

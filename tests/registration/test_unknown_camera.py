@@ -1,0 +1,251 @@
+"""Cameras that are tried and focal lengths that are fitted, in closed cases."""
+
+import math
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.evidence import Evidence, EvidenceWeights
+from curvireg_torch.fitting.focal_length import (
+    USUAL_FOCAL,
+    FocalInformation,
+    scaled_cameras,
+)
+from curvireg_torch.fitting.least_squares import apply_twist
+from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.geometry.cameras import point_in_cameras
+from curvireg_torch.pipeline import Pipeline
+from curvireg_torch.registration import focal, unknown_camera
+from curvireg_torch.registration.inputs import ImageItem
+from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.work import Work
+from tests._support.scenes import CAMERA, SIZE
+
+NOTHING: Any = None
+CENTRE = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
+BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
+
+
+def poses_at(count: int, *, K: Tensor = CAMERA, rank: list[float] | None = None) -> Poses:
+    """Of the views 0, 1, ..., turned about the vertical axis."""
+    R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
+    T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
+    ranks = torch.tensor(rank or [0.0] * count, dtype=torch.float64)
+    return Poses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
+
+
+def evidence_of(*similarity: float) -> Evidence:
+    nothing = torch.zeros(len(similarity), dtype=torch.float64)
+    values = Evidence(*[nothing] * len(fields(Evidence)))
+    return replace(values, similarity=torch.tensor(similarity, dtype=torch.float64))
+
+
+def test_cameras_that_are_tried_have_all_fields_of_view():
+    cameras = focal.possible_cameras((480, 640))
+    fields_of_view = [2.0 * math.degrees(math.atan(320.0 / float(K[0, 0]))) for K in cameras]
+    assert fields_of_view == pytest.approx(focal.FIELDS_OF_VIEW)
+    assert list(focal.FIELDS_OF_VIEW) == sorted(set(focal.FIELDS_OF_VIEW))
+    assert fields_of_view[0] < 15.0
+    assert fields_of_view[-1] > 80.0
+    assert float(focal.usual_camera((480, 640))[0, 0]) == pytest.approx(USUAL_FOCAL * 640)
+
+
+def test_the_angle_to_the_centre_of_the_box():
+    K = CAMERA.clone()
+    box = torch.tensor([119.5 + 100, 89.5 - 20, 119.5 + 160, 89.5 + 20])
+    item = ImageItem(torch.zeros(3, *SIZE), box, K)
+    assert focal.off_axis_angle(item) == pytest.approx(math.degrees(math.atan(130.0 / 260.0)))
+
+
+def test_starts_are_the_best_view_of_each_camera_and_the_best_views(monkeypatch):
+    """Of three cameras and four views; the quick fits of the second camera reach most."""
+    support = torch.tensor(
+        [[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]]
+    ).double()
+    given = [poses_at(4, K=(1.0 + k) * CAMERA, rank=[0.0, -1.0, -2.0, -3.0]) for k in range(3)]
+    monkeypatch.setattr(
+        focal, "with_quick_fit", lambda _, __, poses: (poses, support.flatten().clone())
+    )
+    ranked = support * 20.0 - torch.arange(4)
+    chosen = focal.starts_of_fields(NOTHING, NOTHING, given, 2, screening_weight=20.0)
+    camera = (chosen.cameras[:, 0, 0] / CAMERA[0, 0] - 1.0).round().int().tolist()
+    found = list(zip(camera, chosen.view.tolist(), strict=True))
+    # the best view of each camera, and the third view with its best camera, the second best of all
+    expected = [(1, 0), (1, 2), (0, 1), (2, 3)]
+    assert found == sorted(expected, key=lambda place: -float(ranked[place]))
+    every = focal.starts_of_fields(NOTHING, NOTHING, given, 4, screening_weight=20.0)
+    assert len(every) == 4
+    assert every.view.sort().values.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
+def test_unknown_focal_lengths_are_fitted_at_half_size_first(monkeypatch, source, factors):
+    poses = poses_at(1)
+    fitted: list[int] = []
+
+    def problem(_: Any, __: Any, K: Tensor, ___: Tensor, *, factor: int = 1) -> Any:
+        return SimpleNamespace(factor=factor, K=K, edge_support=lambda _: torch.ones(1))
+
+    def fit(problem: Any, T: Tensor, *_: Any) -> Any:
+        fitted.append(problem.factor)
+        zoom = torch.tensor([0.1], dtype=torch.float64)
+        return SimpleNamespace(problem=problem, state=SimpleNamespace(T=T), log_zoom=zoom)
+
+    def measured(_: Any, __: Any, support: Tensor, ___: Tensor) -> Any:
+        return replace(poses.fit, edge_support=support.double())
+
+    monkeypatch.setattr(focal.ContourProblem, "of", problem)
+    monkeypatch.setattr(focal, "fit_focal_length", fit)
+    monkeypatch.setattr(focal, "measured_fit", measured)
+    describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
+    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
+    item = replace(item, camera_source=source, focal_deviation=0.1)
+    found = focal.with_focal_length(describer, NOTHING, poses, item)
+    assert fitted == factors
+    zoom = float(found.cameras[0, 0, 0] / CAMERA[0, 0])
+    assert zoom == pytest.approx(math.exp(0.1 * len(factors)))
+    assert float(found.edge_support) == 1.0
+
+
+def test_the_covariance_is_that_of_the_origin(monkeypatch):
+    """With the motion of the centre and the rotation about it, of an origin beside the centre."""
+    pose = replace(poses_at(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
+    motion = torch.tensor([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]], dtype=torch.float64)
+    none = torch.ones(1, dtype=torch.float64)
+    information = FocalInformation(amount=none, scale=0.04 * none)
+    problem = SimpleNamespace(state=lambda _: None)
+    monkeypatch.setattr(focal.ContourProblem, "of", lambda *_: problem)
+    monkeypatch.setattr(focal, "focal_information", lambda *_: (information, motion))
+    describer: Any = SimpleNamespace(contours=None, centre=CENTRE)
+    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
+    item = replace(item, focal_deviation=0.2)
+    covariance, deviation = focal.focal_covariance(describer, NOTHING, pose, item)
+    measured = focal.REPORTED_VARIANCE * 0.04
+    variance = 1.0 / (1.0 / measured + 1.0 / 0.2**2)
+    assert deviation == pytest.approx(math.sqrt(variance))
+    step = 1e-6
+    # a twist turns about the centre, and moves it
+    moved = apply_twist(pose.T, step * motion, CENTRE)
+    shift = point_in_cameras(moved, CENTRE) - point_in_cameras(pose.T, CENTRE)
+    torch.testing.assert_close(shift / step, motion[:, 3:], atol=1e-6, rtol=1e-6)
+    origin = (moved - pose.T)[:, :3, 3] / step
+    expected = torch.cat([motion[:, :3], origin], dim=1)[0]
+    torch.testing.assert_close(
+        covariance[0], variance * expected[:, None] * expected, atol=1e-6, rtol=1e-4
+    )
+
+
+def refitted(
+    monkeypatch: pytest.MonkeyPatch,
+    evidence: Evidence,
+    new: dict[int, float],
+    *,
+    starts: Any,
+    outside: list[bool] | None = None,
+) -> tuple[list[int], list[int], Evidence]:
+    """Views that were fitted with their focal lengths, those that changed, and the evidence."""
+    poses = poses_at(len(evidence))
+    tried: list[int] = []
+
+    def fit(_: Any, __: Any, some: Poses, ___: Any) -> Poses:
+        tried.extend(some.view.tolist())
+        return replace(some, cameras=2.0 * some.cameras)
+
+    def measure(_: Any, __: Any, some: Poses) -> Evidence:
+        return evidence_of(*[new[view] for view in some.view.tolist()])
+
+    monkeypatch.setattr(unknown_camera, "with_focal_length", fit)
+    monkeypatch.setattr(unknown_camera, "evidence_of", measure)
+    target: Any = SimpleNamespace(
+        score_weights=lambda **_: EvidenceWeights(),
+        describer=SimpleNamespace(centre=CENTRE),
+        pipeline=Pipeline(),
+    )
+    work: Any = SimpleNamespace(starts=starts, item=None, limits=None, symmetries=None)
+    excluded = torch.tensor(outside or [False] * len(poses))
+    after, changed = unknown_camera.with_fitted_focal_lengths(
+        target, work, NOTHING, poses, evidence, excluded
+    )
+    differ = (after.cameras != poses.cameras).flatten(1).any(dim=1)
+    return tried, differ.nonzero()[:, 0].tolist(), changed
+
+
+def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
+    """By 0.2, which is 0.02 of similarity."""
+    evidence = evidence_of(0.6, 0.9, 0.8)
+    new = {0: 0.6, 1: 0.885, 2: 0.775}
+    tried, changed, after = refitted(monkeypatch, evidence, new, starts="several cameras")
+    assert (tried, changed) == ([1, 2], [1])
+    assert after.similarity.tolist() == pytest.approx([0.6, 0.885, 0.8])
+    assert refitted(monkeypatch, evidence, new, starts=None)[0] == [1], "of a known camera"
+    excluded = [False, True, False]
+    tried, changed, _ = refitted(monkeypatch, evidence, new, starts="some", outside=excluded)
+    assert (tried, changed) == ([2, 0], [0])
+    excluded = [True, True, False]
+    assert refitted(monkeypatch, evidence, new, starts="some", outside=excluded)[0] == [2]
+    close = evidence_of(0.7, 0.9, 0.8)
+    assert refitted(monkeypatch, close, new, starts="some")[0] == [1, 2, 0], "a close rival"
+
+
+def test_fits_also_begin_from_the_focal_length_of_another_pose():
+    """If it differs by more than 0.2 of log f; the first pose from that of the second such."""
+    focal_lengths = 500.0 * torch.tensor([1.0, 1.1, 1.3, 0.7]).double()
+    chosen = torch.tensor([0, 1, 2, 3])
+    index, starts = unknown_camera._focal_starts(chosen, focal_lengths)
+    assert index.tolist() == [0, 1, 2, 3, 0, 2, 3]
+    assert starts.tolist() == pytest.approx([500.0, 550.0, 650.0, 350.0, 650.0, 500.0, 500.0])
+    alone = torch.tensor([2])
+    assert unknown_camera._focal_starts(alone, focal_lengths)[0].tolist() == [2]
+
+
+def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(monkeypatch):
+    poses = poses_at(3)
+    poses = replace(
+        poses,
+        cameras=scaled_cameras(poses.cameras, torch.tensor([0.0, 0.1, 0.2]).double()),
+        covariance=torch.ones(3, 6, 6, dtype=torch.float64),
+    )
+    best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
+    monkeypatch.setattr(unknown_camera, "focal_covariance", lambda *_: (best, 0.07))
+    target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
+    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
+
+    given: dict[str, Any] = {field.name: None for field in fields(Work)} | {"item": item}
+    outside = torch.tensor([False, False, True])
+    work, after = unknown_camera.with_focal_deviation(
+        target, Work(**given), NOTHING, poses, evidence_of(0.7, 0.8, 0.9), outside
+    )
+    assert work.item.focal_deviation == 0.07
+    assert torch.equal(work.item.camera_matrix, poses.cameras[1])
+    assert bool(after.covariance[[0, 2]].isnan().all())
+    assert torch.equal(after.covariance[1], best[0])
+
+
+def test_limits_of_an_unknown_camera_are_wider_by_how_far_the_box_is_off_the_axis(monkeypatch):
+    made: list[tuple[Any, float]] = []
+
+    def limits(item: ImageItem, _: Any, off_centre: float = 0.0) -> str:
+        made.append((item.camera_matrix, off_centre))
+        return "limits"
+
+    monkeypatch.setattr(unknown_camera, "Limits", limits)
+    prior: Any = SimpleNamespace(distance=None)
+    known = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA, prior)
+    unknown = replace(known, camera_matrix=None)
+    target: Any = SimpleNamespace(bank=None, is_exact=True)
+    similar: Any = SimpleNamespace(bank=None, is_exact=False)
+    for one, item in ((target, known), (target, unknown), (similar, unknown)):
+        assert unknown_camera.limits_of(one, item) == "limits"
+    (first, none), (usual, off), (last, also_none) = made
+    assert torch.equal(first, CAMERA)
+    assert (none, also_none, last) == (0.0, 0.0, None)
+    assert torch.equal(usual, focal.usual_camera(SIZE))
+    assert off == pytest.approx(focal.off_axis_angle(replace(known, camera_matrix=usual)))
+    with_distance: Any = SimpleNamespace(distance=(1.0, 2.0))
+    with pytest.raises(InvalidInputError, match="distance"):
+        unknown_camera.limits_of(similar, replace(unknown, prior=with_distance))

@@ -1,0 +1,104 @@
+"""Which creases and inner contours are seen: closed cases of ridges and plates in front of a
+camera."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch.geometry import transform
+from curvireg_torch.rendering.contours import MAX_OCCLUDING, ContourPoints, MeshContours
+
+SIZE = 128
+DISTANCE = 10.0
+PIXEL = 0.01
+"""Length of a pixel at the plate's distance."""
+K = torch.tensor([[DISTANCE / PIXEL, 0, 63.5], [0, DISTANCE / PIXEL, 63.5], [0, 0, 1]]).double()
+IN_FRONT = transform(torch.eye(3).double(), torch.tensor([0.0, 0.0, DISTANCE]).double())[None]
+
+
+def strip(x: list[float], z: list[float], y: float = 0.5) -> trimesh.Trimesh:
+    """A surface that is bent along x only."""
+    rows = [np.column_stack([x, np.full(len(x), end), z]) for end in (-y, y)]
+    n = len(x)
+    faces = [face for k in range(n - 1) for face in ((k, n + k, k + 1), (k + 1, n + k, n + k + 1))]
+    return trimesh.Trimesh(np.concatenate(rows), faces, process=False)
+
+
+def ridge(half_width: float, slope: float) -> trimesh.Trimesh:
+    """A plate of 100 px with a ridge towards the camera, ``half_width`` px to both sides."""
+    a = half_width * PIXEL
+    return strip([-0.5, -a, 0.0, a, 0.5], [0.0, 0.0, -slope * a, 0.0, 0.0])
+
+
+def seen(mesh: trimesh.Trimesh, unit: float = 1.0) -> ContourPoints:
+    mesh = mesh.copy()
+    mesh.apply_scale(unit)
+    T = IN_FRONT.clone()
+    T[:, :3, 3] *= unit
+    return MeshContours(mesh).points(T, K[None], SIZE)
+
+
+def has_crease(mesh: trimesh.Trimesh, unit: float = 1.0) -> bool:
+    """Whether points of a crease are along the middle of the plate."""
+    points = seen(mesh, unit)
+    model = points.model[0, MAX_OCCLUDING:][points.valid[0, MAX_OCCLUDING:]]
+    return int((model[:, 0].abs() < 1e-3 * unit).sum()) > 10
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.parametrize(("slope", "expected"), [(0.16, False), (0.20, True), (0.4, True)])
+def test_a_crease_is_seen_from_a_fold_of_20_degrees_on(slope, expected, unit):
+    assert has_crease(ridge(20.0, slope), unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("half_width", "slope", "expected"),
+    [
+        (3.0, 0.22, True),  # as a wide one
+        (1.0, 0.30, False),  # half of it
+        (1.0, 0.50, True),
+        (0.5, 0.60, False),
+    ],
+)
+def test_the_surface_is_looked_up_two_pixels_beside_a_crease(half_width, slope, expected):
+    """A 64th of the crop's side: a narrower ridge counts by its height."""
+    assert has_crease(ridge(half_width, slope)) == expected
+
+
+def plates(gap: float) -> trimesh.Trimesh:
+    """A plate, and a smaller one of 40 px in front of it; the gap is a fraction of the radius."""
+    large = strip([-0.5, 0.5], [0.0, 0.0])
+    small = strip([-0.2, 0.2], [0.0, 0.0], y=0.2)
+    small.apply_translation((0.0, 0.0, -gap * np.hypot(0.5, 0.5)))
+    return trimesh.util.concatenate([large, small])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.parametrize(("gap", "expected"), [(0.04, 0), (0.06, 1)])
+def test_an_inner_contour_needs_a_step_in_depth(gap, expected, unit):
+    """Of a twentieth of the radius."""
+    points = seen(plates(gap), unit)
+    inner = points.valid & ~points.outline
+    assert min(int(inner[0, :MAX_OCCLUDING].sum()), 1) == expected
+    assert int(points.outline.sum()) > 50
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+@pytest.mark.parametrize(("gap", "expected"), [(0.01, True), (0.03, False)])
+def test_a_crease_may_lie_a_little_behind_the_surface(gap, expected, unit):
+    """A fiftieth of the radius: a cover lies in front of the ridge."""
+    radius = np.hypot(0.5, 0.5)
+    cover = strip([-0.3, 0.3], [0.0, 0.0], y=0.6)
+    cover.apply_translation((0.0, 0.0, -0.3 * 0.2 - gap * radius))
+    assert has_crease(trimesh.util.concatenate([ridge(20.0, 0.3), cover]), unit) == expected
+
+
+@pytest.mark.parametrize(("drop", "expected"), [(0.05, True), (0.15, False)])
+def test_a_step_in_depth_is_no_crease(drop, expected):
+    """Beyond a tenth of the radius: two slopes that fall steeply to both sides."""
+    radius = np.hypot(0.5, 0.5)
+    a = 2.0 * PIXEL
+    depth = drop * radius
+    steep = strip([-0.5, -a, 0.0, a, 0.5], [depth, depth, 0.0, depth, depth])
+    assert has_crease(steep) == expected
