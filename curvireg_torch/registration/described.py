@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -37,6 +37,9 @@ class DescribedPhotograph:
     descriptor: Tensor
     crops: EdgeCrops | None
     keypoints: KeypointMatches | None
+
+
+VIEWS = "_described_views"  # attribute of ComparedPoses, computed on first use
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,17 @@ class ComparedPoses:
         contours = self.target.describer.device_contours
         return evidence_together(contours, crops, poses.cameras, poses.T, poses.crop_index)
 
-    @cached_property
+    @property
     def _views(self) -> tuple[Tensor, Tensor | None]:
         """(H, D) descriptors of the poses' views, and the features (H, F) of their pictures where
         the appearance counts."""
-        return compute_together(_views_of, self)
+        # Not a cached property: in Python 3.11 its lock would keep other photographs waiting, which
+        # this one waits for.
+        known: dict[str, Any] = self.__dict__
+        if VIEWS not in known:
+            known[VIEWS] = compute_together(_views_of, self)
+        views: tuple[Tensor, Tensor | None] = known[VIEWS]
+        return views
 
     @property
     def views_key(self) -> tuple[int, bool]:

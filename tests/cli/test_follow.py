@@ -184,7 +184,16 @@ def test_follow_starts_from_a_known_pose_and_its_confidence(
         "confidence": confidence,
     }
     (tmp_path / "start.json").write_text(json.dumps(pose))
-    monkeypatch.setattr("curvireg_torch.registration.following.RELIABLE", 2.0)
+    refined = Follower._refined
+
+    def unconfirmed(self, item, starts):
+        usual = self._reliable
+        self._reliable = 2.0
+        result = refined(self, item, starts)
+        self._reliable = usual
+        return result
+
+    monkeypatch.setattr(Follower, "_refined", unconfirmed)
     assert (
         follow(
             "--camera",
