@@ -139,3 +139,24 @@ def test_the_pull_of_a_prior_does_not_grow_beyond_its_reach():
     assert zoom(log_zoom=3.0 * gap) == pytest.approx(bounded, abs=0.01)
     none = zoom(deviation=1e6)
     assert zoom(deviation=0.4) - none == pytest.approx(0.25 * (bounded - none), rel=0.35)
+
+
+def test_a_focal_length_moves_by_steps():
+    """Of a quarter of log f, whatever pulls: six in three rounds."""
+    image, box, T = near_scene()
+    problem = fitting_problem(image, box, NEAR)
+    gap = torch.tensor([5.0], dtype=torch.float64)
+    prior = focal_length.FocalPrior(gap, 1e-3, -2.0 * gap, 2.0 * gap)
+    fit = focal_length.fit_focal_length(problem, T[None], prior, FULL_SIZE_RADII)
+    assert 1.0 < float(fit.log_zoom) <= 1.5 + 1e-9
+
+
+def test_errors_of_edges_belong_together(monkeypatch):
+    """The variance of log f is sixteen times that of independent errors."""
+    image, box, T = near_scene()
+    problem = fitting_problem(image, box, NEAR)
+    state = problem.state(T[None])
+    found, _ = focal_length.focal_information(problem, state, 2.0)
+    monkeypatch.setattr(focal_length, "FOCAL_SCALE", 1.0)
+    independent, _ = focal_length.focal_information(problem, state, 2.0)
+    assert float(found.variance / independent.variance) == pytest.approx(16.0)

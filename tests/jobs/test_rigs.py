@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 from curvireg_torch.data import calibrations
 from curvireg_torch.errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
@@ -166,6 +167,27 @@ def test_rows_of_a_rig_with_too_much_are_refused(tmp_path, header, row, message)
     path = written(tmp_path / "rig.csv", header, row)
     with pytest.raises(InvalidInputError, match=message):
         read_rig(path)
+
+
+QUATERNION_COLUMNS = "photo,camera,qw,qx,qy,qz,tx,ty,tz"
+
+
+def test_a_quaternion_begins_with_its_real_part(tmp_path):
+    """A quarter turn about z."""
+    (tmp_path / "cameras.txt").write_text(LINE)
+    half = 0.5**0.5
+    row = ["a.png", "cameras.txt", half, 0, 0, half, 4, 5, 6]
+    (view,) = read_rig(written(tmp_path / "rig.csv", QUATERNION_COLUMNS, row))
+    expected = torch.tensor([[0.0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]).double()
+    torch.testing.assert_close(view.T_cam_from_world, expected)
+
+
+@pytest.mark.parametrize("length", [0.98, 1.02])
+def test_quaternions_have_length_one(tmp_path, length):
+    (tmp_path / "cameras.txt").write_text(LINE)
+    row = ["a.png", "cameras.txt", length, 0, 0, 0, 4, 5, 6]
+    with pytest.raises(InvalidInputError, match=f"of length 1, got {length}; check their order"):
+        read_rig(written(tmp_path / "rig.csv", QUATERNION_COLUMNS, row))
 
 
 def test_empty_cells_beyond_the_header_of_a_rig_do_not_count(tmp_path):

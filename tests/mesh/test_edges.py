@@ -88,3 +88,23 @@ def test_simplification_keeps_the_number_of_faces_that_is_asked_for() -> None:
         assert 0.9 * most <= len(faces) <= 1.02 * most
         assert np.abs(np.linalg.norm(vertices, axis=1) - 1.0).max() < 0.02
     assert len(simplified(sphere, np.zeros(3), len(sphere.faces))[1]) == len(sphere.faces)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
+@pytest.mark.parametrize(("gap", "edges"), [(1e-8, 5), (1e-4, 6)])
+def test_vertices_at_the_same_place_are_one(unit: float, gap: float, edges: int) -> None:
+    """Two triangles of a square; their gap is a fraction of its side."""
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (gap, gap, 0), (1, 1 + gap, 0), (0, 1, 0)])
+    found = edges_of(unit * corners, [[0, 1, 2], [3, 4, 5]])
+    assert len(found.edges) == edges
+
+
+@pytest.mark.parametrize("flipped", [False, True])
+def test_doubled_faces_count_once(flipped: bool) -> None:
+    corners = [(0, 0, 0), (0, 0, 1), (1, 0, 0.5), (-1, 0, 0.5)]
+    faces = [[1, 0, 2], [0, 1, 3]]
+    again = [face[::-1] for face in faces] if flipped else faces
+    edges = edges_of(corners, faces + again)
+    spine = at(edges, *SPINE)
+    assert (bool(edges.is_crease[spine]), bool(edges.is_smooth[spine])) == (False, True)
+    assert len(edges.faces) == 2

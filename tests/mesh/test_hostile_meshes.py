@@ -162,12 +162,16 @@ OUTSIDE = [
 ]
 
 
-@pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "no.bin"])
+@pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "Linked/b.bin", "linked/b.bin", "no.bin"])
 def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
     folder = tmp_path / "inside"
     folder.mkdir()
     (tmp_path / "b.bin").write_bytes(POINTS)
     (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    # names that differ in upper and lower case only are searched for: in links to folders too
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "b.bin").write_bytes(POINTS)
+    (folder / "Linked").symlink_to(tmp_path / "other", target_is_directory=True)
     content = tree(buffers=[{"byteLength": 36, "uri": uri}])
     refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
 

@@ -1,13 +1,21 @@
 """Which creases and inner contours are seen: closed cases of ridges and plates in front of a
 camera."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 import trimesh
 
 from curvireg_torch.geometry import transform
-from curvireg_torch.rendering.contours import MAX_OCCLUDING, ContourPoints, MeshContours
+from curvireg_torch.rendering.contours import (
+    MAX_OCCLUDING,
+    ContourPoints,
+    MeshContours,
+    _Places,
+    _Views,
+)
 
 SIZE = 128
 DISTANCE = 10.0
@@ -102,3 +110,32 @@ def test_a_step_in_depth_is_no_crease(drop, expected):
     depth = drop * radius
     steep = strip([-0.5, -a, 0.0, a, 0.5], [depth, depth, 0.0, depth, depth])
     assert has_crease(steep) == expected
+
+
+@pytest.mark.parametrize(
+    ("degrees", "smooth", "expected"),
+    [
+        (0.0, True, 0.0),
+        (45.0, True, 45.0),
+        (55.0, True, 55.0),
+        (65.0, True, 0.0),  # of another surface, as at the rim of a cone
+        (45.0, False, 0.0),
+        (225.0, True, 45.0),  # outward all the same
+    ],
+)
+def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
+    degrees, smooth, expected
+):
+    """An edge whose normal in the image is (1, 0), of a surface whose normal is turned from it."""
+    angle = np.radians(degrees)
+    surface = np.array([[np.cos(angle), np.sin(angle), 0.0]] * 2, np.float32)
+    edges = SimpleNamespace(edges=np.array([[0, 1]]), normals=surface, is_smooth=np.array([smooth]))
+    level = SimpleNamespace(edges=edges)
+    nothing = np.zeros((1, 1, 3), np.float32)
+    turn = np.eye(3, dtype=np.float32)[None]
+    views = _Views(level, SIZE, turn, nothing, turn, nothing, nothing, nothing)
+    edge = np.zeros((1, 1), int)
+    fraction = np.full((1, 1), 0.5, np.float32)
+    normal = np.array([[[1.0, 0.0]]], np.float32)
+    found = views.smoothed(_Places(edge, fraction, nothing, normal)).normal[0, 0]
+    assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3)

@@ -147,12 +147,15 @@ def test_another_answer_and_a_pose_by_hand_are_those_of_all_photographs(found):
     first.choose(0)
 
 
-def test_boxes_that_are_drawn_replace_those_of_the_rig(found):
+@pytest.mark.parametrize("loose", [False, True])
+def test_boxes_that_are_drawn_replace_those_of_the_rig(found, loose):
+    """Around the object, and around nearly all of the photograph."""
     workspace, session = found
     _, first, last = session.shots
     before = first.box
     session.shot = first
-    drawn = [before[0] - 3.0, before[1] - 2.0, before[2] + 3.0, before[3] + 2.0]
+    tight = [before[0] - 3.0, before[1] - 2.0, before[2] + 3.0, before[3] + 2.0]
+    drawn = [10.0, 10.0, 230.0, 170.0] if loose else tight
     first.set_box(tuple(drawn))
     last.set_box(None)
     assert session.inputs() != first.result.inputs
