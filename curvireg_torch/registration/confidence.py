@@ -151,6 +151,7 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
     if all are near.
 
     Example:
+        >>> import torch
         >>> round(concentration(torch.tensor([1.0, 0.5]), torch.tensor([True, False])), 4)
         0.9412
     """
@@ -170,6 +171,7 @@ def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> f
     be determined.
 
     Example:
+        >>> import torch
         >>> round(undetermined_axes(torch.diag(torch.tensor([0.01, 0.04, 9.0, 1.0, 1.0, 1.0]))), 3)
         1.3
     """
@@ -242,6 +244,7 @@ def shares(scores: Tensor, *, exact: bool) -> Tensor:
         exact: see :func:`model_name`.
 
     Example:
+        >>> import torch
         >>> shares(torch.tensor([3.0, 3.0]), exact=True).tolist()
         [0.5, 0.5]
     """
@@ -257,6 +260,7 @@ def hypothesis_probabilities(any_right: float, scores: Tensor, *, exact: bool) -
     neither has more than one half.
 
     Example:
+        >>> import torch
         >>> hypothesis_probabilities(0.9, torch.tensor([3.0, 3.0]), exact=True)
         (0.45, 0.45)
     """

@@ -41,7 +41,7 @@ class DeviceContours:
         >>> K = torch.tensor([[100.0, 0, 63.5], [0, 100.0, 63.5], [0, 0, 1]], dtype=torch.float64)
         >>> T = torch.eye(4, dtype=torch.float64)[None]; T[0, 2, 3] = 4.0
         >>> points = DeviceContours(contours, "cpu").points(T, K[None], 128)
-        >>> points.model[points.outline].abs().amax(dim=0).tolist()
+        >>> points.model[points.outline].abs().amax(dim=0).round(decimals=4).tolist()
         [1.0, 1.0, 1.0]
     """
 
