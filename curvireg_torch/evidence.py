@@ -83,7 +83,7 @@ class SeenPoses(Protocol):
 
     @property
     def contours(self) -> Tensor:
-        """See :func:`.contour_evidence`; 0 without the contour fit."""
+        """See ``contour_evidence``; 0 without the contour fit."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class Evidence(Rows):
             that agree by chance; 0 without colours, camera or contour fit, with a similar mesh, and
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
-            for it, see :func:`.compare_details`; 0 for poses that score far less than the best.
+            for it, see ``compare_details``; 0 for poses that score far less than the best.
         contours: by how much the edges under its contours exceed chance, see
-            :func:`.contour_evidence`; 0 without the contour fit.
+            ``contour_evidence``; 0 without the contour fit.
 
     Example:
         >>> from dataclasses import replace

@@ -112,7 +112,7 @@ class BankSettings:
         image_size: side of views and crops in px.
         camera: "perspective" or "orthographic".
         margin: space around the object's box, as a fraction of its longer side.
-        depth_field: name in :data:`DEPTH_FIELDS`. "CS" is :func:`depth_curvilinear_saliency` with
+        depth_field: name in ``DEPTH_FIELDS``. "CS" is :func:`depth_curvilinear_saliency` with
             ``sigma`` and ``formula``; the others, with which the paper compares it, use their
             defaults.
         grid, bins, block, clip: of :func:`hog`.
@@ -263,7 +263,7 @@ class Pipeline:
     Attributes:
         views: which viewpoints are rendered.
         bank: how views and photographs are described.
-        field: filter of photographs: a name in :data:`FIELDS`, or "custom:NAME" for a module that
+        field: filter of photographs: a name in ``FIELDS``, or "custom:NAME" for a module that
             is passed with each call.
         weights: digest of the field's weights; "" for a field without any. Filled in for packaged
             weights.

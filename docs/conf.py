@@ -30,6 +30,12 @@ extensions = [
 ]
 exclude_patterns = ["_build", "gallery", "notebooks"]
 nitpicky = True
+nitpick_ignore = [  # types of annotations without a page
+    ("py:class", "Image"),
+    ("py:class", "curvireg_torch.registration.shape_symmetries.TellingSymmetries"),
+    ("py:class", "curvireg_torch.rendering.contours.Contours"),
+    ("py:class", "curvireg_torch.rendering.contours._Level"),
+]
 html_math_renderer = "mathml"  # nothing is fetched from elsewhere
 
 html_theme = "furo"

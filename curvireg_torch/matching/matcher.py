@@ -291,7 +291,7 @@ class ViewMatcher(nn.Module):
 
     def query_together(self, image: Tensor, box: Tensor) -> QueryFeatures:
         """:meth:`query` of one photograph (C, H, W) with a box (4,), described with those that
-        other jobs of :func:`.map_in_company` have."""
+        other jobs of ``map_in_company`` have."""
         image = image.to(self.bank.device)
         return compute_together(self._described, self._regions([image], box[None]))
 
@@ -306,7 +306,7 @@ class ViewMatcher(nn.Module):
         return by_key(requests, lambda request: request[0].shape, describe)
 
     def rank_together(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
-        """:meth:`rank` of one photograph, with those that other jobs of :func:`.map_in_company`
+        """:meth:`rank` of one photograph, with those that other jobs of ``map_in_company``
         have; the ranking is on the CPU."""
         return compute_together(self._ranked, (query, allowed))
 
