@@ -20,6 +20,7 @@ from ..geometry.pose_prior import PosePrior, object_frame
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
 from ..matching import Ranking
 from ..mesh.mesh import mesh_unit
+from ..pipeline import FitSettings
 from ..utils.choices import SIDE_NAMES
 from ..version import __version__
 from .confidence import RELIABLE
@@ -29,6 +30,9 @@ Value = TypeVar("Value")
 
 # Radians of standard deviation from which the rotation about an axis counts as unknown
 UNKNOWN_ROTATION = 1.0
+# Evidence of eight keypoints, of which two agree by chance: they determine a pose, whatever its
+# contours tell
+DETERMINING_KEYPOINTS = math.log1p(8 - FitSettings().chance_keypoints)
 # Fraction of the first pose's probability from which another one makes the answer ambiguous
 RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
@@ -312,13 +316,15 @@ class Registration:
     @property
     def reliable(self) -> bool:
         """Whether the confidence is at least ``reliable_from``, without ``warnings`` or a better
-        pose outside the prior, and the contours determine at least one axis of rotation; if False,
-        the pose is a guess."""
+        pose outside the prior, and the contours determine at least one axis of rotation, or as many
+        keypoints agree as a pose can begin from; if False, the pose is a guess."""
         best = self.hypotheses[0]
         doubtful = self.warnings or self.prior_contradiction == "better outside"
         if self.confidence is None or not self.confidence >= self.reliable_from or doubtful:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
+            return True
+        if best.evidence.get("landmarks", 0.0) >= DETERMINING_KEYPOINTS:
             return True
         deviations = best.standard_deviations
         return deviations is not None and bool(deviations[0].isfinite().any())

@@ -2,6 +2,7 @@
 words."""
 
 import json
+import math
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -235,6 +236,10 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
         sphere, hypotheses=tuple(replace(h, edge_support=0.5) for h in sphere.hypotheses)
     )
     assert not fitted.reliable
+    for keypoints, determine in ((7, False), (8, True)):
+        evidence = {"landmarks": math.log1p(keypoints - 2)}
+        agreed = tuple(replace(h, evidence=evidence) for h in fitted.hypotheses)
+        assert replace(fitted, hypotheses=agreed).reliable == determine
     variances[0] = 1e-4
     known = tuple(replace(h, covariance=torch.diag(variances)) for h in fitted.hypotheses)
     assert replace(fitted, hypotheses=known).reliable
