@@ -62,8 +62,9 @@ def judged(
     is_rival[0] = True
     rivals = own[is_rival]
     own = torch.cat([rivals, own[~is_rival]])
-    # where all are near, the nearest tell how clear the best one is
-    compared = rivals if len(rivals) > 1 else own[distinct[own]]
+    # where there is no rival, those near the best or merged with it tell how clear it is
+    groups = (rivals, own[distinct[own]], own)
+    compared = next((group for group in groups if len(group) > 1), own)
     reported = own[: target.pipeline.hypotheses].tolist()
     fraction = _outside_fraction(target, work, poses[best])
     near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
