@@ -11,6 +11,6 @@ CALIBRATION: dict[str, Any] = json.loads(
     (Path(__file__).parent / "calibration.json").read_text(encoding="utf-8")
 )
 # Factor of the least-squares covariance, which ignores edges that do not belong to the object: with
-# it, nine in ten true poses lie in the 90 % ellipsoid of a reliable result, on generated
-# photographs
+# it, nine in ten true poses lay in the 90 % ellipsoid of a reliable result, on an earlier set of
+# generated photographs (docs/method.md)
 COVARIANCE_SCALE: float = CALIBRATION["covariance_scale"]

@@ -204,11 +204,8 @@ class ContourProblem(Rows):
         what fits are compared by."""
         points = state.points
         uv = pixels(points.model, state.T, self.K, self.centre)
-        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
         counts = self.edges.counts(uv, points.valid, self.image_index)
-        near = self.edges.strength(uv, points.normals, offsets, self.image_index) * torch.exp(
-            -0.5 * offsets**2
-        )
+        offsets, near = self._near(uv, points.normals)
         plain = (near.amax(dim=-1).double() * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1)
         if self.mask is None:
             return plain, plain
@@ -221,11 +218,15 @@ class ContourProblem(Rows):
     def strength_near(self, uv: Tensor, normals: Tensor) -> Tensor:
         """(N, P) float64 strength of the edges within about 1 px of points (N, P, 2) px with
         ``normals`` (N, P, 2)."""
-        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
-        near = self.edges.strength(uv, normals, offsets, self.image_index) * torch.exp(
-            -0.5 * offsets**2
-        )
+        _, near = self._near(uv, normals)
         return near.amax(dim=-1).double()
+
+    def _near(self, uv: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Offsets (L,) px along the normals, and the strengths (N, P, L) there, which fall with the
+        distance from the point."""
+        offsets = torch.arange(-3, 4, dtype=torch.float32, device=uv.device)
+        strength = self.edges.strength(uv, normals, offsets, self.image_index)
+        return offsets, strength * torch.exp(-0.5 * offsets**2)
 
     def measured_edges(self, state: ContourState, radius: float) -> Measurements:
         """The edges that a least-squares step without a mask would use."""

@@ -30,9 +30,9 @@ Value = TypeVar("Value")
 
 # Radians of standard deviation from which the rotation about an axis counts as unknown
 UNKNOWN_ROTATION = 1.0
-# Evidence of eight keypoints, of which two agree by chance: they determine a pose, whatever its
-# contours tell
-DETERMINING_KEYPOINTS = math.log1p(8 - FitSettings().chance_keypoints)
+# Evidence of as many keypoints as a pose can begin from: they determine it, whatever its contours
+# tell
+DETERMINING_KEYPOINTS = math.log1p(FitSettings().min_keypoints - FitSettings().chance_keypoints)
 # Fraction of the first pose's probability from which another one makes the answer ambiguous
 RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
