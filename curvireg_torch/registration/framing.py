@@ -8,6 +8,8 @@ from torch import Tensor
 from ..geometry.cameras import project_points
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
+# By how much an object may go on beyond the border, as fractions of what is visible of it
+EXTENSIONS = (0.4, 1.2)
 # Fraction of the object outside the photograph from which a result carries a warning
 MUCH_OUTSIDE = 0.1
 
@@ -34,10 +36,37 @@ def border_sides(box: Tensor, size: tuple[int, int]) -> int:
         >>> border_sides(torch.tensor([0.0, 10.0, 50.0, 60.0]), (480, 640))
         1
     """
-    limits = photograph_box(size).to(box)
-    low = box[:2] <= limits[:2] + BORDER
-    high = box[2:] >= limits[2:] - BORDER
+    low, high = _on_border(box, size)
     return int(low.sum() + high.sum())
+
+
+def _on_border(box: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Which of the sides x0, y0 and of the sides x1, y1 of a box (4,) lie on the border of a
+    photograph of ``size`` (H, W), or beyond it, each (2,) bool."""
+    limits = photograph_box(size).to(box)
+    return box[:2] <= limits[:2] + BORDER, box[2:] >= limits[2:] - BORDER
+
+
+def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
+    """Boxes that the whole object may have whose visible part has a ``box`` (4,) in a photograph of
+    ``size`` (H, W): beyond the sides on its border, it goes on by ``EXTENSIONS`` of the box's width
+    or height; none where no side lies there.
+
+    Example:
+        >>> box = torch.tensor([-0.5, 10.0, 99.5, 60.0])
+        >>> [whole.tolist() for whole in whole_boxes(box, (480, 640))]
+        [[-40.5, 10.0, 99.5, 60.0], [-120.5, 10.0, 99.5, 60.0]]
+    """
+    low, high = _on_border(box, size)
+    sides = box[2:] - box[:2]
+    if not bool((low | high).any()):
+        return []
+    # an object that leaves the photograph on both sides is about in its middle
+    share = sides / (low.to(box) + high.to(box)).clamp(min=1.0)
+    return [
+        torch.cat([box[:2] - extension * share * low, box[2:] + extension * share * high])
+        for extension in EXTENSIONS
+    ]
 
 
 def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> float:

@@ -14,6 +14,7 @@ from ..terms import QueryFeatures
 from .confidence import are_near
 from .described import evidence_of
 from .focal import FINISHED
+from .framing import whole_boxes
 from .inputs import ImageItem, check_crop
 from .judging import judged
 from .poses import (
@@ -201,13 +202,29 @@ def _promising(target: Target, work: Work) -> Poses:
     screened = count
     if work.crops is not None and work.exact:
         screened = max(target.pipeline.fit.screened_views, count)
-    view, rank = best_views(work.ranking, target.bank, count=screened, symmetries=work.symmetries)
-    poses = poses_of_views(target, work, view, rank)
-    if work.limits is not None:
-        poses = work.limits.moved_inside(poses)
+    poses = _of_best_views(target, work, screened)
+    if work.crops is not None and work.exact:
+        whole = whole_boxes(work.item.box, work.item.size)
+        others = [_of_best_views(target, _with_box(target, work, box), screened) for box in whole]
+        poses = Poses.cat([poses, *others])
     if work.crops is not None and len(poses) > count:
         poses = _screened(target, work.crops, poses, count)
     return poses
+
+
+def _of_best_views(target: Target, work: Work, count: int) -> Poses:
+    """Poses of the ``count`` best distinct views."""
+    view, rank = best_views(work.ranking, target.bank, count=count, symmetries=work.symmetries)
+    poses = poses_of_views(target, work, view, rank)
+    return poses if work.limits is None else work.limits.moved_inside(poses)
+
+
+def _with_box(target: Target, work: Work, box: Tensor) -> Work:
+    """The photograph with another box, ranked for it."""
+    query = target.matcher.query_together(work.item.image, box)
+    allowed = None if work.limits is None else work.limits.allowed()[None]
+    ranking = target.matcher.rank_together(query, allowed)
+    return replace(work, item=replace(work.item, box=box), ranking=ranking)
 
 
 def _screened(target: Target, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
