@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
@@ -166,17 +167,20 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
 
 def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> float:
     """How many axes of rotation a fit leaves undetermined, in [0, 3]: the sum of the standard
-    deviations in radians about the three axes, each at most 1. 3 without a covariance (6, 6): one
-    that is NaN. The axis of a body of revolution, whose ``symmetries`` (S, 4, 4) are many, need not
-    be determined.
+    deviations in radians about the three principal axes of the rotation's covariance, each at most
+    1. 3 without a covariance (6, 6): one that is NaN. The axis of a body of revolution, whose
+    ``symmetries`` (S, 4, 4) are many, need not be determined.
 
     Example:
         >>> import torch
         >>> round(undetermined_axes(torch.diag(torch.tensor([0.01, 0.04, 9.0, 1.0, 1.0, 1.0]))), 3)
         1.3
     """
-    deviations = covariance.diagonal()[:3].clamp(min=0.0).sqrt()
-    undetermined = float(deviations.clamp(max=1.0).nan_to_num(1.0).sum())
+    rotation = covariance[:3, :3]
+    if not bool(rotation.isfinite().all()):
+        return 3.0
+    deviations = torch.linalg.eigvalsh(rotation.double()).clamp(min=0.0).sqrt()
+    undetermined = float(deviations.clamp(max=1.0).sum())
     is_round = symmetries is not None and len(symmetries) >= ROUND
     return max(undetermined - 1.0, 0.0) if is_round else undetermined
 

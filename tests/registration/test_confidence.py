@@ -161,6 +161,13 @@ def test_undetermined_axes():
     assert confidence.undetermined_axes(0.01 * covariance, many) == 0.0
 
 
+def test_one_unknown_axis_counts_once_in_any_direction():
+    axis = torch.nn.functional.normalize(torch.tensor([1.0, 1.0, 0.8]).double(), dim=0)
+    covariance = torch.zeros(6, 6, dtype=torch.float64)
+    covariance[:3, :3] = math.pi**2 * torch.outer(axis, axis)
+    assert confidence.undetermined_axes(covariance) == pytest.approx(1.0)
+
+
 def test_only_the_default_pipeline_is_calibrated():
     for pipeline, calibrated in (
         (Pipeline(), True),
