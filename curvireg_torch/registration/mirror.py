@@ -32,6 +32,7 @@ from .work import Work
 POINTS = 2000
 SAME_SHAPE = 0.03
 SAME_POINTS = 0.995
+LEAST_CONFIDENCE = 0.5  # from which an answer is compared
 HOPELESS = -1.5  # Gain after a short fit from which a whole one is not tried
 WARNING = (
     "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
@@ -46,10 +47,11 @@ def compared_with_mirror_image(
     evidence: Evidence,
     result: Registration,
 ) -> Registration:
-    """A result with its best ``pose`` and the evidence of it. If it is reliable and the mirror
-    image of the mesh fits better, it gets a warning, and a confidence of at most one half."""
+    """A result with its best ``pose`` and the evidence of it. If it is probably right and the
+    mirror image of the mesh fits better, it gets a warning, and at most half the confidence."""
     is_printed = float(evidence.landmarks) >= DETERMINING_KEYPOINTS
-    if not result.reliable or is_printed:  # a print that is found is not mirrored
+    # a print that is found is not mirrored
+    if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:
         return result
     gain = mirror_gain(target, work, crops, pose, evidence)
     if gain <= resolution(exact=True):

@@ -1,14 +1,11 @@
 """The mirror image of a mesh beside the mesh."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 import trimesh
 
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
-from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration import mirror
 from curvireg_torch.registration.poses import Poses
 from tests._support.poses import poses as random_poses
@@ -95,8 +92,7 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
     mesh = mirrored(own.bank.mesh)
     bank = ViewBank.build(mesh, views, image_size=96, progress=False)
-    # every answer counts as reliable, and is compared
-    pipeline = replace(bank.pipeline, fit=FitSettings(reliable=0.01))
-    flipped = Registrar(bank, pipeline=pipeline)([image], box[None], CAMERA)[0]
+    monkeypatch.setattr(mirror, "LEAST_CONFIDENCE", 0.0)
+    flipped = Registrar(bank)([image], box[None], CAMERA)[0]
     assert mirror.WARNING in flipped.warnings
     assert gains[0] < 0.0 < gains[1]
