@@ -28,5 +28,8 @@ def postpone_imports(*names: str) -> None:
         (0.0, 0.0, 1.0)
     """
     for name in names:
-        if name not in sys.modules and importlib.util.find_spec(name) is not None:
-            sys.modules[name] = _Postponed(name)
+        spec = None if name in sys.modules else importlib.util.find_spec(name)
+        if spec is not None:
+            module = _Postponed(name)
+            module.__file__ = spec.origin  # torch asks all modules where they are
+            sys.modules[name] = module
