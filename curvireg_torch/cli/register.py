@@ -441,7 +441,7 @@ def _register_several(
 def print_result(document: Mapping[str, Any], out: Path) -> None:
     """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of
     its files."""
-    from ..registration.result import corners, remarks, two_decimals
+    from ..registration.result import remarks, two_decimals
 
     confidence = NOT_CALIBRATED
     if document["confidence"] is not None:
@@ -459,11 +459,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(f"mesh: {document['mesh']}")
     for line in remarks(document):
         print(line)
-    for instance in document.get("detection", {}).get("instances", []):
-        print(
-            f"found in box {corners(instance['box'])}: there with probability "
-            f"{two_decimals(instance['score'])}; {_angles(instance)}{_place(instance, document)}"
-        )
+    _print_objects(document)
     if document["translation"] is not None:
         print(
             f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} "
@@ -481,6 +477,25 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         f"bank {seconds['bank']:.1f} s, registration {seconds['register']:.1f} s; see "
         f"{out}/overlay.png"
     )
+
+
+def _print_objects(document: Mapping[str, Any]) -> None:
+    """Print where objects were detected, and the confidence of each if there are several."""
+    from ..registration.result import corners, two_decimals
+
+    instances = document.get("detection", {}).get("instances", [])
+    several = len(instances) > 1
+    if several:
+        print(f"{len(instances)} objects, the best first:")
+    for instance in instances:
+        sure = ""
+        if several and instance["confidence"] is not None:
+            sure = f"confidence {two_decimals(instance['confidence'])}, {instance['verdict']}; "
+        print(
+            f"{'' if several else 'found '}in box {corners(instance['box'])}: there with "
+            f"probability {two_decimals(instance['score'])}; {sure}{_angles(instance)}"
+            f"{_place(instance, document)}"
+        )
 
 
 def _place(pose: Mapping[str, Any], document: Mapping[str, Any]) -> str:

@@ -42,6 +42,9 @@ RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS)
 REPORTS = ("results.csv", "index.html")  # written from all results at the end
 
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
+INSTANCE_COLUMNS = ("instance", "found_x0", "found_y0", "found_x1", "found_y1")
+"""Last columns, if several objects of a photograph were asked for: the number of each, from 1, and
+its box in px."""
 
 
 def _entry(
@@ -205,7 +208,8 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
             raise InvalidInputError(
                 f"{path}: unknown column {column!r}; rename it to {meant[0]}, or otherwise"
             )
-    if reserved := [column for column in names if column in (*RESULT_COLUMNS, BEST_MESH)]:
+    results = [*RESULT_COLUMNS, BEST_MESH, *(INSTANCE_COLUMNS if options.instances > 1 else ())]
+    if reserved := [column for column in names if column in results]:
         raise InvalidInputError(
             f"{path}: {', '.join(reserved)}: names of result columns; rename those of the list"
         )
@@ -283,23 +287,27 @@ def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Co
     shown = []
     failures = []
     more = [BEST_MESH] if any(len(entry.meshes) > 1 for entry in entries) else []
-    lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more]]
+    numbered = INSTANCE_COLUMNS if any(entry.instances > 1 for entry in entries) else ()
+    lines: list[Sequence[object]] = [[*entries[0].cells, *RESULT_COLUMNS, *more, *numbered]]
     for entry, row in zip(entries, _rows(entries, store), strict=True):
         number = row["row"]
         message = row["message"]
         reliable = row.get("reliable", False)
         confidence = row.get("confidence") or 0.0
         verdict = row["verdict"]
-        caption = message or f"{verdict}, confidence {two_decimals(confidence)}"
+        objects = _objects(row)
+        count = f"{len(objects)} objects, the best: " if len(objects) > 1 else ""
+        caption = message or f"{count}{verdict}, confidence {two_decimals(confidence)}"
         picture = thumbnail_of(out, row)
         rank = bool(message), not reliable, -confidence, number
         shown.append(SheetEntry(number, entry.name, caption, verdict, picture, rank))
         if message:
             reason = message if entry.name in message else f"{entry.name}: {message}"
             failures.append(f"row {number}: {reason}".encode(errors="backslashreplace").decode())
-        lines.append(
-            [*entry.cells.values(), *_result_cells(row), *(row.get("mesh", "") for _ in more)]
-        )
+        for instance, found in enumerate(objects, start=1):
+            cells = [*entry.cells.values(), *_result_cells(found)]
+            cells += [row.get("mesh", "") for _ in more]
+            lines.append([*cells, *(_instance_cells(instance, found) if numbered else ())])
     counts = Counts(Counter(shot.kind for shot in shown), tuple(failures))
     write_sheet(out / "index.html", str(counts), shown, table="results.csv")
     store.rewrite(_rows(entries, store))
@@ -313,6 +321,21 @@ def _rows(entries: Sequence[Entry], store: ResultStore) -> Iterator[Row]:
         head = {"row": number, "columns": dict(entry.cells)}
         unusable = {"key": "", "digests": {"request": "", "photo": ""}, **failed_row(entry.error)}
         yield {**head, **(unusable if entry.error else store.read(entry.key)), **head}
+
+
+def _objects(row: Row) -> list[Row]:
+    """The row itself, or one for each object that was detected, the best first."""
+    if not has_pose(row) or "detection" not in row:
+        return [row]
+    return [{**row, **instance} for instance in row["detection"]["instances"]]
+
+
+def _instance_cells(number: int, row: Row) -> list[str]:
+    """Number and box of an object; empty without a pose."""
+    if not has_pose(row):
+        return [""] * len(INSTANCE_COLUMNS)
+    box = row.get("box") or row["inputs"]["box"]
+    return [str(number), *map(str, box)]
 
 
 def _result_cells(row: Row) -> list[str]:

@@ -53,6 +53,7 @@ class RegisteredPhotograph(Registration):
             object was found.
         document: the content of ``result.json``.
         inputs: files that were read.
+        copies: further objects that were found in the photograph, by decreasing confidence.
     """
 
     registrar: Registrar
@@ -60,11 +61,12 @@ class RegisteredPhotograph(Registration):
     box: Tensor
     document: dict[str, Any]
     inputs: tuple[Path, ...] = ()
+    copies: tuple[Registration, ...] = ()
 
     def overlay(self) -> np.ndarray:
         """(H, W, 3) uint8 RGB: the photograph with the contours of the mesh at the pose, and the
-        box."""
-        return contour_overlay(self.registrar, self, self.image, self.box)
+        box; those of ``copies`` too."""
+        return contour_overlay(self.registrar, self, self.image, self.box, copies=self.copies)
 
     def plot(self) -> Any:
         """The overlay as a ``matplotlib.figure.Figure``; needs matplotlib."""
@@ -85,7 +87,9 @@ class RegisteredPhotograph(Registration):
     def write(self, folder: Path) -> None:
         """Write the files of :meth:`save` into a folder that :func:`.outputs.output_folder` has
         checked."""
-        write_result(folder, self.document, self.registrar, self, self.image, self.box)
+        write_result(
+            folder, self.document, self.registrar, self, self.image, self.box, copies=self.copies
+        )
 
     def _repr_html_(self) -> str:
         """For notebooks: the overlay above the pose."""
@@ -241,10 +245,9 @@ def register_observation(
         },
         **_camera_document(result.camera, camera and camera.at(item.size)),
     }
+    objects = [found for found in results if isinstance(found, Registration)]
     if result.detection is not None:
-        document["detection"] = detection_document(
-            [r for r in results if isinstance(r, Registration)]
-        )
+        document["detection"] = detection_document(objects)
     box = box.double() if result.corrected_box is None else result.corrected_box
     files = entry.files
     return RegisteredPhotograph(
@@ -254,6 +257,7 @@ def register_observation(
         box=box,
         document=document,
         inputs=files,
+        copies=tuple(objects[1:]),
     )
 
 

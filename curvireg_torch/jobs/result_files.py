@@ -29,6 +29,8 @@ def write_result(
     result: Registration,
     image: Tensor,
     box: Tensor,
+    *,
+    copies: Sequence[Registration] = (),
 ) -> None:
     """Write the files of a result into the folder ``out``; ``document`` is the content of
     ``result.json``.
@@ -44,7 +46,7 @@ def write_result(
         out,
         document,
         len(mesh.faces),
-        lambda: png(registration_sheet(registrar, result, image, box, note=note)),
+        lambda: png(registration_sheet(registrar, result, image, box, note=note, copies=copies)),
         lambda: pose_glb(mesh, *result.projection, image),
     )
 

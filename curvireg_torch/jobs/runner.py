@@ -28,6 +28,7 @@ from ..utils.company import map_in_company
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
+from ..visualization.overlay import drawn_copies
 from ..visualization.sheet import thumbnail
 from .entry import Entry, observe
 from .options import with_advice
@@ -178,7 +179,9 @@ def _row(
             }
         return failed_row(error, seconds=seconds, **places)
     describer = registrar.of_model(found.model).describer
-    write_file(picture, thumbnail(describer, found.projection, found.image, found.box.tolist()))
+    box = found.box.tolist()
+    copies = drawn_copies(registrar, found.copies)
+    write_file(picture, thumbnail(describer, found.projection, found.image, box, copies))
     return {"message": "", **line_document(found.document)}
 
 

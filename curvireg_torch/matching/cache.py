@@ -18,7 +18,7 @@ import trimesh
 
 from ..errors import BankError, OutputError
 from ..geometry.viewpoint import ViewSphere
-from ..mesh.mesh import as_mesh, mesh_up
+from ..mesh.mesh import as_mesh, mesh_up, mesh_warnings
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
 from ..utils.files import tensor_digest, text_digest
@@ -157,7 +157,9 @@ def cached_bank(
         if bank_key(bank.mesh, bank.views, pipeline=bank.pipeline, renderer=renderer) == key:
             with suppress(OSError):  # a read-only cache
                 os.utime(path)
-            bank.mesh.units = mesh.units  # the file may have been stored in another one
+            # the file may have been stored in another unit, or of another file of this surface
+            bank.mesh.units = mesh.units
+            bank.mesh.metadata["warnings"] = mesh_warnings(mesh)
             bank.pipeline = pipeline  # pipelines that differ in ranking or search share a bank
             bank.described_views_file = (
                 _described_views_file(path) if bank.device.type == "cpu" else None

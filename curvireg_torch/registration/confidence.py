@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..calibration import CALIBRATION
@@ -32,7 +33,7 @@ EVIDENCE_FEATURES = (
     "concentration",
     "landmarks",
 )
-DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
+DOUBT_FEATURES = ("unmatched", "undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
@@ -166,17 +167,20 @@ def concentration(scores: Tensor, near: Tensor) -> float | None:
 
 def undetermined_axes(covariance: Tensor, symmetries: Tensor | None = None) -> float:
     """How many axes of rotation a fit leaves undetermined, in [0, 3]: the sum of the standard
-    deviations in radians about the three axes, each at most 1. 3 without a covariance (6, 6): one
-    that is NaN. The axis of a body of revolution, whose ``symmetries`` (S, 4, 4) are many, need not
-    be determined.
+    deviations in radians about the three principal axes of the rotation's covariance, each at most
+    1. 3 without a covariance (6, 6): one that is NaN. The axis of a body of revolution, whose
+    ``symmetries`` (S, 4, 4) are many, need not be determined.
 
     Example:
         >>> import torch
         >>> round(undetermined_axes(torch.diag(torch.tensor([0.01, 0.04, 9.0, 1.0, 1.0, 1.0]))), 3)
         1.3
     """
-    deviations = covariance.diagonal()[:3].clamp(min=0.0).sqrt()
-    undetermined = float(deviations.clamp(max=1.0).nan_to_num(1.0).sum())
+    rotation = covariance[:3, :3]
+    if not bool(rotation.isfinite().all()):
+        return 3.0
+    deviations = torch.linalg.eigvalsh(rotation.double()).clamp(min=0.0).sqrt()
+    undetermined = float(deviations.clamp(max=1.0).sum())
     is_round = symmetries is not None and len(symmetries) >= ROUND
     return max(undetermined - 1.0, 0.0) if is_round else undetermined
 
@@ -186,6 +190,7 @@ def confidence_features(
     scores: Tensor,
     share: float | None,
     *,
+    printed: float,
     undetermined: float,
     outside: float,
     border: float,
@@ -194,12 +199,16 @@ def confidence_features(
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
     similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
-    the largest of its rivals, clamped to +-5; None without rivals.
+    the largest of its rivals, clamped to +-5; None without rivals. unmatched: by how much
+    ``printed`` exceeds its landmarks: a print that the photograph does not show speaks against an
+    answer, and a mesh without print has none to find.
 
     Args:
         evidence: of the H hypotheses, the best first.
         scores: (H,) theirs, without keypoints, which a similar print beside the object has too.
         share: :func:`concentration` of the ranking.
+        printed: log (1 + n) with the number n of keypoints that a view of the mesh has; 0 where
+            keypoints are not looked for, as with a mesh without colours.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
         outside: fraction of the object that lies outside the photograph.
         border: number of the box's sides that lie on the border of the photograph.
@@ -218,6 +227,7 @@ def confidence_features(
         "contours": best["contours"],
         "concentration": share,
         "landmarks": best["landmarks"],
+        "unmatched": max(printed - best["landmarks"], 0.0),
         "undetermined": undetermined,
         "outside": outside,
         "border": border,

@@ -528,7 +528,10 @@ def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
         {
             "box": at.box.tolist(),
             "score": at.score,
+            "verdict": result.verdict,
             "confidence": result.confidence,
+            "reliable": result.reliable,
+            "warnings": [*result.warnings, *result.notes],
             **result.hypotheses[0].pose_dict(),
         }
         for result, at in found

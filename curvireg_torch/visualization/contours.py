@@ -2,6 +2,7 @@
 background."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -30,6 +31,16 @@ MAX_DENSITY = 80.0  # Largest multiple of a fit's number of points
 SHORT = 0.06
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """A mesh that is drawn: its describer, ``T_cam_from_model`` (4, 4) with the camera matrix
+    (3, 3), and its box in px."""
+
+    describer: ViewDescriber
+    projection: tuple[Tensor, Tensor] | None
+    box: Sequence[float] | None
+
+
 def line_width(size: Sequence[int]) -> float:
     """Width of the outline in px in a picture of ``size`` (H, W)."""
     return max(1.5, max(size) / 350)
@@ -52,12 +63,14 @@ def draw_window(
     window: Sequence[int],
     scale: float,
     box: Sequence[float] | None = None,
+    copies: Sequence[Drawn] = (),
 ) -> np.ndarray:
     """(H', W', 3) uint8 RGB: part of a (1 or 3, H, W) photograph with a mesh's contours, and a box
     in px below them.
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3); None draws no mesh.
     ``window`` is x0, y0, x1, y1 without the last column and row, and is resized by ``scale``.
+    ``copies`` are further meshes that are drawn.
     """
     x0, y0, x1, y1 = window
     picture = to_uint8(image[:, y0:y1, x0:x1])
@@ -73,22 +86,32 @@ def draw_window(
     # of pixel centres
     moved = [[fx, 0.0, fx * (0.5 - x0) - 0.5], [0.0, fy, fy * (0.5 - y0) - 0.5], [0.0, 0.0, 1.0]]
     resize = torch.tensor(moved, dtype=torch.float64)
-    if box is not None:
-        corners = resize @ torch.tensor(
-            [[box[0], box[2]], [box[1], box[3]], [1.0, 1.0]], dtype=torch.float64
-        )
-        start, end = corners[:2].mT.round().int().tolist()
-        width = max(1, round(line_width(picture.shape[:2]) / 3))
-        for colour, thickness in ((RIM, width + 2), (BOX, width)):
-            cv2.rectangle(picture, start, end, colour, thickness)
-    if projection is not None:
-        T, K = projection
-        K = resize @ K.cpu().double()
-        layer = contour_layer(describer, T, K, picture.shape[:2])
-        drawn = layer[..., 3] > 0
-        alpha = layer[drawn][:, 3:] / 255.0
-        picture[drawn] = np.round(alpha * layer[drawn][:, :3] + (1.0 - alpha) * picture[drawn])
+    for drawn in (*copies, Drawn(describer, projection, box)):
+        if drawn.box is not None:
+            _draw_box(picture, resize, drawn.box)
+        if drawn.projection is not None:
+            T, K = drawn.projection
+            layer = contour_layer(drawn.describer, T, resize @ K.cpu().double(), picture.shape[:2])
+            _paint(picture, layer)
     return picture
+
+
+def _draw_box(picture: np.ndarray, resize: Tensor, box: Sequence[float]) -> None:
+    """Draw a box in px of the photograph, of which ``resize`` (3, 3) makes px of the picture."""
+    x0, y0, x1, y1 = box
+    corners = resize @ torch.tensor([[x0, x1], [y0, y1], [1.0, 1.0]], dtype=torch.float64)
+    start, end = corners[:2].mT.round().int().tolist()
+    width = max(1, round(line_width(picture.shape[:2]) / 3))
+    for colour, thickness in ((RIM, width + 2), (BOX, width)):
+        cv2.rectangle(picture, start, end, colour, thickness)
+
+
+def _paint(picture: np.ndarray, layer: np.ndarray) -> None:
+    """Paint an (H, W, 4) layer over an (H, W, 3) picture."""
+    is_drawn = layer[..., 3] > 0
+    alpha = layer[is_drawn][:, 3:] / 255.0
+    paint = layer[is_drawn][:, :3]
+    picture[is_drawn] = np.round(alpha * paint + (1.0 - alpha) * picture[is_drawn])
 
 
 def contour_layer(

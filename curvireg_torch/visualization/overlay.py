@@ -19,7 +19,7 @@ from ..registration.result import pose_in_words, two_decimals
 from ..terms import crop_regions, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
-from .contours import close_up, draw_window
+from .contours import Drawn, close_up, draw_window
 from .encoding import to_uint8
 
 # px of the photograph's longer side in the picture
@@ -36,7 +36,12 @@ LEGEND = "Green: outline of the mesh at this pose. Orange: its inner edges. Whit
 
 
 def contour_overlay(
-    registrar: Registrar, result: Registration | Hypothesis, image: ImageLike, box: BoxLike
+    registrar: Registrar,
+    result: Registration | Hypothesis,
+    image: ImageLike,
+    box: BoxLike,
+    *,
+    copies: Sequence[Registration] = (),
 ) -> np.ndarray:
     """The photograph with the mesh's outline (green), its inner edges (orange) at the pose, and the
     box (white).
@@ -46,6 +51,7 @@ def contour_overlay(
             its ``projection``.
         image, box: the photograph, as the registrar takes it: a (1 or 3, H, W) tensor, an array or
             a path; (4,) px.
+        copies: further objects that :func:`.detect` found in it; they are drawn too.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -63,9 +69,21 @@ def contour_overlay(
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
     describer = registrar.of_model(getattr(result, "model", 0)).describer
+    more = drawn_copies(registrar, copies)
     return draw_window(
-        describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist()
+        describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist(), more
     )
+
+
+def drawn_copies(registrar: Registrar, copies: Sequence[Registration]) -> list[Drawn]:
+    """What is drawn of further objects that :func:`.detect` found."""
+    return [
+        Drawn(
+            registrar.of_model(copy.model).describer, copy.projection, copy.detection.box.tolist()
+        )
+        for copy in copies
+        if copy.detection is not None
+    ]
 
 
 def views_sheet(
@@ -151,7 +169,13 @@ def _field_picture(field: Tensor) -> np.ndarray:
 
 @torch.no_grad()
 def registration_sheet(
-    registrar: Registrar, result: Registration, image: ImageLike, box: BoxLike, *, note: str = ""
+    registrar: Registrar,
+    result: Registration,
+    image: ImageLike,
+    box: BoxLike,
+    *,
+    note: str = "",
+    copies: Sequence[Registration] = (),
 ) -> np.ndarray:
     """The photograph with the pose's contours and a caption; below it a close-up, the compared
     fields and the rivals.
@@ -173,12 +197,16 @@ def registration_sheet(
         960
     """
     item = image_item(image, as_numbers(box, "box"))
+    more = drawn_copies(registrar, copies)
     registrar = registrar.of_model(result.model)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
+    whole = (0, 0, W, H)
     photograph = draw_window(
-        registrar.describer, result.projection, item.image, (0, 0, W, H), scale, item.box.tolist()
+        registrar.describer, result.projection, item.image, whole, scale, item.box.tolist(), more
     )
+    if copies:
+        note = f"{1 + len(copies)} objects; words and small pictures: the best one. {note}"
     height = photograph.shape[0]
     width = max(NARROWEST, photograph.shape[1])
     count = 3 + len(result.hypotheses)

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
 from ..matching import ViewDescriber
 from ..utils.files import write_file
-from .contours import close_up, draw_window
+from .contours import Drawn, close_up, draw_window
 from .encoding import jpeg
 
 SIDE = 224  # longer side of a thumbnail in px
@@ -51,16 +52,23 @@ class SheetEntry:
 
 
 def thumbnail(
-    describer: ViewDescriber, projection: tuple[Tensor, Tensor], image: Tensor, box: Sequence[float]
+    describer: ViewDescriber,
+    projection: tuple[Tensor, Tensor],
+    image: Tensor,
+    box: Sequence[float],
+    copies: Sequence[Drawn] = (),
 ) -> bytes:
     """JPEG of a (3, H, W) uint8 photograph around a box in px, with the mesh's contours at the
     pose.
 
     ``projection`` is ``T_cam_from_model`` (4, 4) and the camera matrix (3, 3) of the photograph.
+    ``copies`` are further meshes that are drawn, each with its box.
     """
-    window = close_up(image.shape[-2:], box)
+    boxes = np.array([box, *(copy.box for copy in copies)])
+    around = [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
+    window = close_up(image.shape[-2:], around)
     scale = min(1.0, SIDE / max(window[2] - window[0], window[3] - window[1]))
-    return jpeg(draw_window(describer, projection, image, window, scale, box), 80)
+    return jpeg(draw_window(describer, projection, image, window, scale, box, copies), 80)
 
 
 def write_sheet(

@@ -41,6 +41,7 @@ from curvireg_torch.errors import LostObjectError
 from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
+from curvireg_torch.inspection.photographs import without_colours
 from curvireg_torch.registration import Follower
 from curvireg_torch.registration.confidence import (
     DOUBT_FEATURES,
@@ -64,7 +65,7 @@ SETS: dict[str, tuple[float, tuple[str, ...]]] = {
     "furniture": (1.0, (*FURNITURE, "--cad", "exact")),
     "shapes": (1.0, (*SHAPES, "--seed", "101")),
     "packages": (0.5, (*PRINTED, "--seed", "102")),
-    "shelves": (0.1, ("--kind", "shelf", "--objects", "6", "14", "--seed", "103")),
+    "shelves": (0.25, ("--kind", "shelf", "--objects", "6", "14", "--seed", "103")),
     "tied": (0.6, (*TIED, "--seed", "104")),
     "cut": (0.5, (*SHAPES, *CUT, "--seed", "105")),
     "cut_packages": (0.25, (*PRINTED, *CUT, "--seed", "106")),
@@ -112,15 +113,16 @@ UPRIGHT = (
     "similar",
     "sequences",
 )  # sets of which half stand upright
-GREY = (
-    "shapes",
-    "packages",
-    "shelves",
-    "cut",
-    "cut_packages",
-    "estimated_shapes",
-    "estimated_packages",
-)  # sets in which every third mesh loses its colours
+GREY = {
+    "shapes": 3,
+    "packages": 3,
+    "shelves": 2,
+    "cut": 3,
+    "cut_packages": 3,
+    "estimated_shapes": 3,
+    "estimated_packages": 3,
+}
+"""Sets in which every n-th mesh loses its colours."""
 
 RIGHT = 30.0  # degrees within which a registration is right
 # and fraction of the distance, within which a refined or tracked pose is right
@@ -318,6 +320,17 @@ def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
             }
 
 
+def is_grey(kind: str, obj_id: int) -> bool:
+    """Whether a mesh of a set loses its colours."""
+    return kind in GREY and obj_id % GREY[kind] == 0
+
+
+def mesh_of(path: Path, *, grey: bool) -> trimesh.Trimesh:
+    """The mesh in a file, ``grey`` without its colours."""
+    mesh = cr.load_mesh(path, unit="mm")
+    return without_colours(mesh) if grey else mesh
+
+
 def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     """Rows of one mesh's photographs."""
     kind, folder, pose, indices, beside = task
@@ -326,10 +339,8 @@ def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
     samples = [data[i] for i in indices]
     other = data[beside]
     pipeline = cr.Pipeline().with_pose_prior(pose)
-    mesh = cr.load_mesh(samples[0]["model_path"], unit="mm")
-    grey = kind in GREY and samples[0]["obj_id"] % 3 == 0
-    if grey:
-        mesh.visual = trimesh.visual.ColorVisuals()
+    grey = is_grey(kind, samples[0]["obj_id"])
+    mesh = mesh_of(samples[0]["model_path"], grey=grey)
     mesh_is = "similar" if "similar" in kind else "exact"
     registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is=mesh_is)
     if kind == "sequences":

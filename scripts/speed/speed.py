@@ -30,6 +30,7 @@ import argparse
 import json
 import os
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -202,6 +203,8 @@ def measured(
         ]
         _, usage, output = _shared.run_process(words, folder, environment)
         return {**json.loads(output.splitlines()[-1]), "megabytes": usage.ru_maxrss / 1024}
+    # another checkout refuses to replace files that it did not write
+    shutil.rmtree(folder / "out", ignore_errors=True)
     boxes = json.loads((folder / "boxes.json").read_text())
     words = ["-m", "curvireg_torch", "register", f"photo{EARLIER}.png", "mesh.ply", "--out", "out"]
     words += ["--box", *map(str, boxes[EARLIER]), "--camera", *map(str, CAMERA)]
@@ -239,6 +242,7 @@ def compare(
                     )
                 new = measured(step, checkout, folder, cache, photographs, device)
                 shutil.rmtree(cache, ignore_errors=True)
+                print(f"{step}, {name}: {cell(new)}", file=sys.stderr)
                 old = found[name].get(step, new)
                 found[name][step] = {key: min(old[key], value) for key, value in new.items()}
     return found

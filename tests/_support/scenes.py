@@ -12,6 +12,7 @@ from torch import Tensor
 from curvireg_torch import Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.registration.result import Detection
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 
 SIZE = (180, 240)
@@ -76,3 +77,22 @@ def truck_registrar(**changes: Any) -> Registrar:
 def write_photo(path: Path, image: Tensor) -> None:
     """Write a photograph (3, H, W) in [0, 1]."""
     assert cv2.imwrite(str(path), (image.permute(1, 2, 0).flip(-1) * 255).round().byte().numpy())
+
+
+def found_in(registrar, image, boxes):
+    """What detection might find in a photograph: an object in each box."""
+    boxes = torch.stack(boxes).double()
+    results = registrar([image] * len(boxes), boxes)
+    scores = torch.linspace(0.9, 0.5, len(boxes)).tolist()
+    found = zip(results, boxes, scores, strict=True)
+    return [
+        replace(result, detection=Detection(box, score, 7.0, boxes, torch.ones(len(boxes))))
+        for result, box, score in found
+    ]
+
+
+def two_trucks():
+    """A photograph (3, H, 2 W) of two trucks side by side, and their boxes."""
+    (left, first, _), (right, second, _) = scene(0), scene(1)
+    shift = torch.tensor([SIZE[1], 0.0, SIZE[1], 0.0])
+    return torch.cat([left, right], dim=2), [first, second + shift]

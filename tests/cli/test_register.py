@@ -319,6 +319,7 @@ def test_advice_names_what_was_measured_or_says_less():
 
 
 POSE = {"viewpoint": {"azimuth": 10.0, "elevation": 20.0, "theta": 0.0}, "translation": None}
+COPY = {**POSE, "box": [1, 2, 3, 4], "score": 0.9, "confidence": 0.64, "verdict": "unsure"}
 PRINTED = {
     **POSE,
     "score": 0.5,
@@ -355,6 +356,12 @@ PRINTED = {
             },
             "found in box 1 2 3 4: there with probability 0.90; azimuth 10.0, elevation 20.0, "
             "theta 0.0 degrees, at 4, 5.5, 6 mm",
+        ),
+        (
+            {"detection": {"instances": [COPY, {**COPY, "score": 0.7, "confidence": None}]}},
+            "2 objects, the best first:\nin box 1 2 3 4: there with probability 0.90; confidence "
+            "0.64, unsure; azimuth 10.0, elevation 20.0, theta 0.0 degrees\n"
+            "in box 1 2 3 4: there with probability 0.70; azimuth",
         ),
     ],
 )

@@ -4,20 +4,21 @@ text."""
 import os
 from dataclasses import replace
 
+import cv2
 import pytest
 import torch
 
 from curvireg_torch import Camera, Registrar, ViewBank, camera_matrix, sample_views
 from curvireg_torch.data import read_photo
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.jobs import lists, runner
+from curvireg_torch.jobs import lists, photograph, runner
 from curvireg_torch.jobs.entry import Entry, camera_of, observe
 from curvireg_torch.jobs.lists import find_photographs, list_photographs, read_list
 from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.pipeline import PRESETS
 from curvireg_torch.synthetic import example_mesh
 from tests._support.lists import table
-from tests._support.scenes import SIZE, scene, unrefined, write_photo
+from tests._support.scenes import SIZE, found_in, scene, two_trucks, unrefined, write_photo
 
 CAMERA = Camera(camera_matrix(260.0, 260.0, 119.5, 89.5))
 LENS = replace(CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0))
@@ -177,3 +178,48 @@ def test_names_are_in_the_order_of_their_numbers(tmp_path):
     assert [path.name for path in find_photographs(tmp_path)] == expected
     assert [path.name for path in find_photographs(tmp_path / "[ab]*.png")] == expected[3:8]
     assert find_photographs(tmp_path / "none.png") == [tmp_path / "none.png"]
+
+
+def test_every_copy_of_the_object_has_a_row_and_is_drawn(registrar, entry, tmp_path, monkeypatch):
+    image, boxes = two_trucks()
+    write_photo(tmp_path / "two.png", image)
+    found = found_in(registrar, image, boxes)
+    monkeypatch.setattr(photograph, "detect_items", lambda *_, **__: [found])
+    cells = {"photo": "two.png", "note": "shelf"}
+    shelf = Entry(cells, "two.png", tmp_path / "two.png", entry.meshes, instances=4)
+    located = replace(shelf, cells={"photo": "one", "note": ""}, photo=entry.photo, box=entry.box)
+    lost = Entry({"photo": "none", "note": ""}, "none", error="no such file")
+    counts = register_rows([shelf, located, lost], tmp_path / "out", registrar)
+    assert (counts.posed, len(counts.failures)) == (2, 1)
+    rows = table(tmp_path / "out")
+    assert [row["photo"] for row in rows] == ["two.png", "two.png", "one", "none"]
+    assert [row["instance"] for row in rows] == ["1", "2", "1", ""]
+    assert [row["note"] for row in rows] == ["shelf", "shelf", "", ""]
+    names = ("found_x0", "found_y0", "found_x1", "found_y1")
+    assert list(rows[0])[-5:] == ["instance", *names]
+    for row, box in zip(rows, [*boxes, torch.tensor(entry.box)], strict=False):
+        assert [float(row[name]) for name in names] == pytest.approx(box.tolist(), abs=0.01)
+    assert [rows[3][name] for name in names] == [""] * 4
+    for row, result in zip(rows, found, strict=False):
+        assert float(row["r11"]) == float(result.rotation[0, 0])
+        assert row["verdict"] == result.verdict
+        assert row["reliable"] == "false"
+    assert "2 objects" in (tmp_path / "out" / "index.html").read_text()
+    (picture,) = [
+        pixels
+        for path in (tmp_path / "out" / "thumbnails").iterdir()
+        if (pixels := cv2.imread(str(path))).shape[1] > 1.5 * pixels.shape[0]
+    ]
+    greenish = picture[..., 1].astype(int) - picture[..., 2] > 60
+    middle = picture.shape[1] // 2
+    assert greenish[:, :middle].sum() > 50
+    assert greenish[:, middle:].sum() > 50
+
+
+def test_columns_of_copies_are_reserved_only_where_copies_are_asked_for(tmp_path):
+    path = tmp_path / "list.csv"
+    path.write_text("photo,x0,y0,x1,y1,found_x0\na.png,,,,,7\n")
+    options = RegisterOptions(meshes=(tmp_path / "part.stl",))
+    assert read_list(path, options)[0].cells["found_x0"] == "7"
+    with pytest.raises(InvalidInputError, match="found_x0: names of result columns"):
+        read_list(path, replace(options, instances=2))

@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import curvireg_torch as cr
 from curvireg_torch.cli import main
+from curvireg_torch.data import Photo
+from curvireg_torch.jobs import photograph
+from curvireg_torch.jobs.entry import Entry, observe
 from curvireg_torch.jobs.outputs import MARKER
 from tests._support.exif import exif, with_exif
 from tests._support.lists import CAMERA, box_of, write_files
-from tests._support.scenes import learned_registrar, scene
+from tests._support.scenes import found_in, learned_registrar, scene, two_trucks
 
 
 @pytest.fixture(scope="module")
@@ -128,3 +131,27 @@ def test_a_bank_has_the_unit_and_the_axis_that_are_given(folder):
             cr.register(photo, bank, **given)
         with pytest.raises(cr.errors.InvalidInputError, match="unit, up: of a mesh file"):
             cr.register(photo, learned_registrar(), **given)
+
+
+def test_every_copy_is_drawn_and_saved(tmp_path, monkeypatch):
+    image, boxes = two_trucks()
+    registrar = learned_registrar()
+    found = found_in(registrar, image, boxes)
+    monkeypatch.setattr(photograph, "detect_items", lambda *_, **__: [found])
+    entry = Entry(name="two.png", photo=tmp_path / "two.png", meshes=(), instances=2)
+    picture = Photo((255 * image).round().byte(), 1, None, ())
+    result = photograph.register_observation(observe(entry, picture), registrar)
+    assert [copy.detection.box.tolist() for copy in result.copies] == [boxes[1].tolist()]
+    instances = result.document["detection"]["instances"]
+    assert [one["verdict"] for one in instances] == [one.verdict for one in found]
+    assert [one["reliable"] for one in instances] == [one.reliable for one in found]
+    result.save(tmp_path)
+    W = image.shape[2]
+    for drawn in (result.overlay(), cv2.imread(str(tmp_path / "overlay.png"))):
+        scale = drawn.shape[1] / W
+        outline = (drawn[: int(scale * image.shape[1])] == (0, 255, 80)).all(axis=2)
+        outline |= (drawn[: len(outline)] == (80, 255, 0)).all(axis=2)  # OpenCV's order
+        for box in boxes:
+            x0, _, x1, _ = (scale * box).int().tolist()
+            columns = np.nonzero(outline[:, x0:x1].any(axis=0))[0]
+            assert np.ptp(columns) > 0.8 * (x1 - x0)

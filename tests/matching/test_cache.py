@@ -15,7 +15,7 @@ from PIL import Image
 from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, bank_key, cache, cache_folder, cached_bank, list_cache
 from curvireg_torch.matching.cache import clear_cache
-from curvireg_torch.mesh.mesh import as_mesh, mesh_unit
+from curvireg_torch.mesh.mesh import as_mesh, mesh_unit, mesh_warnings
 from curvireg_torch.pipeline import BankSettings, Pipeline
 
 PIPELINE = Pipeline(bank=BankSettings(image_size=64))
@@ -75,6 +75,20 @@ def test_bank_of_another_unit_is_not_rendered_again(tmp_path, monkeypatch):
     mesh = trimesh.creation.box()
     assert mesh_unit(cached_bank(mesh, VIEWS, **options).mesh) is None
     assert len(list_cache(tmp_path)) == 1
+
+
+def test_a_bank_from_the_cache_has_the_warnings_of_this_mesh(tmp_path):
+    """The same surface in another file, of which a leftover was left out; and the other way."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    leftover = trimesh.Trimesh([[40.0, 0, 0], [40.01, 0, 0], [40.0, 0.01, 0]], [[0, 1, 2]])
+    with_leftover = trimesh.util.concatenate([ball, leftover])
+    found = [
+        cached_bank(mesh, VIEWS, pipeline=PIPELINE, folder=tmp_path, progress=False).mesh
+        for mesh in (ball, with_leftover, ball)
+    ]
+    assert len(list_cache(tmp_path)) == 1
+    kinds = [[warning.kind for warning in mesh_warnings(mesh)] for mesh in found]
+    assert kinds == [[], ["stray"], []]
 
 
 def test_cached_bank_is_loaded_the_second_time(tmp_path, monkeypatch):

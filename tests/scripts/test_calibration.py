@@ -8,7 +8,9 @@ import torch
 
 pytest.importorskip("sklearn")
 
+from curvireg_torch.mesh import has_colours
 from curvireg_torch.registration.framing import outside_fraction
+from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
 from scripts.calibration import calibrate
 from scripts.scenes.scene import cut, look_at
@@ -115,3 +117,13 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
     assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.08)
     assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.15)
     assert (fitted["slope"], fitted["resolution"]) == (1.5, 0.5)
+
+
+def test_grey_meshes_have_no_colours(tmp_path):
+    path = tmp_path / "painted.glb"
+    example_mesh(painted=True).export(path)
+    assert has_colours(calibrate.mesh_of(path, grey=False))
+    assert not has_colours(calibrate.mesh_of(path, grey=True))
+    assert calibrate.is_grey("shelves", 4)
+    assert not calibrate.is_grey("shelves", 3)
+    assert not calibrate.is_grey("wrong", 4)
