@@ -187,11 +187,13 @@ class ViewDescriber:
         return self._shaded(*self._framed(rotations, distances))
 
     @torch.no_grad()
-    def described(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
-        """:meth:`descriptors` and :meth:`shaded`, of the same depth images."""
-        depth, T, K = self._framed(rotations, distances)
+    def seen_by(self, T: Tensor, K: Tensor, *, shaded: bool) -> tuple[Tensor, Tensor | None]:
+        """Fields (N, 2, S, S) of poses (N, 4, 4) seen by cameras (N, 3, 3), and, if ``shaded``, the
+        pictures of :meth:`shaded`, of the same depth images."""
+        size = (self.settings.image_size,) * 2
+        depth = self.view_renderer.render(T, K, size, orthographic=self._orthographic)
         field = self.field(depth.to(self._device), K.to(self._device))
-        return self.descriptor(field), self._shaded(depth, T, K)
+        return field, self._shaded(depth, T, K) if shaded else None
 
     def _framed(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         T, K, _ = self.cameras(rotations, distances)

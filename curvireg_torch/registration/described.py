@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from ..fitting.together import details_together, evidence_together
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
 from ..utils.company import by_key, compute_together
+from .framing import Frame
 from .poses import Poses
 from .target import Target
 
@@ -31,6 +32,8 @@ class DescribedPhotograph:
             box.
         crops: of the box, for contour fits; None without them.
         keypoints: those found in the box; None where they do not count.
+        frame: in which poses are compared with it; None: each fills a picture, as views of the bank
+            do.
     """
 
     query: QueryFeatures
@@ -38,6 +41,7 @@ class DescribedPhotograph:
     descriptor: Tensor
     crops: EdgeCrops | None
     keypoints: KeypointMatches | None
+    frame: Frame | None = field(default=None, kw_only=True)
 
     @property
     def printed(self) -> float:
@@ -46,6 +50,7 @@ class DescribedPhotograph:
         return 0.0 if self.keypoints is None else math.log1p(self.keypoints.per_view)
 
 
+BACKGROUND = 1.0  # of pictures of the mesh
 VIEWS = "_described_views"  # attribute of ComparedPoses, computed on first use
 
 
@@ -110,9 +115,11 @@ class ComparedPoses:
         return views
 
     @property
-    def views_key(self) -> tuple[int, bool]:
+    def views_key(self) -> tuple[int, bool, bool]:
         """What poses have in common whose views are drawn together."""
-        return id(self.target.describer), Appearance.name in self.photograph.ranking.terms
+        photograph = self.photograph
+        has_appearance = Appearance.name in photograph.ranking.terms
+        return id(self.target.describer), has_appearance, photograph.frame is None
 
 
 def _views_of(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
@@ -122,14 +129,44 @@ def _views_of(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | 
 def _views_of_one_mesh(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
     target = requests[0].target
     counts = [len(request.poses) for request in requests]
-    rotation = torch.cat([request.poses.rotation for request in requests])
-    distance = torch.cat([request.poses.distance for request in requests])
-    if Appearance.name not in requests[0].photograph.ranking.terms:
-        views = target.describer.descriptors(rotation, distance)
+    shaded = Appearance.name in requests[0].photograph.ranking.terms
+    T, K = _cameras(requests)
+    fields, pictures = target.describer.seen_by(T, K, shaded=shaded)
+    if requests[0].photograph.frame is not None:
+        inside = _inside(requests).to(fields.device)
+        fields = fields * inside
+        pictures = None if pictures is None else pictures.masked_fill(~inside, BACKGROUND)
+    views = target.describer.descriptor(fields)
+    if pictures is None:
         return [(part, None) for part in views.split(counts)]
-    views, pictures = target.describer.described(rotation, distance)
     features = target.matcher.appearance_of(pictures)
     return list(zip(views.split(counts), features.split(counts), strict=True))
+
+
+def _cameras(requests: Sequence[ComparedPoses]) -> tuple[Tensor, Tensor]:
+    """Poses (N, 4, 4) and camera matrices (N, 3, 3) of the pictures in which poses are compared."""
+    if requests[0].photograph.frame is not None:
+        cameras = [
+            request.photograph.frame.transform @ request.poses.cameras
+            for request in requests
+            if request.photograph.frame is not None
+        ]
+        return torch.cat([request.poses.T for request in requests]), torch.cat(cameras)
+    rotation = torch.cat([request.poses.rotation for request in requests])
+    distance = torch.cat([request.poses.distance for request in requests])
+    T, K, _ = requests[0].target.describer.cameras(rotation, distance)
+    return T, K
+
+
+def _inside(requests: Sequence[ComparedPoses]) -> Tensor:
+    """(N, 1, S, S) bool pixels of the frames of poses that lie in the photographs."""
+    return torch.cat(
+        [
+            request.photograph.frame.inside.expand(len(request.poses), 1, -1, -1)
+            for request in requests
+            if request.photograph.frame is not None
+        ]
+    )
 
 
 def evidence_of(target: Target, photograph: DescribedPhotograph, poses: Poses) -> Evidence:

@@ -1,11 +1,15 @@
 """How far a photograph shows an object: what lies outside it, and boxes that its border cuts."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..geometry.cameras import project_points
+from ..geometry.crops import crop_transforms, image_transforms, square_boxes
+from ..pipeline import BankSettings
 
 BORDER = 1.5  # Pixels from the border within which a side of a box lies on it
 # By how much an object may go on beyond the border, as fractions of what is visible of it
@@ -67,6 +71,33 @@ def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
         torch.cat([box[:2] - extension * share * low, box[2:] + extension * share * high])
         for extension in EXTENSIONS
     ]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the crop of a box shows. In it, poses are compared as the photograph's camera sees them,
+    without what the border cuts off.
+
+    Attributes:
+        transform: (3, 3) from px of the photograph to those of the crop.
+        inside: (1, S, S) bool, pixels of the crop that lie in the photograph.
+    """
+
+    transform: Tensor
+    inside: Tensor
+
+    @classmethod
+    def of(cls, box: Tensor, size: tuple[int, int], settings: BankSettings) -> "Frame":
+        """The frame of a box (4,) in a photograph of ``size`` (H, W)."""
+        side = settings.image_size
+        square = square_boxes(box.double(), settings.margin)
+        to_photograph = image_transforms(square, side)
+        pixels = torch.arange(side, dtype=torch.float64)
+        x = to_photograph[0, 0] * pixels + to_photograph[0, 2]
+        y = to_photograph[1, 1] * pixels + to_photograph[1, 2]
+        x0, y0, x1, y1 = photograph_box(size)
+        inside = ((y >= y0) & (y <= y1))[:, None] & ((x >= x0) & (x <= x1))
+        return cls(crop_transforms(square, side), inside[None])
 
 
 def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> float:

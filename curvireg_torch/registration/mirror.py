@@ -74,7 +74,7 @@ def mirror_gain(
     quick, _ = with_quick_fit(image.describer, crops, starts)
     near = placed(quick, quick.quick, image.describer.centre)
     photograph = DescribedPhotograph(
-        work.query, Ranking.none(), work.descriptor, crops, keypoints=None
+        work.query, Ranking.none(), work.descriptor, crops, keypoints=None, frame=work.frame
     )
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
