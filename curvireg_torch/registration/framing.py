@@ -100,6 +100,11 @@ class Frame:
         return cls(crop_transforms(square, side), inside[None])
 
 
+def shown_in(frame: Frame | None, field: Tensor) -> Tensor:
+    """A field (..., S, S) without what lies outside the photograph; as it is without a frame."""
+    return field if frame is None else field * frame.inside.to(field.device)
+
+
 def outside_fraction(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> float:
     """Fraction of the outline's area that lies outside a photograph of ``size`` (H, W), in [0, 1].
 

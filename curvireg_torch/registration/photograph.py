@@ -14,7 +14,7 @@ from ..terms import QueryFeatures
 from .confidence import are_near
 from .described import evidence_of
 from .focal import FINISHED
-from .framing import Frame, border_sides, whole_boxes
+from .framing import shown_in, whole_boxes
 from .inputs import ImageItem, check_crop
 from .judging import judged
 from .mirror import compared_with_mirror_image
@@ -156,12 +156,11 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     if target.pipeline.contours:
         mask = target.object_mask(query, [item])
         crops = EdgeCrops.cut([item.image], item.box[None], target.bank.settings.margin, mask)
-    frame = _frame_of(target, item)
-    shown = query.field if frame is None else query.field * frame.inside.to(query.field.device)
+    frame = target.frame_of(item.box, item.size)
     return Work(
         query=query,
         ranking=ranking,
-        descriptor=target.describer.descriptor(shown),
+        descriptor=target.describer.descriptor(shown_in(frame, query.field)),
         crops=crops,
         keypoints=target.keypoint_matches(item, item.box) if target.uses_keypoints else None,
         item=item,
@@ -170,15 +169,6 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
         symmetries=symmetries,
         frame=frame,
     )
-
-
-def _frame_of(target: Target, item: ImageItem) -> Frame | None:
-    """The frame in which poses are compared if the border cuts the object."""
-    settings = target.bank.settings
-    is_cut = border_sides(item.box, item.size) > 0 and item.camera_matrix is not None
-    if not (target.is_exact and is_cut) or settings.camera == "orthographic":
-        return None
-    return Frame.of(item.box, item.size, settings)
 
 
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:

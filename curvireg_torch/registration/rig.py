@@ -26,6 +26,7 @@ from ..rendering.contours import ContourPoints
 from ..terms import crop_regions
 from .confidence import MAX_MARGIN, refinement_confidence
 from .described import DescribedPhotograph, evidence_of
+from .framing import shown_in
 from .inputs import ImageItem
 from .poses import Poses
 from .result import Hypothesis, Registration
@@ -142,6 +143,7 @@ class RigPhotograph(DescribedPhotograph):
             [image], boxes[:, None], size=settings.image_size, margin=settings.margin
         )[:, 0].float()
         query = target.matcher.features(crop.to(target.bank.device))
+        frame = target.frame_of(box, item.size)
         mask = target.object_mask(query, [replace(item, box=boxes[0])])
         return RigPhotograph(
             index=index,
@@ -152,7 +154,8 @@ class RigPhotograph(DescribedPhotograph):
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
             ranking=result.ranking,
-            descriptor=target.describer.descriptor(query.field),
+            descriptor=target.describer.descriptor(shown_in(frame, query.field)),
+            frame=frame,
             keypoints=target.keypoint_matches(item, box) if target.uses_keypoints else None,
             result=result,
         )

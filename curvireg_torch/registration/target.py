@@ -19,6 +19,7 @@ from ..mesh.mesh import mirrored
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
+from .framing import Frame
 from .inputs import ImageItem
 from .shape_symmetries import TellingSymmetries, telling_symmetries
 
@@ -82,6 +83,16 @@ class Target:
         if self.symmetries is not None or symmetries is None:
             return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
         return telling_symmetries(self.bank.mesh, symmetries)
+
+    def frame_of(self, box: Tensor, size: tuple[int, int]) -> Frame | None:
+        """The frame in which fitted poses are compared with a box (4,) of a photograph of ``size``
+        (H, W). None for a similar mesh, without the contour fit, and for orthographic views: a pose
+        that is not fitted is in no frame."""
+        settings = self.bank.settings
+        is_fitted = self.is_exact and self.pipeline.contours
+        if not is_fitted or settings.camera == "orthographic":
+            return None
+        return Frame.of(box, size, settings)
 
     @property
     def uses_keypoints(self) -> bool:

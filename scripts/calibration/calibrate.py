@@ -246,6 +246,7 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     is_rival = ~are_near(R.float(), R[0].float(), S)
     is_rival[0] = True
     row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
+    row |= {"evidence": evidence.table[is_rival].tolist()}
     row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
     best = result.hypotheses[0]
     if best.covariance is not None and row["errors"][0] < RIGHT:
