@@ -32,8 +32,8 @@ class DescribedPhotograph:
             box.
         crops: of the box, for contour fits; None without them.
         keypoints: those found in the box; None where they do not count.
-        frame: in which poses are compared with it; None: each fills a picture by itself, as views of
-            the bank do.
+        frame: in which poses are compared with it; None: each fills a picture by itself, as a view
+            of the bank does.
     """
 
     query: QueryFeatures

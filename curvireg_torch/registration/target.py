@@ -19,7 +19,7 @@ from ..mesh.mesh import mirrored
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
-from .framing import Frame
+from .framing import Frame, border_sides
 from .inputs import ImageItem
 from .shape_symmetries import TellingSymmetries, telling_symmetries
 
@@ -85,12 +85,14 @@ class Target:
         return telling_symmetries(self.bank.mesh, symmetries)
 
     def frame_of(self, box: Tensor, size: tuple[int, int]) -> Frame | None:
-        """The frame in which fitted poses are compared with a box (4,) of a photograph of ``size``
-        (H, W). None for a similar mesh, without the contour fit, and for orthographic views: a pose
-        that is not fitted is in no frame."""
+        """The frame in which fitted poses are compared with a box (4,) at the border of a
+        photograph of ``size`` (H, W). None inside of it: the view of a pose that is a little off
+        resembles the object more by itself. None for a similar mesh, without the contour fit, and
+        for orthographic views, too."""
         settings = self.bank.settings
         is_fitted = self.is_exact and self.pipeline.contours
-        if not is_fitted or settings.camera == "orthographic":
+        is_perspective = settings.camera != "orthographic"
+        if not (is_fitted and is_perspective and border_sides(box, size)):
             return None
         return Frame.of(box, size, settings)
 
