@@ -460,10 +460,10 @@ class Repeatability(Term):
             # A point in a cut cell counts as much as any other.
             points = cell_counts(query.points.flatten(0, 1), cell).flatten(1).float()
             # Most cells have no points. A float32 copy of the others at once would take longer than
-            # the product.
+            # the product, and near[few] ten times as long as index_select.
             matched = points.new_zeros(len(points), near.shape[1])
             for few in points.any(dim=0).nonzero()[:, 0].split(CELLS_AT_A_TIME):
-                matched.addmm_(points[:, few] / area[:, few], near[few].float())
+                matched.addmm_(points[:, few] / area[:, few], near.index_select(0, few).float())
             rep = matched / points.sum(dim=1, keepdim=True).clamp(
                 min=torch.finfo(torch.float32).tiny
             )

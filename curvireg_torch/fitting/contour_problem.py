@@ -30,6 +30,9 @@ SELECTIONS_PER_STEP = 3
 STALE_SHIFT = 0.6
 """Mean shift of the contour points in px after which the mesh's contours are found again."""
 
+NO_EDGE = 1e-30
+"""Strength below which there is no edge."""
+
 EDGE_DAMPING = 1e-2
 """Levenberg-Marquardt: fraction of the diagonal of J^T W J that is added to it."""
 
@@ -154,13 +157,13 @@ class ContourProblem(Rows):
             strength = strength * self.mask.weights(
                 uv, points, _offsets(radius, uv.device)[1:-1], self.image_index, self.size
             )
-        log = strength.log()
+        # The logarithm of 0 takes ten times as long as that of other numbers.
+        log = strength.clamp(min=NO_EDGE).log()
         residual = distance
         for _ in range(SELECTIONS_PER_STEP):
             # The largest strength times exp(-2 (residual / radius)^2)
-            index = torch.addcmul(log, residual, residual, value=-2.0 / radius**2).argmax(
-                dim=-1, keepdim=True
-            )
+            agreement = torch.addcmul(log, residual, residual, value=-2.0 / radius**2)
+            index = agreement.max(dim=-1, keepdim=True).indices  # faster than argmax
             tukey = (1.0 - (residual.gather(-1, index) / radius).square()).clamp(min=0.0).square()
             edges = Measurements(J, distance.gather(-1, index), strength.gather(-1, index) * tukey)
             A, b = (each.double() for each in edges.equations())

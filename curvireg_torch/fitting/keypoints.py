@@ -111,7 +111,8 @@ class KeypointMatches:
     """Features of a photograph that resemble keypoints of a mesh with a ``centre`` (3,) and a
     ``radius``: pixels ``uv`` (M, 2), ``points`` (M, 3) of the mesh, and where each pair alone has
     the object: ``centres`` (M,) in px, x + iy, and ``radii`` (M,) in px. ``K`` (3, 3) is the
-    camera; ``least`` must agree on a pose."""
+    camera; ``least`` must agree on a pose. A view of the mesh has ``per_view`` keypoints on
+    average."""
 
     uv: np.ndarray
     points: np.ndarray
@@ -121,6 +122,7 @@ class KeypointMatches:
     centre: np.ndarray
     radius: float
     least: int
+    per_view: float
 
     def poses(self) -> list[KeypointPose]:
         """Poses on which at least ``least`` agree, the largest number first."""
@@ -203,6 +205,8 @@ class Keypoints:
         found = map_on_threads(features, range(VIEWS))
         self._features = _Features.cat([features for features, _ in found])
         self._points = np.concatenate([points for _, points in found])
+        error = AGREEMENT * focal / VIEW_DISTANCE
+        self._per_view = float(np.mean([_places(features.uv, error) for features, _ in found]))
         # Of a feature of size 1 that is upright: the way to the object's centre, and the object's
         # radius, both in px.
         turn = np.exp(-1j * self._features.angle) / self._features.size
@@ -232,6 +236,7 @@ class Keypoints:
             centre=self._centre,
             radius=self._radius,
             least=self._least,
+            per_view=self._per_view,
         )
 
     def _photograph_features(self, image: Tensor, box: Tensor | None) -> _Features:

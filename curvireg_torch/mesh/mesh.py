@@ -274,6 +274,16 @@ def mesh_up(mesh: trimesh.Trimesh) -> str:
     return str(mesh.metadata.get("up", "z"))
 
 
+MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
+"""The reflection that makes the mirror image of a mesh: of its x axis."""
+
+
+def mirrored(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mirror image of a mesh's shape, without colours."""
+    vertices = np.asarray(mesh.vertices) @ MIRROR.numpy()
+    return trimesh.Trimesh(vertices, mesh.faces[:, ::-1], process=False)
+
+
 def cached_in_mesh(
     function: Callable[[trimesh.Trimesh], Found],
 ) -> Callable[[trimesh.Trimesh], Found]:

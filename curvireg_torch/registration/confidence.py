@@ -33,7 +33,7 @@ EVIDENCE_FEATURES = (
     "concentration",
     "landmarks",
 )
-DOUBT_FEATURES = ("undetermined", "outside", "border", "focal")  # the more, the worse
+DOUBT_FEATURES = ("unmatched", "undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
 MAX_MARGIN = 5.0  # Margins are clamped to +- this value
 UNCOMPARED_CONFIDENCE = 0.5  # Largest confidence in a result without rival views
@@ -190,6 +190,7 @@ def confidence_features(
     scores: Tensor,
     share: float | None,
     *,
+    printed: float,
     undetermined: float,
     outside: float,
     border: float,
@@ -198,12 +199,16 @@ def confidence_features(
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
     similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
-    the largest of its rivals, clamped to +-5; None without rivals.
+    the largest of its rivals, clamped to +-5; None without rivals. unmatched: by how much
+    ``printed`` exceeds its landmarks: a print that the photograph does not show speaks against an
+    answer, and a mesh without print has none to find.
 
     Args:
         evidence: of the H hypotheses, the best first.
         scores: (H,) theirs, without keypoints, which a similar print beside the object has too.
         share: :func:`concentration` of the ranking.
+        printed: log (1 + n) with the number n of keypoints that a view of the mesh has; 0 where
+            keypoints are not looked for, as with a mesh without colours.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
         outside: fraction of the object that lies outside the photograph.
         border: number of the box's sides that lie on the border of the photograph.
@@ -222,6 +227,7 @@ def confidence_features(
         "contours": best["contours"],
         "concentration": share,
         "landmarks": best["landmarks"],
+        "unmatched": max(printed - best["landmarks"], 0.0),
         "undetermined": undetermined,
         "outside": outside,
         "border": border,

@@ -1,5 +1,6 @@
 """A photograph as poses are compared with it, and the poses beside it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -37,6 +38,12 @@ class DescribedPhotograph:
     descriptor: Tensor
     crops: EdgeCrops | None
     keypoints: KeypointMatches | None
+
+    @property
+    def printed(self) -> float:
+        """log (1 + n) with the number n of keypoints that a view of the mesh has; 0 where they do
+        not count."""
+        return 0.0 if self.keypoints is None else math.log1p(self.keypoints.per_view)
 
 
 VIEWS = "_described_views"  # attribute of ComparedPoses, computed on first use

@@ -72,6 +72,7 @@ def judged(
         evidence[compared],
         evidence[compared].scores(replace(weights, landmarks=0.0)),
         concentration(work.ranking.scores[0], near),
+        printed=work.printed,
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,
         border=border_sides(work.item.box, work.item.size),

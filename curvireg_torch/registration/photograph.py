@@ -16,6 +16,7 @@ from .described import evidence_of
 from .focal import FINISHED
 from .inputs import ImageItem, check_crop
 from .judging import judged
+from .mirror import compared_with_mirror_image
 from .poses import (
     Poses,
     best_views,
@@ -135,7 +136,11 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
     outside = F.pad(outside, (0, len(sibling.poses)))
     siblings = len(sibling.poses)
     result = judged(target, work, poses, evidence, distinct, outside, siblings=siblings)
-    return replace(result, feature_is_hidden=sibling.feature_is_hidden)
+    result = replace(result, feature_is_hidden=sibling.feature_is_hidden)
+    if work.crops is None or not work.exact:
+        return result
+    best = best_inside(target, evidence, outside | ~distinct)
+    return compared_with_mirror_image(target, work, work.crops, poses[best], evidence[best], result)
 
 
 def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:

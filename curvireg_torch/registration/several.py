@@ -237,6 +237,7 @@ def _joint_features(
         mean,
         total,
         sum(known) / len(known) if known else None,
+        printed=max(p.printed for p in rig.photographs),
         undetermined=undetermined_axes(answer.covariance[0], rig.symmetries),
         outside=float(weights @ torch.tensor(outside).to(weights)),
         border=float(weights @ torch.tensor(border).to(weights)),

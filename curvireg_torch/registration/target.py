@@ -15,6 +15,7 @@ from ..evidence import RANK_ALONE, EvidenceWeights
 from ..fitting.keypoints import KeypointMatches, Keypoints
 from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
+from ..mesh.mesh import mirrored
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
@@ -122,6 +123,21 @@ class Target:
         return self.matcher.describer.with_settings(
             replace(settings, grid=min(2 * settings.grid, settings.image_size))
         )
+
+    @property
+    def mirror_image(self) -> "Target":
+        """The target of the mesh's mirror image, without colours."""
+        with _SHAPE_LOCK:  # photographs share it
+            return self._mirror_image
+
+    @cached_property
+    def _mirror_image(self) -> "Target":
+        describer = ViewDescriber(
+            mirrored(self.bank.mesh), self.describer.settings, device=self.bank.device
+        )
+        image = copy(self)
+        image.__dict__["describer"] = describer
+        return image
 
     @cached_property
     def detector(self) -> Detector:

@@ -22,6 +22,7 @@ COMPUTED = (
     "mesh_warnings",
     "telling_symmetries",
     "_keypoints",
+    "_mirror_image",
     "_workers",
 )
 SECONDS_TO_END = 20.0  # within which a process stores the features of views that it has described

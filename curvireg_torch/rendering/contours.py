@@ -115,7 +115,8 @@ class _Level:
         is_outside = (beyond_start & beyond_end) | ((beyond_start | beyond_end) & BEHIND)
         across = u.take(end) - u.take(start)
         down = v.take(end) - v.take(start)
-        length: np.ndarray = np.sqrt(across**2 + down**2) * (is_outside == 0)
+        length: np.ndarray = np.sqrt(across * across + down * down)
+        length[is_outside != 0] = 0.0
         return length
 
     def depth_at(
@@ -124,11 +125,12 @@ class _Level:
         """Depth (N, M) of the mesh at pixels (N, M, 2) that ``wanted`` (N, M) marks; inf elsewhere
         and beside the mesh."""
         focal_lengths = np.stack([K[:, 0, 0], K[:, 1, 1]], axis=1)
-        xy = (uv - K[:, None, :2, 2]) / focal_lengths[:, None]
-        rays = np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1) @ R
-        origins = np.broadcast_to((eye / self.radius)[:, None], rays.shape)
+        rays = np.ones((*wanted.shape, 3), np.float32)
+        rays[..., :2] = (uv - K[:, None, :2, 2]) / focal_lengths[:, None]
+        rays = rays @ R
+        origins = np.repeat(eye / self.radius, wanted.sum(axis=1), axis=0)
         depth = np.full(wanted.shape, np.inf, np.float32)
-        depth[wanted] = self._scene.distance(origins[wanted], rays[wanted]) * self.radius
+        depth[wanted] = self._scene.distance(origins, rays[wanted]) * self.radius
         return depth
 
 
@@ -209,8 +211,10 @@ class _Views:
         pixel = self.pixels(places.at)
         step = np.float32(CREASE_SCALE * self.size)
         is_seen = valid & (self.depth_at(pixel, valid) > z - VISIBLE_TOLERANCE * radius)
-        ahead = self.depth_at(pixel + step * places.normal, is_seen)
-        back = self.depth_at(pixel - step * places.normal, is_seen)
+        aside = step * places.normal
+        on_both_sides = np.concatenate([pixel + aside, pixel - aside], axis=1)
+        depth = self.depth_at(on_both_sides, np.concatenate([is_seen, is_seen], axis=1))
+        ahead, back = np.split(depth, 2, axis=1)
         with np.errstate(invalid="ignore"):
             bend = np.abs(ahead - 2.0 * z + back) / step * self.K[:, :1, 0] / z
             largest_jump = np.maximum(np.abs(ahead - z), np.abs(back - z))
@@ -341,25 +345,30 @@ def _spread(
     """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose``
     (M,) are the edges' poses, ascending. Returns (N, count): the number of the edge, the fraction
     of its length, whether there is one."""
-    end = np.concatenate([[0.0], np.nan_to_num(length).cumsum(dtype=np.float64)])
+    # Lengths up to each edge; poses after the last edge are within an endless one.
+    before = np.zeros(len(length) + 2)
+    np.cumsum(length, out=before[1:-1])
+    before[-1] = np.inf
     borders = np.searchsorted(pose, np.arange(poses + 1))
     first = borders[:-1, None]
     last = np.maximum(borders[1:, None] - 1, 0)
-    total = np.diff(end[borders])[:, None]
-    target = end[first] + (np.arange(count) + 0.5) / count * total
-    number = np.clip(np.searchsorted(end, target) - 1, first, last)
-    length_of_edge = np.diff(end, append=np.inf)[number]
-    fraction = (target - end[number]) / np.maximum(length_of_edge, 1e-30)
-    has_edges = np.broadcast_to(total > 0, number.shape).copy()
+    total = np.diff(before[borders])[:, None]
+    target = before[first] + (np.arange(count) + 0.5) / count * total
+    number = np.clip(np.searchsorted(before, target) - 1, first, last)
+    start = before[number]
+    length_of_edge = before[number + 1] - start
+    fraction = (target - start) / np.maximum(length_of_edge, 1e-30)
+    has_edges = np.broadcast_to(total > 0, number.shape)
     return number, fraction.clip(0.0, 1.0).astype(np.float32), has_edges
 
 
 def _evenly(valid: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Indices (N, most) of valid entries (N, M), evenly chosen where there are more, and which are
     not padding."""
-    order = np.argsort(~valid, axis=1, kind="stable")
     count = valid.sum(axis=1, keepdims=True)
+    column = np.append(np.nonzero(valid)[1], 0)
+    first = count.cumsum()[:, None] - count
     place = np.arange(most)[None]
-    rank = np.where(count > most, (place * np.maximum(count, 1)) // most, place)
-    index = np.take_along_axis(order, np.minimum(rank, valid.shape[1] - 1), axis=1)
-    return index, place < count
+    rank = np.where(count > most, place * count // most, place)
+    is_point = place < count
+    return column[np.where(is_point, first + rank, -1)], is_point

@@ -106,7 +106,7 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
         "concentration": 0.3,
         "landmarks": 1.0,
     }
-    tied |= {"undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
+    tied |= {"unmatched": 1.0, "undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
     decisive = ("similarity", "edge_support") if exact else ("similarity",)
     for name in decisive:
         more = confidence.probability_of_any({**tied, name: tied[name] + 0.1}, exact=exact)
@@ -126,6 +126,7 @@ def test_confidence_features():
     )
     scores = torch.tensor([5.5, 2.0, 3.0], dtype=torch.float64)
     doubts = {"undetermined": 0.2, "outside": 0.25, "border": 1.0, "focal": 0.3}
+    given = {**doubts, "printed": 3.5}
     expected = {
         "similarity": 0.7,
         "margin": 2.5,
@@ -133,17 +134,18 @@ def test_confidence_features():
         "contours": 0.9,
         "concentration": 0.3,
         "landmarks": 2.0,
+        "unmatched": 1.5,
         **doubts,
     }
-    assert confidence.confidence_features(evidence, scores, 0.3, **doubts) == pytest.approx(
-        expected
-    )
+    assert confidence.confidence_features(evidence, scores, 0.3, **given) == pytest.approx(expected)
     for factor in (10.0, -10.0):
-        margin = confidence.confidence_features(evidence, factor * scores, 0.3, **doubts)["margin"]
+        margin = confidence.confidence_features(evidence, factor * scores, 0.3, **given)["margin"]
         assert margin == math.copysign(5.0, factor)
-    unknown = {**doubts, "focal": 3.0}
+    no_print = {**given, "printed": 0.0}
+    assert confidence.confidence_features(evidence, scores, 0.3, **no_print)["unmatched"] == 0.0
+    unknown = {**given, "focal": 3.0}
     assert confidence.confidence_features(evidence, scores, 0.3, **unknown)["focal"] == 1.0
-    alone = confidence.confidence_features(evidence[:1], scores[:1], None, **doubts)
+    alone = confidence.confidence_features(evidence[:1], scores[:1], None, **given)
     assert alone["margin"] is alone["concentration"] is None
 
 

@@ -1,0 +1,98 @@
+"""The mirror image of a mesh beside the mesh."""
+
+import pytest
+import torch
+import trimesh
+
+from curvireg_torch import Registrar, ViewBank, sample_views
+from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
+from curvireg_torch.registration import mirror
+from curvireg_torch.registration.poses import Poses
+from tests._support.poses import poses as random_poses
+from tests._support.scenes import CAMERA, learned_registrar, scene
+
+
+def chiral_mesh() -> trimesh.Trimesh:
+    parts = [
+        trimesh.creation.box((1.0, 0.6, 0.4)),
+        trimesh.creation.box((0.3, 0.3, 0.5)).apply_translation((0.5, 0.2, 0.3)),
+        trimesh.creation.box((0.2, 0.7, 0.2)).apply_translation((-0.4, 0.4, 0.1)),
+    ]
+    return trimesh.util.concatenate(parts)
+
+
+def placed_at(T: torch.Tensor, mesh: trimesh.Trimesh) -> Poses:
+    nothing = torch.zeros(len(T))
+    cameras = CAMERA.expand(len(T), 3, 3)
+    return Poses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())
+
+
+def test_symmetric_shapes_have_no_other_mirror_image():
+    turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
+    half = chiral_mesh()
+    both = trimesh.util.concatenate([half, mirrored(half).apply_translation((-3.0, 0.0, 0.0))])
+    for mesh in (trimesh.creation.box((1, 2, 3)), trimesh.creation.cone(1.0, 2.0), both):
+        assert mirror.reflection_planes(mesh) is None
+        assert mirror.reflection_planes(mesh.copy().apply_transform(turn)) is None
+    planes = mirror.reflection_planes(chiral_mesh())
+    torch.testing.assert_close(planes @ planes.T, torch.eye(3).double())
+
+
+def test_mirrored_mesh_is_inside_out_nowhere():
+    mesh = chiral_mesh()
+    image = mirrored(mesh)
+    assert image.volume == pytest.approx(mesh.volume)
+    assert image.bounds[0, 0] == -mesh.bounds[1, 0]
+
+
+def test_reflected_poses_show_the_mesh_reflected():
+    mesh = chiral_mesh()
+    T = random_poses(1, seed=4)
+    pose = placed_at(T, mesh)
+    planes = torch.eye(3).double()
+    found = mirror.reflected_poses(pose, planes, mesh_centre(mesh), mesh_centre(mirrored(mesh)))
+    vertices = torch.from_numpy(mesh.vertices.copy())
+    images = vertices @ MIRROR
+    seen = vertices @ T[0, :3, :3].T + T[0, :3, 3]
+    position = T[0, :3, :3] @ mesh_centre(mesh) + T[0, :3, 3]
+    towards = torch.nn.functional.normalize(position, dim=0)
+    normals = [*(T[0, :3, :3] @ planes.T).T, towards]
+    assert len(found) == 4
+    for T_image, normal in zip(found.T, normals, strict=True):
+        away = (seen - position) @ normal
+        expected = seen - 2.0 * away[:, None] * normal
+        torch.testing.assert_close(images @ T_image[:3, :3].T + T_image[:3, 3], expected)
+        assert torch.linalg.det(T_image[:3, :3]) == pytest.approx(1.0)
+
+
+def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
+    image, box, _ = scene(0)
+    known = learned_registrar()
+    for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
+        monkeypatch.setattr(mirror, "mirror_gain", lambda *_, gain=gain: gain)
+        result = known([image], box[None], CAMERA)[0]
+        assert (mirror.WARNING in result.warnings) == is_doubted
+        assert result.reliable != is_doubted
+        if is_doubted:
+            assert result.confidence < 0.5
+
+
+def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
+    gains = []
+    measure = mirror.mirror_gain
+
+    def recorded(*given):
+        gains.append(measure(*given))
+        return gains[-1]
+
+    monkeypatch.setattr(mirror, "mirror_gain", recorded)
+    image, box, _ = scene(0)
+    own = learned_registrar()
+    assert own([image], box[None], CAMERA)[0].reliable
+    views = sample_views(azimuth_step=15, elevations=[0, 20, 40, 60])
+    mesh = mirrored(own.bank.mesh)
+    bank = ViewBank.build(mesh, views, image_size=96, progress=False)
+    monkeypatch.setattr(mirror, "LEAST_CONFIDENCE", 0.0)
+    flipped = Registrar(bank)([image], box[None], CAMERA)[0]
+    assert mirror.WARNING in flipped.warnings
+    assert gains[0] < 0.0 < gains[1]
