@@ -6,14 +6,18 @@ import torch
 import trimesh
 
 from curvireg_torch.geometry import camera_matrix
+from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration.framing import (
+    Frame,
     border_sides,
     clipped,
     outside_fraction,
     outside_warnings,
+    shown_in,
+    whole_boxes,
 )
 from curvireg_torch.registration.inputs import image_item
-from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
+from tests._support.scenes import CAMERA, SIZE, errors, learned_registrar, scene
 
 SQUARE = torch.from_numpy(trimesh.creation.box((1.0, 1.0, 0.001)).vertices.copy())
 K = camera_matrix(100.0, 100.0, 49.5, 39.5, dtype=torch.float64)
@@ -84,3 +88,42 @@ def test_a_cut_object_has_a_warning_and_is_not_reliable():
     whole = learned_registrar()([image], box[None], CAMERA)[0].confidence_features
     assert (whole["border"], whole["outside"]) == (0, pytest.approx(0.0, abs=0.02))
     assert np.prod(SIZE) > part[0].numel()
+
+
+def test_whole_boxes_go_on_beyond_the_border_alone():
+    size = (100, 200)
+    inside = torch.tensor([10.0, 20.0, 60.0, 50.0])
+    assert whole_boxes(inside, size) == []
+    corner = torch.tensor([150.0, 60.0, 199.5, 99.5])
+    near, far = whole_boxes(corner, size)
+    expected = torch.tensor([150.0, 60.0, 199.5 + 0.4 * 49.5, 99.5 + 0.4 * 39.5])
+    torch.testing.assert_close(near, expected)
+    assert (far - corner).tolist() == pytest.approx([0.0, 0.0, 1.2 * 49.5, 1.2 * 39.5], abs=1e-4)
+    across = torch.tensor([-0.5, 20.0, 199.5, 50.0])
+    wide = whole_boxes(across, size)[0]
+    assert (wide - across).tolist() == pytest.approx([-40.0, 0.0, 40.0, 0.0])
+
+
+def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
+    # a square of 80 px without margin that goes on for 20 px to the left and 30 px below
+    settings = BankSettings(image_size=16, margin=0.0)
+    box = torch.tensor([-20.5, 49.5, 59.5, 129.5])
+    frame = Frame.of(box, (100, 200), settings)
+    corners = torch.tensor([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]]).double()
+    expected = torch.tensor([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]]).double()
+    torch.testing.assert_close(corners @ frame.transform.T, expected)
+    columns = torch.arange(16) >= 4
+    rows = torch.arange(16) < 10
+    assert frame.inside.equal((rows[:, None] & columns)[None])
+    field = torch.ones(1, 2, 16, 16)
+    assert float(shown_in(frame, field).sum()) == 2 * 10 * 12
+    assert shown_in(None, field) is field
+
+
+@pytest.mark.parametrize("seed", [9, 11])
+def test_half_of_an_object_at_the_border_gives_its_pose(seed):
+    image, box, T = scene(seed)
+    end = int(0.5 * (box[0] + box[2]))
+    visible = torch.tensor([box[0], box[1], end - 0.5, box[3]])
+    result = learned_registrar()([image[..., :end]], visible[None], CAMERA)[0]
+    assert errors(result, T)[0] < 10.0
