@@ -281,7 +281,7 @@ MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 def mirrored(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mirror image of a mesh's shape, without colours."""
     vertices = np.asarray(mesh.vertices) @ MIRROR.numpy()
-    return trimesh.Trimesh(vertices, mesh.faces[:, ::-1], process=False)
+    return trimesh.Trimesh(vertices, mesh.faces[:, [0, 2, 1]], process=False)
 
 
 def cached_in_mesh(

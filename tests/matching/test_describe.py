@@ -95,9 +95,11 @@ def test_shading_and_apparent_ridges_see_the_surface_of_perspective_views(truck,
         bank.descriptors, describe.descriptor(describe.fields(*at)), rtol=0, atol=2e-3
     )
     torch.testing.assert_close(describe.descriptors(*at), describe.descriptor(describe.fields(*at)))
-    torch.testing.assert_close(
-        describe.described(*at)[0], describe.descriptor(describe.fields(*at))
-    )
+    T, K, _ = describe.cameras(*at)
+    field, pictures = describe.seen_by(T, K, shaded=True)
+    torch.testing.assert_close(field, describe.fields(*at))
+    torch.testing.assert_close(pictures, describe.shaded(*at))
+    assert describe.seen_by(T, K, shaded=False)[1] is None
 
 
 def test_an_orthographic_view_is_rendered_once_for_all_distances(truck):

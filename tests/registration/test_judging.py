@@ -64,6 +64,7 @@ def judgement(
     outside: list[bool] | None = None,
     pipeline: Pipeline | None = None,
     scores: list[float] | None = None,
+    printed: float = 0.0,
     **changes: Any,
 ) -> Registration:
     H = len(poses)
@@ -88,7 +89,7 @@ def judgement(
     known = {"limits": None, "symmetries": None}
     known |= {name: changes.pop(name) for name in list(changes) if name in known}
     vars(item).update(changes)
-    work: Any = SimpleNamespace(exact=True, item=item, ranking=ranking, **known)
+    work: Any = SimpleNamespace(exact=True, item=item, ranking=ranking, printed=printed, **known)
     return judged(
         target,
         work,
@@ -165,7 +166,10 @@ def test_doubts_are_those_of_the_best_pose():
     poses.covariance[1] = known
     evidence = evidence_of(similarity=[0.5, 0.6])
     box = torch.tensor([-0.5, 60.0, 150.0, 120.0])
-    features = judgement(poses, evidence, focal_deviation=0.25, box=box).confidence_features
+    features = judgement(
+        poses, evidence, focal_deviation=0.25, box=box, printed=3.0
+    ).confidence_features
+    assert features["unmatched"] == 3.0
     assert features["undetermined"] == pytest.approx(0.6)
     assert features["focal"] == 0.25
     assert features["border"] == 1

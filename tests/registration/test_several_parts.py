@@ -42,6 +42,7 @@ def photograph(index: int, **changes: Any) -> Any:
         camera=EYE,
         K=torch.eye(3).double(),
         size=(100, 200),
+        printed=0.0,
         box=torch.tensor([10.0, 10.0, 50.0, 50.0]),
     )
 
@@ -186,6 +187,7 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     second.size = (300, 200)
     third.size = (100, 200)
     second.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
+    second.printed = 3.5
     found = {0: first, 1: second, 2: third}
     scores = SCORES | {2: [1.0, 1.0, 1.0]}
     result = joint(monkeypatch, found, scores, vote={0: 0.5, 1: 1.0, 2: 0.5})
@@ -194,4 +196,5 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     assert features["outside"] == pytest.approx(0.25 * 0.1 + 0.5 * 0.3 + 0.25 * 0.1)
     assert features["border"] == pytest.approx(0.5 * 2)
     assert features["undetermined"] == 3.0
+    assert features["unmatched"] == pytest.approx(3.5 - features["landmarks"])
     assert result.warnings == ("a", "b")
