@@ -159,6 +159,8 @@ def test_keypoints_agree_with_the_poses_of_their_object():
     )
     counts = matches.agreeing(torch.stack([T, other, *off]))
     assert float(counts[:2].min()) >= FitSettings().min_keypoints
+    # about what a view of the mesh has, in which the print is in full view
+    assert 0.5 * matches.per_view < float(counts[:2].min()) < matches.per_view
     assert float(counts[2:].max()) < 0.5 * float(counts[0])
     twice = replace(
         matches, uv=matches.uv.repeat(2, axis=0), points=matches.points.repeat(2, axis=0)
