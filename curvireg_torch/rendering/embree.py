@@ -286,7 +286,7 @@ class RasterRenderer(EmbreeRenderer):
         cv2.triangleRasterizeDepth(
             self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings
         )
-        background = z > far - 0.5 * BESIDE
+        is_object = z <= far - 0.5 * BESIDE
         z *= np.float32(self._radius)
-        z[background] = 0.0
+        z *= is_object
         return z
