@@ -44,7 +44,8 @@ from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
 FORMAT_VERSION = 9
-PIXELS_AT_A_TIME = 2**20  # of views that a thread holds in memory, about 60 bytes each
+PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
+TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
 PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
@@ -372,8 +373,8 @@ class ViewBank:
 
 
 def views_at_a_time(image_size: int) -> int:
-    """How many views a thread describes together: a multiple of four, which share a rendering."""
-    return 4 * max(1, PIXELS_AT_A_TIME // (4 * image_size**2))
+    """How many views a thread describes together: all turns of some directions."""
+    return TURNS * max(1, PIXELS_AT_A_TIME // (TURNS * image_size**2))
 
 
 def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:
