@@ -192,7 +192,7 @@ class HOG(FunctionModule):
 
     def with_quarter_turn(self, field: Tensor) -> tuple[Tensor, Tensor]:
         """Descriptors (B, D) of square fields (B, 2, S, S), and of the same rotated clockwise by 90
-        degrees, at two thirds of the time of both."""
+        degrees, at three quarters of the time of both."""
         both = _hog(field, bin_weights=self.bin_weights, **self.options, with_quarter_turn=True)
         upright, sideways = both.chunk(2, dim=1)
         return upright, sideways
