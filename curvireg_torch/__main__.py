@@ -16,7 +16,7 @@ def main() -> int:
     if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     # imports make 400,000 objects that stay: look for cycles among them less often
-    gc.set_threshold(10_000)
+    gc.set_threshold(100_000)
     code = run()
     gc.freeze()  # and not at exit
     return code

@@ -7,7 +7,7 @@ from .cache import cache_folder as cache_folder
 from .cache import cached_bank as cached_bank
 from .cache import clear_cache as clear_cache
 from .cache import list_cache as list_cache
+from .cells import distinct_views as distinct_views
 from .describe import ViewDescriber as ViewDescriber
 from .matcher import Ranking as Ranking
 from .matcher import ViewMatcher as ViewMatcher
-from .matcher import distinct_views as distinct_views

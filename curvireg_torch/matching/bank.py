@@ -33,16 +33,17 @@ from ..mesh.mesh import (
 )
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
-from ..terms import Precision, Whitening, ledoit_wolf
+from ..terms import Appearance, Precision, Whitening, ledoit_wolf
 from ..utils.checks import check_finite, check_option, check_symmetries, check_tensor
 from ..utils.choices import UNITS, UP_AXES
-from ..utils.files import tensor_digest, write_tensors
+from ..utils.files import tensor_checksum, write_tensors
 from ..utils.likes import MeshLike
 from ..utils.threads import single_threaded_pool
+from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
 PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
@@ -91,6 +92,7 @@ class ViewBank:
         self._points = tensors["points"]
         self._silhouettes = tensors["silhouettes"]
         self.appearance = tensors.get("appearance")
+        self._packings: dict[float, Packing] = {}
 
     def __len__(self) -> int:
         return len(self.views)
@@ -119,6 +121,12 @@ class ViewBank:
     def distances(self) -> Tensor:
         """(N,) float64 distances of the object's centre, in the mesh's unit."""
         return self.views.distance.to(self.device, torch.float64) * mesh_radius(self.mesh)
+
+    def packing(self, angle: float) -> Packing:
+        """Views that stand for the others, more than ``angle`` degrees apart."""
+        if angle not in self._packings:
+            self._packings[angle] = packing_of_views(self.rotations, angle)
+        return self._packings[angle]
 
     @cached_property
     def whitening(self) -> Whitening:
@@ -243,6 +251,10 @@ class ViewBank:
         # another device rounds differently: a file has the features of a CPU
         on_cpu = bank.device.type == "cpu"
         bank.described_views_file = self.described_views_file if on_cpu else None
+        bank._packings = {
+            angle: Packing(*(x.to(device) for x in packing))
+            for angle, packing in self._packings.items()
+        }
         return bank
 
     @property
@@ -272,6 +284,9 @@ class ViewBank:
         contents["extreme_points"] = extreme_points(self.mesh)
         if not has_colours(self.mesh):
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
+        angle = self._compared_angle()
+        if angle is not None:
+            contents |= {f"packing.{name}": x for name, x in self.packing(angle)._asdict().items()}
         metadata = {
             "format": FORMAT,
             "version": str(FORMAT_VERSION),
@@ -280,9 +295,20 @@ class ViewBank:
             "unit": mesh_unit(self.mesh) or "",
             "up": mesh_up(self.mesh),
             "warnings": json.dumps([asdict(warning) for warning in mesh_warnings(self.mesh)]),
-            "checksum": tensor_digest(contents, size=16),
+            "packing": json.dumps(angle),
+            "checksum": tensor_checksum(contents),
         }
         write_tensors(Path(path), contents, metadata)
+
+    def _compared_angle(self) -> float | None:
+        """How far apart the views are that a photograph's appearance is compared with; None if it
+        is compared with all, or with none."""
+        angles = [
+            term.min_angle
+            for term in self.pipeline.terms
+            if isinstance(term, Appearance) and len(self) > term.exhaustive_limit
+        ]
+        return angles[0] if angles else None
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: torch.device | str = "cpu") -> "ViewBank":
@@ -310,7 +336,7 @@ class ViewBank:
                     )
                     raise BankError(message, subject=path, kind="bank")
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-            if metadata["checksum"] != tensor_digest(tensors, size=16):
+            if metadata["checksum"] != tensor_checksum(tensors):
                 raise BankError(
                     f"changed since it was written (its checksum differs); {REBUILD}",
                     subject=path,
@@ -325,6 +351,7 @@ class ViewBank:
                 MeshWarning(str(one["kind"]), str(one["text"])) for one in noticed
             )
             _check_contents(views, pipeline.bank, tensors)
+            packings = _packings(tensors, json.loads(metadata["packing"]), len(views))
         except BankError:
             raise
         except (SafetensorError, OSError) as error:
@@ -339,7 +366,9 @@ class ViewBank:
             raise BankError(
                 f"incomplete bank ({reason}); {REBUILD}", subject=path, kind="bank"
             ) from error
-        return cls(mesh, views, pipeline, tensors).to(device)
+        bank = cls(mesh, views, pipeline, tensors)
+        bank._packings = packings
+        return bank.to(device)
 
 
 def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:
@@ -475,6 +504,24 @@ def _check_contents(
         or not (tensors["boxes"][:, 2:] > tensors["boxes"][:, :2]).all()
     ):
         raise ValueError("descriptors that are all zero, or empty boxes")
+
+
+def _packings(
+    tensors: Mapping[str, Tensor], angle: float | None, count: int
+) -> dict[float, Packing]:
+    """The packing that a file holds of its ``count`` views, by its angle."""
+    if angle is None:
+        return {}
+    packing = Packing(tensors["packing.representatives"], tensors["packing.cells"])
+    for index, limit in (
+        (packing.representatives, count),
+        (packing.cells, len(packing.representatives)),
+    ):
+        if index.dtype != torch.int64 or int(index.min()) < 0 or int(index.max()) >= limit:
+            raise ValueError("packing: not of the bank's views")
+    if packing.representatives.ndim != 1 or packing.cells.shape != (count,):
+        raise ValueError("packing: not of the bank's views")
+    return {float(angle): packing}
 
 
 def _unpack(packed: Tensor, size: int) -> Tensor:

@@ -1,21 +1,90 @@
-"""A coarse packing of a bank's views, and the appearance of its views, described once and stored
-beside the bank."""
+"""Views far apart from each other, which stand for all views of a bank, and the appearance of
+views, described once and stored beside the bank."""
 
+import math
 import weakref
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from ..errors import OutputError
-from ..utils.files import tensor_digest, write_tensors
+from ..utils.checks import check_symmetries
+from ..utils.files import tensor_checksum, write_tensors
 
+ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 MAX_STORED_VIEWS = 2048
 """Views whose appearance is kept, 35 kB each at 128 px. A packing of the 7200 default views at 20
 degrees has 942."""
+
+
+class Packing(NamedTuple):
+    """Of N views a few, far enough apart, that stand for the others.
+
+    Attributes:
+        representatives: (C,) their indices.
+        cells: (N,) for each view, which representative is nearest to it.
+    """
+
+    representatives: Tensor
+    cells: Tensor
+
+
+def packing_of_views(rotations: Tensor, angle: float) -> Packing:
+    """Representatives of views with rotations (N, 3, 3), more than ``angle`` degrees apart. They
+    are the same for every photograph, so that few views of a mesh are ever described."""
+    every = torch.arange(len(rotations), device=rotations.device)
+    representatives = distinct_views(every, rotations, count=len(rotations), angle=angle)
+    return Packing(representatives, cells_of_views(rotations, representatives))
+
+
+def distinct_views(
+    order: Tensor,
+    rotations: Tensor,
+    *,
+    count: int,
+    angle: float = 30.0,
+    symmetries: Tensor | None = None,
+) -> Tensor:
+    """Best views that are more than ``angle`` degrees from every better selected one.
+
+    Args:
+        order: (N,) view indices, best first.
+        rotations: (N, 3, 3) of the views.
+        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from
+            :func:`curvireg_torch.geometry.symmetry_transforms`: views that differ by one of them
+            count as the same.
+
+    Returns:
+        (K,) view indices, best first, K <= count.
+
+    Example:
+        >>> from curvireg_torch.geometry import rotation_from_viewpoint
+        >>> R = rotation_from_viewpoint(torch.tensor([0.0, 10.0, 90.0]), 0.0)
+        >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
+        [1, 2]
+    """
+    symmetries = torch.eye(3)[None] if symmetries is None else symmetries
+    check_symmetries(symmetries)
+    R, S = (
+        x.detach().cpu().float().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations))
+    )  # many small steps
+    flat = R.reshape(-1, 9).T
+    least = 1.0 + 2.0 * math.cos(math.radians(min(angle, 180.0))) - ROUNDING_OF_TRACE
+    selected: list[int] = []
+    available = np.ones(len(R), bool)
+    for view in order.tolist():
+        if len(selected) == count:
+            break
+        if available[view]:
+            selected.append(view)
+            available &= ((R[view] @ S).reshape(-1, 9) @ flat).max(axis=0) < least
+    return torch.tensor(selected, dtype=torch.long, device=order.device)
 
 
 def cells_of_views(rotations: Tensor, representatives: Tensor) -> Tensor:
@@ -92,7 +161,7 @@ def _read_features(path: Path) -> dict[int, Tensor]:
             tensors = {name: file.get_tensor(name) for name in ("views", "features")}
     except (OSError, SafetensorError):
         return {}
-    if metadata.get("checksum") != tensor_digest(tensors, size=16):
+    if metadata.get("checksum") != tensor_checksum(tensors):
         return {}
     return dict(zip(tensors["views"].tolist(), tensors["features"], strict=True))
 
@@ -110,4 +179,4 @@ def _store(path: Path, features: dict[int, Tensor], stored: set[int]) -> None:
         "features": torch.stack([together[view] for view in views]),
     }
     with suppress(OutputError):  # a read-only or full cache: they are described again
-        write_tensors(path, tensors, {"checksum": tensor_digest(tensors, size=16)})
+        write_tensors(path, tensors, {"checksum": tensor_checksum(tensors)})

@@ -1,13 +1,11 @@
 """All views of a bank ranked for every photograph of a batch, and the selection of distinct
 views."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -28,18 +26,17 @@ from ..terms import (
     photograph_field,
     whole_box_shapes,
 )
-from ..utils.checks import as_boxes, check_pixels, check_symmetries
+from ..utils.checks import as_boxes, check_pixels
 from ..utils.company import by_key, compute_together
 from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
 from .bank import VIEWS_AT_A_TIME, ViewBank, packed
-from .cells import DescribedViews, best_cells, cells_of_views
+from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells
 from .describe import ViewDescriber, hog_layer
 
 # attributes that follow from bank and pipeline
-_PREPARED = ("_terms", "_described_views", "_packing", "describer")
-ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
+_PREPARED = ("_terms", "_described_views", "describer")
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
 FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
@@ -110,50 +107,6 @@ class Ranking:
             )
             for b in range(len(self))
         ]
-
-
-def distinct_views(
-    order: Tensor,
-    rotations: Tensor,
-    *,
-    count: int,
-    angle: float = 30.0,
-    symmetries: Tensor | None = None,
-) -> Tensor:
-    """Best views that are more than ``angle`` degrees from every better selected one.
-
-    Args:
-        order: (N,) view indices, best first.
-        rotations: (N, 3, 3) of the views.
-        symmetries: (S, 3, 3) or (S, 4, 4) of the model, from
-            :func:`curvireg_torch.geometry.symmetry_transforms`: views that differ by one of them
-            count as the same.
-
-    Returns:
-        (K,) view indices, best first, K <= count.
-
-    Example:
-        >>> from curvireg_torch.geometry import rotation_from_viewpoint
-        >>> R = rotation_from_viewpoint(torch.tensor([0.0, 10.0, 90.0]), 0.0)
-        >>> distinct_views(torch.tensor([1, 0, 2]), R, count=2).tolist()
-        [1, 2]
-    """
-    symmetries = torch.eye(3)[None] if symmetries is None else symmetries
-    check_symmetries(symmetries)
-    R, S = (
-        x.detach().cpu().float().numpy() for x in (rotations, symmetries[:, :3, :3].to(rotations))
-    )  # many small steps
-    flat = R.reshape(-1, 9).T
-    least = 1.0 + 2.0 * math.cos(math.radians(min(angle, 180.0))) - ROUNDING_OF_TRACE
-    selected: list[int] = []
-    available = np.ones(len(R), bool)
-    for view in order.tolist():
-        if len(selected) == count:
-            break
-        if available[view]:
-            selected.append(view)
-            available &= ((R[view] @ S).reshape(-1, 9) @ flat).max(axis=0) < least
-    return torch.tensor(selected, dtype=torch.long, device=order.device)
 
 
 class ViewMatcher(nn.Module):
@@ -422,7 +375,7 @@ class ViewMatcher(nn.Module):
             score = term.log_score(raw)
         elif len(log):
             R = self.bank.rotations
-            representatives, cells = self._packing
+            representatives, cells = self.bank.packing(term.min_angle)
             selected = [representatives[best_cells(row, cells, count=term.top)] for row in log]
             compared = torch.cat(selected).unique()
             similarity = appearance.compare(query, self._features_of_views(compared)).to(log)
@@ -432,19 +385,6 @@ class ViewMatcher(nn.Module):
                 traces = R.flatten(1) @ R[index].flatten(1).T
                 score[b] = term.log_score(raw[b : b + 1, index])[0, traces.argmax(dim=1)]
         return log + term.weight * score, {term.name: raw}
-
-    @cached_property
-    def _packing(self) -> tuple[Tensor, Tensor]:
-        """(C,) views that are at least the appearance term's ``min_angle`` apart, and (N,) the
-        nearest of these to each view. They are the same for every photograph, so that few views of
-        a mesh are ever described."""
-        assert self._appearance is not None
-        R = self.bank.rotations
-        every = torch.arange(len(R), device=R.device)
-        representatives = distinct_views(
-            every, R, count=len(R), angle=self._appearance.term.min_angle
-        )
-        return representatives, cells_of_views(R, representatives)
 
     def _features_of_views(self, views: Tensor) -> Tensor:
         """(U, D) features of (U,) ascending views: from the bank, described before, or described

@@ -36,6 +36,8 @@ class TellingSymmetries:
 def telling_symmetries(mesh: trimesh.Trimesh, symmetries: Tensor) -> TellingSymmetries:
     """Those of the symmetries (S, 4, 4) of a mesh's shape that a small feature tells from the
     identity; at most ``MAX_SIBLINGS``, far from each other."""
+    if len(symmetries) == 1:
+        return TellingSymmetries(symmetries)
     chosen = spread(symmetries)
     fractions = feature_fractions(mesh, chosen)
     telling = fractions > FEATURE_FRACTION

@@ -12,6 +12,7 @@ import secrets
 import signal
 import sys
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path, PureWindowsPath
@@ -293,10 +294,25 @@ def file_digest(path: Path) -> str:
 
 def tensor_digest(tensors: Mapping[str, "Tensor"], *, size: int = 8) -> str:
     """``2 * size`` hexadecimal digits of named tensors: names, dtypes, shapes and values."""
+    digest = hashlib.blake2b(digest_size=size)
+    for part in _parts_of(tensors):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def tensor_checksum(tensors: Mapping[str, "Tensor"]) -> str:
+    """8 hexadecimal digits that show damage of what :func:`tensor_digest` is of, in a fifth of its
+    time; other tensors may have the same ones."""
+    checksum = 0
+    for part in _parts_of(tensors):
+        checksum = zlib.crc32(part, checksum)
+    return f"{checksum:08x}"
+
+
+def _parts_of(tensors: Mapping[str, "Tensor"]) -> Iterator[bytes | memoryview]:
+    """What digests of named tensors are of, in the order of names."""
     import torch
 
-    digest = hashlib.blake2b(digest_size=size)
     for name, x in sorted(tensors.items()):
-        digest.update(f"{name} {x.dtype} {tuple(x.shape)}".encode())
-        digest.update(x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data)
-    return digest.hexdigest()
+        yield f"{name} {x.dtype} {tuple(x.shape)}".encode()
+        yield x.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().data

@@ -22,7 +22,7 @@ from curvireg_torch.mesh.mesh import extreme_points
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
-from curvireg_torch.utils.files import tensor_digest
+from curvireg_torch.utils.files import tensor_checksum
 from tests._support.scenes import learned_registrar, scene
 
 UPRIGHT = ViewPolicy(pose="upright", azimuth_step=120.0, elevations=(10.0,))
@@ -165,7 +165,7 @@ def with_nan(x):
 def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
     tensors = load_file(saved)
     tensors[name] = change(tensors[name]).contiguous()
-    rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
+    rewrite(saved, tensors, checksum=tensor_checksum(tensors))
     with pytest.raises(BankError, match=message):
         ViewBank.load(saved)
 
@@ -196,7 +196,7 @@ def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):
             function(mesh)
     tensors = load_file(path)
     tensors["view_mesh.faces"] += 10**6
-    rewrite(path, tensors, checksum=tensor_digest(tensors, size=16))
+    rewrite(path, tensors, checksum=tensor_checksum(tensors))
     with pytest.raises(BankError, match="view_mesh: faces name vertices"):
         ViewBank.load(path)
 
@@ -221,8 +221,40 @@ def test_features_of_another_network_are_a_bank_error(saved):
     registrar.bank.save(saved)
     tensors = load_file(saved)
     tensors["appearance"] = tensors["appearance"][:, :-1].contiguous()
-    rewrite(saved, tensors, checksum=tensor_digest(tensors, size=16))
+    rewrite(saved, tensors, checksum=tensor_checksum(tensors))
     image, box, _ = scene(0)
     (result,) = Registrar(ViewBank.load(saved))([image], box[None])
     assert isinstance(result.error, BankError)
     assert "appearance of" in str(result.error)
+
+
+def test_a_bank_stores_the_views_that_stand_for_the_others(truck, tmp_path, monkeypatch):
+    pipeline = Pipeline(views=UPRIGHT).with_term("appearance", exhaustive_limit=0, min_angle=50.0)
+    bank = build(truck, pipeline=pipeline)
+    bank.save(path := tmp_path / "bank.safetensors")
+    monkeypatch.setattr(bank_module, "packing_of_views", None)  # would fail
+    stored = ViewBank.load(path).packing(50.0)
+    for part, expected in zip(stored, bank.packing(50.0), strict=True):
+        assert torch.equal(part, expected)
+    with pytest.raises(TypeError):
+        ViewBank.load(path).packing(40.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("representatives", lambda x: x + 1000),
+        ("representatives", lambda x: x[:, None]),
+        ("cells", lambda x: -1 - x),
+        ("cells", lambda x: x.int()),
+        ("cells", lambda x: x[1:]),
+    ],
+)
+def test_load_refuses_a_packing_of_other_views(truck, tmp_path, name, change):
+    pipeline = Pipeline(views=UPRIGHT).with_term("appearance", exhaustive_limit=0, min_angle=50.0)
+    build(truck, pipeline=pipeline).save(path := tmp_path / "bank.safetensors")
+    tensors = load_file(path)
+    tensors[f"packing.{name}"] = change(tensors[f"packing.{name}"]).contiguous()
+    rewrite(path, tensors, checksum=tensor_checksum(tensors))
+    with pytest.raises(BankError, match="packing: not of the bank's views"):
+        ViewBank.load(path)

@@ -2,10 +2,12 @@ import csv
 import os
 import signal
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
@@ -149,7 +151,10 @@ def test_finite_numbers_accepts_finite_numbers_only() -> None:
         assert files.finite_numbers(values, 2) is None
 
 
-def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
+@pytest.mark.parametrize("digest", [files.tensor_digest, files.tensor_checksum])
+def test_tensor_digest_depends_on_name_dtype_shape_and_values(
+    digest: Callable[[Mapping[str, Tensor]], str],
+) -> None:
     x = torch.arange(4.0)
     others = [
         {"b": x},
@@ -159,11 +164,16 @@ def test_tensor_digest_depends_on_name_dtype_shape_and_values() -> None:
         {"a": x, "b": x},
         {"a": x.bfloat16()},
     ]
-    found = {files.tensor_digest(tensors) for tensors in ({"a": x}, *others)}
+    found = {digest(tensors) for tensors in ({"a": x}, *others)}
     assert len(found) == 1 + len(others)
     strided = torch.stack([x, x], dim=1)[:, 0].requires_grad_()
-    assert files.tensor_digest({"a": strided}) == files.tensor_digest({"a": x})
-    assert len(files.tensor_digest({"a": torch.tensor(True)}, size=16)) == 32
+    assert digest({"a": strided}) == digest({"a": x})
+
+
+def test_digests_have_as_many_digits_as_they_say() -> None:
+    tensors = {"a": torch.tensor(True)}
+    assert len(files.tensor_digest(tensors, size=16)) == 32
+    assert len(files.tensor_checksum(tensors)) == 8
 
 
 def test_file_name_has_no_folders():
