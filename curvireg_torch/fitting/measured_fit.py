@@ -140,4 +140,5 @@ def contour_evidence(
     most_points = torch.maximum(outline_points, within.sum(dim=1))
     of_outline = (excess * on_outline).sum(dim=1) / outline_points.clamp(min=1)
     of_inner = (excess * within).sum(dim=1) / most_points.clamp(min=1)
-    return of_outline + of_inner
+    evidence: Tensor = of_outline + of_inner
+    return evidence
