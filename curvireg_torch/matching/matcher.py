@@ -413,7 +413,7 @@ class ViewMatcher(nn.Module):
     def appearance_of(self, pictures: Tensor) -> Tensor:
         """(H, D) features of ``pictures`` (H, C, S, S) by the appearance term."""
         assert self._appearance is not None
-        return self._appearance.describe(pictures, together=True)
+        return self._appearance.describe(pictures)
 
     @in_full_precision
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, features: Tensor) -> Tensor:

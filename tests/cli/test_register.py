@@ -71,6 +71,22 @@ def test_register_upright_mesh_with_another_up_axis(
     assert float(rotation_error(found, scene(0)[2][:3, :3] @ up_rotation(up))) < 15
 
 
+def test_an_upright_mesh_that_is_not_recognised_is_told_which_axis_was_taken_as_up(
+    folder, register_one, document, capsys
+):
+    """OBJ names no axis; many programs write y up, and z is assumed."""
+    mesh = example_mesh()
+    mesh.vertices = mesh.vertices[:, [0, 2, 1]] * (1, 1, -1)
+    mesh.export(folder / "y.obj")
+    hint = "--pose upright: z of the mesh is taken as up; --up names another"
+    words = ("--pose", "upright", "--preset", "fast", "--unit", "m")
+    assert register_one(*words, mesh="y.obj") == 0
+    assert document()["confidence"] is None or document()["confidence"] < 0.5
+    assert hint in capsys.readouterr().out
+    assert register_one(*words, "--up", "y", mesh="y.obj") == 0
+    assert hint not in capsys.readouterr().out
+
+
 def test_register_checks_box_and_camera_before_it_opens_a_bank(register_one, refused, monkeypatch):
     monkeypatch.setattr(
         "curvireg_torch.jobs.opening.open_registrar", lambda *_: pytest.fail("opened")

@@ -63,7 +63,7 @@ class Browser:
         parts = self.driver.find_elements("css selector", '[data-testid^="message-"]')
         return [part.text for part in parts if part.text]
 
-    def wait(self, condition, what, seconds=90):
+    def wait(self, condition, what, seconds=300):
         deadline = time.monotonic() + seconds
         error = None
         while True:
@@ -73,7 +73,8 @@ class Browser:
                 error = None
             except Exception as caught:  # the page is not ready
                 error = caught
-            assert time.monotonic() < deadline, f"{what}; page says {self.messages()!r}; {error}"
+            said = f"{self.text('progress')!r}, {self.messages()!r}"
+            assert time.monotonic() < deadline, f"{what}; page says {said}; {error}"
             time.sleep(0.1)
 
     def click(self, name):
