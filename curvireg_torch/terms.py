@@ -583,13 +583,11 @@ class AppearanceModule(Backbone):
         super().__init__()
         self.term = term
 
-    def describe(self, pictures: Tensor, *, together: bool = False) -> Tensor:
+    def describe(self, pictures: Tensor) -> Tensor:
         """(N, D) features of pictures of views: (N, 1, S, S) grey, or (N, 4, S, S) grey and in the
-        mesh's colours; ``together`` if the same ones always come together."""
+        mesh's colours."""
         kinds = [pictures[:, :1], pictures[:, 1:]]
-        return torch.cat(
-            [describe(kind, self, together=together) for kind in kinds if kind.shape[1]], dim=1
-        )
+        return torch.cat([describe(kind, self) for kind in kinds if kind.shape[1]], dim=1)
 
     def compare(self, query: QueryFeatures, features: Tensor) -> Tensor:
         """(B, N) raw scores of B photographs and the (N, D) features of N views."""

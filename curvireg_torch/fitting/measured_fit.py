@@ -126,15 +126,19 @@ def contour_evidence(
     uv = pixels(points.model, T, problem.K, problem.centre)
     angle = torch.arange(CHANCE_DIRECTIONS) * (2.0 * math.pi / CHANCE_DIRECTIONS)
     shifts = CHANCE_SHIFT * torch.stack([angle.cos(), angle.sin()], dim=1).to(uv)
-    by_chance = torch.stack(
-        [problem.strength_near(uv + shift, points.normals) for shift in shifts]
-    ).mean(dim=0)
+    places = torch.cat([uv[None], uv + shifts[:, None, None]])  # as predicted, and shifted
+    copies = len(places)
+    every = torch.arange(len(T), device=T.device).repeat(copies)
+    normals = points.normals.repeat(copies, 1, 1)
+    strength = problem[every].strength_near(places.flatten(0, 1), normals)
+    strength = strength.unflatten(0, (copies, len(T)))
     counted = points.valid & (problem.edges.counts(uv, points.valid, image_index) > 0)
-    excess = problem.strength_near(uv, points.normals) - by_chance
+    excess = strength[0] - strength[1:].mean(dim=0)
     on_outline = counted & points.outline
     within = counted & ~points.outline
     outline_points = on_outline.sum(dim=1)
     most_points = torch.maximum(outline_points, within.sum(dim=1))
     of_outline = (excess * on_outline).sum(dim=1) / outline_points.clamp(min=1)
     of_inner = (excess * within).sum(dim=1) / most_points.clamp(min=1)
-    return of_outline + of_inner
+    evidence: Tensor = of_outline + of_inner
+    return evidence

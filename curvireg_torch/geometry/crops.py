@@ -239,4 +239,4 @@ class _Resampling:
             )
             weights = (1.0 - (samples - centre[:, None]).abs() / width[:, None]).clamp(min=0.0)
             parts.append((weights / weights.sum(dim=1, keepdim=True)).to(part) @ part)
-        return torch.cat(parts, dim=1)[:, order.argsort()]
+        return torch.cat(parts, dim=1).index_select(1, order.argsort())

@@ -44,7 +44,8 @@ from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
 FORMAT_VERSION = 9
-VIEWS_AT_A_TIME = 24  # Views that a thread holds in memory, about 60 bytes x image_size^2 each
+PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
+TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
 PIXEL_BITS = (128, 64, 32, 16, 8, 4, 2, 1)  # of eight pixels in a byte
 EXTREME_TOLERANCE = 0.02  # radii by which the points that bound projections may miss the mesh's box
@@ -217,7 +218,7 @@ class ViewBank:
         appearance = None if term is None else term.build().to(device)
 
         on_cpu = torch.device(device).type == "cpu"
-        at_a_time = VIEWS_AT_A_TIME if on_cpu else VIEWS_ON_DEVICE
+        at_a_time = views_at_a_time(describe.settings.image_size) if on_cpu else VIEWS_ON_DEVICE
 
         def describe_chunk(start: int) -> dict[str, Tensor]:
             chunk = (
@@ -369,6 +370,11 @@ class ViewBank:
         bank = cls(mesh, views, pipeline, tensors)
         bank._packings = packings
         return bank.to(device)
+
+
+def views_at_a_time(image_size: int) -> int:
+    """How many views a thread describes together: all turns of some directions."""
+    return TURNS * max(1, PIXELS_AT_A_TIME // (TURNS * image_size**2))
 
 
 def view_frame(mesh: trimesh.Trimesh, policy: ViewPolicy) -> Tensor:

@@ -240,14 +240,13 @@ class ViewDescriber:
         field = self.field(depth, K)
         points = field_points(field, fraction=self.settings.point_fraction)[:, 0]
         silhouettes = depth[:, 0] > 0
-        descriptors = self.descriptor(field)
-        if not bool(rendered.all()):
+        if bool(rendered.all()):
+            descriptors = self.descriptor(field)
+        else:
             selected = quarters.to(self._device), (rendered.cumsum(0) - 1)[source].to(self._device)
-            sideways = self.descriptor(
-                torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3))
-            )
-            halves = (self.descriptor.rotated_by_180(x) for x in (descriptors, sideways))
-            descriptors = torch.stack([descriptors, sideways, *halves])[selected]
+            turned = self.descriptor.with_quarter_turn(field)
+            halves = (self.descriptor.rotated_by_180(x) for x in turned)
+            descriptors = torch.stack([*turned, *halves])[selected]
             masks = torch.stack([points, silhouettes])
             points, silhouettes = torch.stack([masks.rot90(-k, (2, 3)) for k in range(4)], dim=1)[
                 :, *selected

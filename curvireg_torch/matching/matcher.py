@@ -31,7 +31,7 @@ from ..utils.company import by_key, compute_together
 from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
-from .bank import VIEWS_AT_A_TIME, ViewBank, packed
+from .bank import ViewBank, packed, views_at_a_time
 from .cells import ROUNDING_OF_TRACE, DescribedViews, best_cells
 from .describe import ViewDescriber, hog_layer
 
@@ -343,9 +343,10 @@ class ViewMatcher(nn.Module):
         of them, by all terms but appearance; mu and Sigma of whitened descriptors are those of the
         bank."""
         radius = mesh_radius(self.bank.mesh)
+        at_a_time = views_at_a_time(self.bank.settings.image_size)
         parts = zip(
-            views.rotations.split(VIEWS_AT_A_TIME),
-            views.distance.split(VIEWS_AT_A_TIME),
+            views.rotations.split(at_a_time),
+            views.distance.split(at_a_time),
             strict=True,
         )
         described = [packed(self.describer(R, distance * radius)) for R, distance in parts]
@@ -412,7 +413,7 @@ class ViewMatcher(nn.Module):
     def appearance_of(self, pictures: Tensor) -> Tensor:
         """(H, D) features of ``pictures`` (H, C, S, S) by the appearance term."""
         assert self._appearance is not None
-        return self._appearance.describe(pictures, together=True)
+        return self._appearance.describe(pictures)
 
     @in_full_precision
     def appearance_score(self, query: QueryFeatures, ranking: Ranking, features: Tensor) -> Tensor:

@@ -182,7 +182,7 @@ class MeshSource:
                 kind, f"{first} is missing beside it; the mesh is shown without these colours"
             )
         else:
-            text = f"{first} lies outside of its folder and is left out; name its folder"
+            text = f"{first} lies outside of its folder and is left out; name its folder (textures)"
             self.warn(kind, text)
         return None
 

@@ -165,7 +165,8 @@ class _Parts:
         path = self._find(name)
         if path is None:
             self._source.warn(
-                "link", f"the mesh {name[:100]} is missing in its folder; name its folder"
+                "link",
+                f"the mesh {name[:100]} is missing in its folder; name its folder (textures)",
             )
             return None
         if path not in self._meshes:

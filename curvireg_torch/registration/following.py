@@ -207,7 +207,7 @@ class Follower:
     def _registration(self, tracked: TrackedPose, item: ImageItem) -> Registration:
         """The result of a tracked pose, without ranking and without rivals."""
         describer = self.registrar.describer
-        T = tracked.state.T
+        T = tracked.state.T.clone()  # a tensor like any other, not one of inference mode
         none = torch.zeros(1, dtype=torch.long)
         poses = Poses.at(T, item.K[None], describer.centre, none, none)
         poses = replace(

@@ -136,6 +136,7 @@ class Tracker:
         self._regions = RegionModel()
         self.accept(first)
 
+    @torch.inference_mode()
     def measure(self, image: Tensor, K: Tensor, T: Tensor) -> TrackedPose:
         """The pose ``T`` (4, 4) in an image (C, H, W) with camera matrix ``K`` (3, 3), as it is;
         errors as :meth:`start`."""
@@ -143,6 +144,7 @@ class Tracker:
         frame = self._frame(image, K, start)
         return self._tracked(frame, frame.problem.state(start), [])
 
+    @torch.inference_mode()
     def track(self, image: Tensor, K: Tensor) -> TrackedPose:
         """The pose in the next frame (C, H, W) with camera matrix ``K`` (3, 3);
         :class:`LostObjectError` if it left the image, or pixels around it are outside [0, 1]."""
@@ -157,6 +159,7 @@ class Tracker:
             raise LostObjectError("the object has left the photograph")
         return max(found, key=lambda pose: pose.confidence)
 
+    @torch.inference_mode()
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
         self._poses = [*self._poses[-1:], pose.state.T]
@@ -164,6 +167,7 @@ class Tracker:
         self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
 
+    @torch.inference_mode()
     def covariance(self, pose: TrackedPose) -> Tensor:
         """(6, 6) of a pose, see :func:`curvireg_torch.registration.fit_contours`."""
         problem = pose.frame.problem

@@ -102,7 +102,23 @@ class EmbreeRenderer:
         *,
         orthographic: bool = False,
     ) -> Tensor:
-        return self.faces_at(T_cam_from_model, camera_matrix, size, orthographic=orthographic)[3]
+        T, K = (x.numpy() for x in check_render_arguments(T_cam_from_model, camera_matrix, size))
+        depth = np.zeros((len(T), *size), np.float32)
+        scene, outline = self._scene
+
+        def cast(i: int) -> None:
+            if rays := self._rays(outline, T[i], K[i], size, orthographic):
+                mask, starts, directions, near = rays
+                depth[i][mask] = self._depth(scene.distance(starts, directions), near)
+
+        for_each(len(T), cast)
+        return torch.from_numpy(depth)[:, None]
+
+    def _depth(self, along: np.ndarray, near: float) -> np.ndarray:
+        """(M,) depth in model units of what rays hit at distances ``along`` (M,) from the plane
+        where they start, at ``near`` radii; 0 for inf."""
+        z = (along + np.float32(near)) * np.float32(self._radius)
+        return np.where(np.isinf(z), np.float32(0.0), z)
 
     def faces_at(
         self,
@@ -124,8 +140,7 @@ class EmbreeRenderer:
             if rays := self._rays(outline, T[i], K[i], size, orthographic):
                 mask, starts, directions, near = rays
                 face[i][mask], u[i][mask], v[i][mask], along = scene.hits(starts, directions)
-                z = (along + np.float32(near)) * np.float32(self._radius)
-                depth[i][mask] = np.where(np.isinf(z), 0.0, z)
+                depth[i][mask] = self._depth(along, near)
 
         for_each(len(T), cast)
         return face, u, v, torch.from_numpy(depth)[:, None]
@@ -286,7 +301,7 @@ class RasterRenderer(EmbreeRenderer):
         cv2.triangleRasterizeDepth(
             self._vertices, self._faces, z, camera, math.pi / 2.0, near, far, self._settings
         )
-        background = z > far - 0.5 * BESIDE
+        is_object = z <= far - 0.5 * BESIDE
         z *= np.float32(self._radius)
-        z[background] = 0.0
+        z *= is_object
         return z

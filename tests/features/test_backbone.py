@@ -98,6 +98,14 @@ def test_similarity_is_the_mean_cosine_of_the_cells(network):
     torch.testing.assert_close(similarity(d, d).diagonal(), torch.ones(3), atol=2e-3, rtol=0)
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("count", [2, 5, 16, 19])
+def test_the_descriptor_of_an_image_does_not_depend_on_the_others(network, count, channels):
+    images = torch.rand(count, channels, 64, 64, generator=torch.Generator().manual_seed(0))
+    alone = torch.cat([describe(images[k : k + 1], network) for k in (0, 1, count - 1)])
+    assert torch.equal(describe(images, network)[[0, 1, count - 1]], alone)
+
+
 @pytest.mark.parametrize(("count", "filled"), [(1, 1), (3, 4), (4, 4), (5, 8)])
 def test_images_are_filled_up_to_a_power_of_two(count, filled):
     images = torch.rand(count, 1, 8, 8)

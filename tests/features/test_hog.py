@@ -173,3 +173,20 @@ def test_hog_on_the_meta_device(learnable: bool) -> None:
     layer = features.HOG(grid=4, learnable=learnable).to("meta")
     descriptors = layer(torch.zeros(3, 2, 40, 48, device="meta"))
     assert (descriptors.device.type, descriptors.shape) == ("meta", (3, layer.length))
+
+
+@pytest.mark.parametrize(("bins", "learnable"), [(9, False), (8, True), (1, False)])
+def test_descriptor_of_a_quarter_turn_is_that_of_the_rotated_field(
+    bins: int, learnable: bool
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    field = torch.randn(3, 2, 40, 40, generator=generator, dtype=torch.float64)
+    field[1, 0, 3, 4] = math.nan
+    layer = features.HOG(grid=4, bins=bins, learnable=learnable)
+    if learnable:
+        layer.bin_weights = torch.linspace(0.5, 2.0, bins)
+    rotated = torch.stack([-field[:, 1], field[:, 0]], dim=1).rot90(-1, (2, 3))
+    for found, expected in zip(
+        layer.with_quarter_turn(field), (layer(field), layer(rotated)), strict=True
+    ):
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)

@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -210,10 +211,11 @@ def test_every_copy_of_the_object_has_a_row_and_is_drawn(registrar, entry, tmp_p
         for path in (tmp_path / "out" / "thumbnails").iterdir()
         if (pixels := cv2.imread(str(path))).shape[1] > 1.5 * pixels.shape[0]
     ]
-    greenish = picture[..., 1].astype(int) - picture[..., 2] > 60
+    blue, green, red = np.moveaxis(picture.astype(int), 2, 0)
+    outline = green - np.maximum(blue, red) > 80
     middle = picture.shape[1] // 2
-    assert greenish[:, :middle].sum() > 50
-    assert greenish[:, middle:].sum() > 50
+    assert outline[:, :middle].sum() > 50
+    assert outline[:, middle:].sum() > 50
 
 
 def test_columns_of_copies_are_reserved_only_where_copies_are_asked_for(tmp_path):

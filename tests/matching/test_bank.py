@@ -54,7 +54,8 @@ def assert_same(a: ViewBank, b: ViewBank, *, atol: float = 0.0) -> None:
 
 
 def test_build_does_not_depend_on_chunks_and_threads(small_bank, truck, monkeypatch, threads):
-    monkeypatch.setattr(bank_module, "VIEWS_AT_A_TIME", 5)
+    monkeypatch.setattr(bank_module, "TURNS", 5)
+    monkeypatch.setattr(bank_module, "PIXELS_AT_A_TIME", 1)
     threads(3)
     other = build(truck, small_bank.views)
     assert torch.get_num_threads() == 3

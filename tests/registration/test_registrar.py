@@ -322,7 +322,8 @@ def test_progress_reports_stages_and_may_cancel(monkeypatch):
     calls = []
     pipeline = replace(PRESETS["classical"], hypotheses=1)
     options = {"pipeline": pipeline, "image_size": 64, "progress": lambda *call: calls.append(call)}
-    monkeypatch.setattr("curvireg_torch.matching.bank.VIEWS_AT_A_TIME", 3)
+    monkeypatch.setattr("curvireg_torch.matching.bank.TURNS", 3)
+    monkeypatch.setattr("curvireg_torch.matching.bank.PIXELS_AT_A_TIME", 1)
     bank = ViewBank.build(example_mesh(), views, **options)
     assert calls == [("bank", 3, 8), ("bank", 6, 8), ("bank", 8, 8)]
     registrar = Registrar(bank, progress=lambda stage, *_: calls.append(stage))
