@@ -2,8 +2,9 @@
 side.
 
 Whether it fits a photograph better than the mesh is tested for the best pose. Seen from afar, a
-shape that is reflected through a plane in its centre has the outline of the shape if the plane
-faces the camera, and nearly so if the shape is nearly symmetric to the plane.
+shape and its reflection through a plane that faces the camera have the same outline, and nearly so
+if the shape is nearly symmetric to the plane. Only one of the two has the photograph's inner
+contours.
 """
 
 from dataclasses import replace
@@ -22,7 +23,7 @@ from ..matching import Ranking
 from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius
 from .confidence import resolution, shares
 from .described import DescribedPhotograph, evidence_of
-from .poses import Poses, fit_poses, placed, with_quick_fit
+from .poses import Poses, placed, with_quick_fit
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
 from .work import Work
@@ -33,7 +34,6 @@ POINTS = 2000
 SAME_SHAPE = 0.03
 SAME_POINTS = 0.995
 LEAST_CONFIDENCE = 0.5  # from which an answer is compared
-HOPELESS = -1.5  # Gain after a short fit from which a whole one is not tried
 WARNING = (
     "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
 )
@@ -65,68 +65,59 @@ def mirror_gain(
     target: Target, work: Work, crops: EdgeCrops, pose: Poses, evidence: Evidence
 ) -> float:
     """By how much the mirror image of the mesh scores more in a photograph than the mesh at one
-    ``pose``, by shape alone; 0 for a mesh that is its own mirror image."""
-    planes = reflection_planes(target.bank.mesh)
-    if planes is None:
+    ``pose``, by shape alone and after a short fit; 0 for a mesh that is its own mirror image."""
+    plane = reflection_plane(target.bank.mesh)
+    if plane is None:
         return 0.0
     image = target.mirror_image
-    starts = reflected_poses(pose, planes, target.describer.centre, image.describer.centre)
-    quick, _ = with_quick_fit(image.describer, crops, starts)
-    near = placed(quick, quick.quick, image.describer.centre)
+    centre = image.describer.centre
+    starts = reflected_poses(pose, plane, target.describer.centre, centre)
+    fitted, _ = with_quick_fit(image.describer, crops, starts)
     photograph = DescribedPhotograph(
         work.query, Ranking.none(), work.descriptor, crops, keypoints=None, frame=work.frame
     )
+    seen = evidence_of(image, photograph, placed(fitted, fitted.quick, centre))
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-
-    def gains(poses: Poses) -> Tensor:
-        seen = evidence_of(image, photograph, poses)
-        return seen.scores(of_shape) - evidence.scores(of_shape)
-
-    gain = gains(near)
-    if float(gain.max()) < HOPELESS:
-        return float(gain.max())
-    settings = target.pipeline.fit
-    best = near[gain.argmax()[None]]
-    fitted = fit_poses(
-        image.describer, crops, best, settings=settings, wide_angles=settings.wide_angles
-    )
-    return float(gains(fitted).max())
+    return float(seen.scores(of_shape).max() - evidence.scores(of_shape))
 
 
-def reflected_poses(pose: Poses, planes: Tensor, centre: Tensor, image_centre: Tensor) -> Poses:
-    """Poses at which the mirror image of a mesh is the mesh at one ``pose``, reflected through
-    planes in its ``centre`` (3,): those with normals ``planes`` (P, 3) in the model's frame, and
-    the one that faces the camera. ``image_centre`` (3,) is the centre of the image."""
+def reflected_poses(pose: Poses, plane: Tensor, centre: Tensor, image_centre: Tensor) -> Poses:
+    """Two poses at which the mirror image of a mesh is the mesh at one ``pose``, reflected through
+    planes in its ``centre`` (3,): one that faces the camera, and that with the normal ``plane``
+    (3,) in the model's frame. ``image_centre`` (3,) is the centre of the image."""
     T = pose.T[0]
-    position = T[:3, :3] @ centre.to(T) + T[:3, 3]
-    towards = F.normalize(T[:3, :3].T @ position, dim=0)
-    normals = torch.cat([planes.to(T), towards[None]])
+    rotation = T[:3, :3]
+    position = rotation @ centre.to(T) + T[:3, 3]
+    normals = torch.stack([F.normalize(position, dim=0), rotation @ plane.to(T)])
     reflections = torch.eye(3).to(T) - 2.0 * normals[:, :, None] * normals[:, None]
-    R = T[:3, :3] @ reflections @ MIRROR.to(T)
-    transforms = transform(R, position - R @ image_centre.to(T))
+    R = reflections @ rotation @ MIRROR.to(T)
     copies = pose[torch.zeros(len(R), dtype=torch.long)]
-    return placed(copies, transforms, image_centre)
+    return placed(copies, transform(R, position - R @ image_centre.to(T)), image_centre)
 
 
 @cached_in_mesh
-def reflection_planes(mesh: trimesh.Trimesh) -> Tensor | None:
-    """(3, 3) normals of the planes in which a mesh is reflected: the principal axes of its surface;
-    None if it is its own mirror image in one of them, or in a plane of the mesh file's axes.
+def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
+    """(3,) normal of the plane to which a mesh is most nearly symmetric, of those of the principal
+    axes of its surface and of the mesh file's axes; None if it is symmetric to one of them,
+    and thus its own mirror image.
 
     Example:
-        >>> reflection_planes(trimesh.creation.box((1, 2, 3))) is None
+        >>> reflection_plane(trimesh.creation.box((1, 2, 3))) is None
         True
     """
     centre, axes = _principal_axes(mesh)
     points = trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0] - centre
     tree = cKDTree(trimesh.sample.sample_surface(mesh, 20 * POINTS, seed=1)[0] - centre)
-    for normal in np.concatenate([axes, np.eye(3)]):
+    normals = np.concatenate([axes, np.eye(3)])
+    means = []
+    for normal in normals:
         reflected = points - 2.0 * (points @ normal)[:, None] * normal
-        distance = np.quantile(tree.query(reflected)[0], SAME_POINTS)
-        if distance < SAME_SHAPE * mesh_radius(mesh):
+        distances, _ = tree.query(reflected)
+        if np.quantile(distances, SAME_POINTS) < SAME_SHAPE * mesh_radius(mesh):
             return None
-    return torch.from_numpy(axes)
+        means.append(distances.mean())
+    return torch.from_numpy(normals[int(np.argmin(means))].copy())
 
 
 def _principal_axes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:

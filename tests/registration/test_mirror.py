@@ -27,15 +27,21 @@ def placed_at(T: torch.Tensor, mesh: trimesh.Trimesh) -> Poses:
     return Poses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())
 
 
-def test_symmetric_shapes_have_no_other_mirror_image():
+def test_symmetric_shapes_are_their_own_mirror_images():
     turn = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])
     half = chiral_mesh()
     both = trimesh.util.concatenate([half, mirrored(half).apply_translation((-3.0, 0.0, 0.0))])
     for mesh in (trimesh.creation.box((1, 2, 3)), trimesh.creation.cone(1.0, 2.0), both):
-        assert mirror.reflection_planes(mesh) is None
-        assert mirror.reflection_planes(mesh.copy().apply_transform(turn)) is None
-    planes = mirror.reflection_planes(chiral_mesh())
-    torch.testing.assert_close(planes @ planes.T, torch.eye(3).double())
+        assert mirror.reflection_plane(mesh) is None
+        assert mirror.reflection_plane(mesh.copy().apply_transform(turn)) is None
+
+
+def test_plane_is_that_to_which_a_mesh_is_most_nearly_symmetric():
+    mast = trimesh.creation.box((0.2, 0.2, 1.2)).apply_translation((0.4, 0.35, 0.6))
+    hull = trimesh.creation.box((2.0, 0.8, 0.5))
+    bow = trimesh.creation.box((0.3, 0.8, 1.0)).apply_translation((0.9, 0.0, 0.4))
+    plane = mirror.reflection_plane(trimesh.util.concatenate([hull, bow, mast]))
+    assert abs(float(plane[1])) > 0.95, "but for its mast, the ship is symmetric from side to side"
 
 
 def test_mirrored_mesh_is_inside_out_nowhere():
@@ -48,20 +54,19 @@ def test_mirrored_mesh_is_inside_out_nowhere():
 def test_reflected_poses_show_the_mesh_reflected():
     mesh = chiral_mesh()
     T = random_poses(1, seed=4)
-    pose = placed_at(T, mesh)
-    planes = torch.eye(3).double()
-    found = mirror.reflected_poses(pose, planes, mesh_centre(mesh), mesh_centre(mirrored(mesh)))
+    rotation = T[0, :3, :3]
+    plane = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
+    centres = mesh_centre(mesh), mesh_centre(mirrored(mesh))
+    found = mirror.reflected_poses(placed_at(T, mesh), plane, *centres).T
     vertices = torch.from_numpy(mesh.vertices.copy())
-    images = vertices @ MIRROR
-    seen = vertices @ T[0, :3, :3].T + T[0, :3, 3]
-    position = T[0, :3, :3] @ mesh_centre(mesh) + T[0, :3, 3]
-    towards = torch.nn.functional.normalize(position, dim=0)
-    normals = [*(T[0, :3, :3] @ planes.T).T, towards]
-    assert len(found) == 4
-    for T_image, normal in zip(found.T, normals, strict=True):
+    seen = vertices @ rotation.T + T[0, :3, 3]
+    position = rotation @ mesh_centre(mesh) + T[0, :3, 3]
+    normals = torch.nn.functional.normalize(position, dim=0), rotation @ plane
+    for T_image, normal in zip(found, normals, strict=True):
         away = (seen - position) @ normal
         expected = seen - 2.0 * away[:, None] * normal
-        torch.testing.assert_close(images @ T_image[:3, :3].T + T_image[:3, 3], expected)
+        image = (vertices @ MIRROR) @ T_image[:3, :3].T + T_image[:3, 3]
+        torch.testing.assert_close(image, expected)
         assert torch.linalg.det(T_image[:3, :3]) == pytest.approx(1.0)
 
 
