@@ -21,7 +21,7 @@ from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
 from ..matching import Ranking
 from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius
-from .confidence import resolution, shares
+from .confidence import resolution
 from .described import DescribedPhotograph, evidence_of
 from .poses import Poses, placed, with_quick_fit
 from .result import DETERMINING_KEYPOINTS, Registration
@@ -34,6 +34,7 @@ POINTS = 2000
 SAME_SHAPE = 0.03
 SAME_POINTS = 0.995
 LEAST_CONFIDENCE = 0.5  # from which an answer is compared
+DOUBT = 0.3  # factor of the confidence where the mirror image fits better
 WARNING = (
     "the mirror image of the mesh fits better than the mesh: check whether an axis of it is flipped"
 )
@@ -48,7 +49,7 @@ def compared_with_mirror_image(
     result: Registration,
 ) -> Registration:
     """A result with its best ``pose`` and the evidence of it. If it is probably right and the
-    mirror image of the mesh fits better, it gets a warning, and at most half the confidence."""
+    mirror image of the mesh fits better, it gets a warning, and its confidence is multiplied by ``DOUBT``."""
     is_printed = float(evidence.landmarks) >= DETERMINING_KEYPOINTS
     # a print that is found is not mirrored
     if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:
@@ -56,8 +57,7 @@ def compared_with_mirror_image(
     gain = mirror_gain(target, work, crops, pose, evidence)
     if gain <= resolution(exact=True):
         return result
-    own, _ = shares(torch.tensor([0.0, gain]), exact=True).tolist()
-    probabilities = tuple(own * probability for probability in result.probabilities)
+    probabilities = tuple(DOUBT * probability for probability in result.probabilities)
     return replace(result, probabilities=probabilities, warnings=(*result.warnings, WARNING))
 
 

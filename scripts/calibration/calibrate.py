@@ -42,7 +42,7 @@ from curvireg_torch.evidence import Evidence
 from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
 from curvireg_torch.geometry.crops import box_iou
 from curvireg_torch.inspection.photographs import without_colours
-from curvireg_torch.registration import Follower
+from curvireg_torch.registration import Follower, mirror
 from curvireg_torch.registration.confidence import (
     DOUBT_FEATURES,
     EVIDENCE_FEATURES,
@@ -248,8 +248,10 @@ def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> It
     row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
     row |= {"evidence": evidence.table[is_rival].tolist()}
     row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
+    row |= {"mirror": mirror.WARNING in result.warnings}
     best = result.hypotheses[0]
-    if best.covariance is not None and row["errors"][0] < RIGHT:
+    is_unique = len(S) == 1  # else the covariance is that of another pose
+    if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:
         turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
         e = torch.cat([turn, sample["translation"].double() - best.translation])
         row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
@@ -500,7 +502,8 @@ def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
 def first_probability(row: Row, constants: Row) -> float:
     """Confidence of a row."""
     any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
-    return any_right * first_share(row, constants)
+    doubt = mirror.DOUBT if row.get("mirror") else 1.0
+    return doubt * any_right * first_share(row, constants)
 
 
 def first_share(row: Row, constants: Row) -> float:
@@ -549,12 +552,15 @@ def fit_registrations(
     signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
 
     def fit(train: np.ndarray) -> Row:
+        # what fits, but is less probable than the mirror image, tells nothing of what fits
+        train = train & ~is_mirrored
         some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
         fitted = present or fit_logistic(some, weight[train], signs) | fit_shares(
             some, weight[train], ties=exact
         )
         return fit_level(some, weight[train], fitted)
 
+    is_mirrored = np.array([row.get("mirror", False) for row in rows])
     fold = folds_of(rows)
     p = np.zeros(len(rows))
     for k in range(FOLDS):
