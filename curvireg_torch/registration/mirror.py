@@ -49,7 +49,7 @@ def compared_with_mirror_image(
     result: Registration,
 ) -> Registration:
     """A result with its best ``pose`` and the evidence of it. If it is probably right and the
-    mirror image of the mesh fits better, it gets a warning, and its confidence is multiplied by ``DOUBT``."""
+    mirror image of the mesh fits better, it gets a warning, and ``DOUBT`` of its confidence."""
     is_printed = float(evidence.landmarks) >= DETERMINING_KEYPOINTS
     # a print that is found is not mirrored
     if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:

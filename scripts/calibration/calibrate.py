@@ -93,8 +93,8 @@ SHARES = {
     "cut_packages": 0.05,
     "print": 0.03,
     "mirrored": 0.01,
-    "wrong": 0.03,
-    "estimated_wrong": 0.03,
+    "wrong": 0.05,
+    "estimated_wrong": 0.05,
 }
 """Assumed shares of the photographs that users have; those of the other sets have the rest, each
 the same weight."""
@@ -533,6 +533,12 @@ def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
     return quality
 
 
+def errors_within(errors: np.ndarray) -> Row:
+    """Fractions of errors (n,) in degrees within 5 and 15, and their median."""
+    within = {f"within {limit}": float((errors < limit).mean()) for limit in (5, 15)}
+    return within | {"median": float(np.median(errors))}
+
+
 def fit_registrations(
     rows: list[Row], *, exact: bool, present: Row | None = None
 ) -> tuple[Row, Row]:
@@ -575,8 +581,9 @@ def fit_registrations(
     by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
     by_set["grey"] = np.array([row["grey"] for row in rows])
     by_set["with colours"] = ~by_set["grey"]
+    errors = np.array([row["errors"][0] for row in rows])
     quality["sets"] = {
-        name: quality_of(p[own], first[own], weight[own])
+        name: quality_of(p[own], first[own], weight[own]) | errors_within(errors[own])
         for name, own in by_set.items()
         if own.any()
     }
