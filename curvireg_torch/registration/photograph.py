@@ -95,6 +95,8 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
                 unknown, with_quick_fit(target.describer, work.crops, poses[unknown])[0]
             )
         finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
+        if work.frame is not None:  # at the border as many poses of larger boxes compete
+            finish *= 2
         poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
     evidence = evidence_of(target, work, poses)
     sibling = Rival.none(poses, evidence)
@@ -210,13 +212,15 @@ def _promising(target: Target, work: Work) -> Poses:
     if work.crops is not None and work.exact:
         screened = max(target.pipeline.fit.screened_views, count)
     poses = _of_best_views(target, work, screened)
-    if work.crops is not None and work.exact:
-        whole = whole_boxes(work.item.box, work.item.size)
-        others = [_of_best_views(target, _with_box(target, work, box), screened) for box in whole]
-        poses = Poses.cat([poses, *others])
-    if work.crops is not None and len(poses) > count:
+    if work.crops is None:
+        return poses
+    if len(poses) > count:
         poses = _screened(target, work.crops, poses, count)
-    return poses
+    if work.frame is None:
+        return poses
+    whole = whole_boxes(work.item.box, work.item.size)
+    beyond = [_of_best_views(target, _with_box(target, work, box), screened) for box in whole]
+    return Poses.cat([poses, _screened(target, work.crops, Poses.cat(beyond), count)])
 
 
 def _of_best_views(target: Target, work: Work, count: int) -> Poses:
