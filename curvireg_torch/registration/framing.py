@@ -57,7 +57,7 @@ def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
     or height; none where no side lies there.
 
     Example:
-        >>> box = torch.tensor([-0.5, 10.0, 99.5, 60.0])
+        >>> box = torch.tensor([-0.5, 10.0, 99.5, 60.0]).double()
         >>> [whole.tolist() for whole in whole_boxes(box, (480, 640))]
         [[-40.5, 10.0, 99.5, 60.0], [-120.5, 10.0, 99.5, 60.0]]
     """

@@ -56,7 +56,10 @@ def register_item(target: Target, item: ImageItem) -> Registration:
     # Without a camera, poses are derived from their boxes.
     if target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None:
         box = projected_box(target.describer, result.projection)
-        if item.shows_other_part(box):
+        frames = [target.frame_of(part, item.size) for part in (item.box, box)]
+        # in a frame and without one, similarities mean different things
+        alike = (frames[0] is None) == (frames[1] is None)
+        if alike and item.shows_other_part(box):
             with suppress(CurviregError):
                 again = _register_box(target, replace(item, box=box.float()))
                 weights = target.score_weights(exact=True)
