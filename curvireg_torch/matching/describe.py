@@ -61,7 +61,7 @@ def view_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 class ViewDescriber:
     """Renders, filters and describes arbitrary views of one clean mesh, see
     :meth:`curvireg_torch.ViewBank.build`. Framed views are rendered from a mesh of at most
-    ``VIEW_FACES`` faces; ``renderer`` is one of the whole mesh.
+    ``VIEW_FACES`` faces, ``view_mesh``; ``renderer`` is one of the whole mesh.
 
     Example:
         >>> import curvireg_torch as cr
@@ -79,7 +79,7 @@ class ViewDescriber:
         renderer: str | DepthRenderer = "auto",
         device: torch.device | str = "cpu",
     ) -> None:
-        self._mesh = self._simple = mesh
+        self._mesh = self.view_mesh = mesh
         self._coloured = has_colours(mesh)
         self.renderer = self.view_renderer = make_renderer(mesh, renderer, many_views=True)
         self.centre = mesh_centre(mesh)
@@ -87,10 +87,10 @@ class ViewDescriber:
         self.hull = extreme_points(mesh)
         self._device = torch.device(device)
         if isinstance(renderer, str) and len(mesh.faces) > VIEW_FACES:
-            self._simple = view_mesh(mesh)
-            self.view_renderer = make_renderer(self._simple, renderer, many_views=True)
+            self.view_mesh = view_mesh(mesh)
+            self.view_renderer = make_renderer(self.view_mesh, renderer, many_views=True)
         if renderer == "auto" and self._device.type != "cpu":
-            self.view_renderer = DeviceRenderer(self._simple, self._device)
+            self.view_renderer = DeviceRenderer(self.view_mesh, self._device)
         self._set(settings)
 
     def _set(self, settings: BankSettings) -> None:
@@ -102,7 +102,7 @@ class ViewDescriber:
     @cached_property
     def contours(self) -> MeshContours:
         """Occluding contours and creases at any pose, on the CPU."""
-        return MeshContours(self._simple)
+        return MeshContours(self.view_mesh)
 
     @cached_property
     def device_contours(self) -> Contours:

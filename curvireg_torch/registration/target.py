@@ -145,8 +145,9 @@ class Target:
 
     @cached_property
     def _mirror_image(self) -> "Target":
+        known = self.describer
         describer = ViewDescriber(
-            mirrored(self.bank.mesh), self.describer.settings, device=self.bank.device
+            mirrored(known.view_mesh), known.settings, device=self.bank.device
         )
         image = copy(self)
         image.__dict__["describer"] = describer
