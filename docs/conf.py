@@ -33,7 +33,7 @@ nitpicky = True
 nitpick_ignore = [  # types of annotations without a page
     ("py:class", "Image"),
     ("py:class", "curvireg_torch.matching.cells.Packing"),
-    ("py:class", "curvireg_torch.registration.framing.Frame"),
+    ("py:class", "curvireg_torch.registration.framing.CropFrame"),
     ("py:class", "curvireg_torch.registration.shape_symmetries.TellingSymmetries"),
     ("py:class", "curvireg_torch.rendering.contours.Contours"),
     ("py:class", "curvireg_torch.rendering.contours._Level"),

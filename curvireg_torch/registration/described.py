@@ -16,7 +16,7 @@ from ..fitting.together import details_together, evidence_together
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
 from ..utils.company import by_key, compute_together
-from .framing import Frame
+from .framing import CropFrame
 from .poses import Poses
 from .target import Target
 
@@ -41,7 +41,7 @@ class DescribedPhotograph:
     descriptor: Tensor
     crops: EdgeCrops | None
     keypoints: KeypointMatches | None
-    frame: Frame | None = field(default=None, kw_only=True)
+    frame: CropFrame | None = field(default=None, kw_only=True)
 
     @property
     def printed(self) -> float:

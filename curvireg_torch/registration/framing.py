@@ -74,7 +74,7 @@ def whole_boxes(box: Tensor, size: tuple[int, int]) -> list[Tensor]:
 
 
 @dataclass(frozen=True)
-class Frame:
+class CropFrame:
     """What the crop of a box shows. In it, poses are compared as the photograph's camera sees them,
     without what the border cuts off.
 
@@ -87,7 +87,7 @@ class Frame:
     inside: Tensor
 
     @classmethod
-    def of(cls, box: Tensor, size: tuple[int, int], settings: BankSettings) -> "Frame":
+    def of(cls, box: Tensor, size: tuple[int, int], settings: BankSettings) -> "CropFrame":
         """The frame of a box (4,) in a photograph of ``size`` (H, W)."""
         side = settings.image_size
         square = square_boxes(box.double(), settings.margin)
@@ -100,7 +100,7 @@ class Frame:
         return cls(crop_transforms(square, side), inside[None])
 
 
-def shown_in(frame: Frame | None, field: Tensor) -> Tensor:
+def shown_in(frame: CropFrame | None, field: Tensor) -> Tensor:
     """A field (..., S, S) without what lies outside the photograph; as it is without a frame."""
     return field if frame is None else field * frame.inside.to(field.device)
 

@@ -20,7 +20,7 @@ from ..evidence import Evidence, EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
 from ..matching import Ranking
-from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius
+from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius, principal_rotation
 from .confidence import resolution
 from .described import DescribedPhotograph, evidence_of
 from .poses import Poses, placed, with_quick_fit
@@ -106,10 +106,10 @@ def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
         >>> reflection_plane(trimesh.creation.box((1, 2, 3))) is None
         True
     """
-    centre, axes = _principal_axes(mesh)
+    centre = np.asarray(mesh.centroid)
     points = trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0] - centre
     tree = cKDTree(trimesh.sample.sample_surface(mesh, 20 * POINTS, seed=1)[0] - centre)
-    normals = np.concatenate([axes, np.eye(3)])
+    normals = np.concatenate([principal_rotation(mesh).numpy(), np.eye(3)])
     means = []
     for normal in normals:
         reflected = points - 2.0 * (points @ normal)[:, None] * normal
@@ -118,15 +118,3 @@ def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
             return None
         means.append(distances.mean())
     return torch.from_numpy(normals[int(np.argmin(means))].copy())
-
-
-def _principal_axes(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Centroid (3,) of a mesh's surface, and its principal axes (3, 3), one in each row."""
-    area = mesh.area_faces[:, None, None]
-    centre = np.asarray(mesh.centroid)
-    corners = mesh.triangles - centre
-    # of a triangle, the integral of x x^T
-    total = corners.sum(axis=1, keepdims=True)
-    moments = area * (corners.mT @ corners + total.mT @ total) / 12.0
-    _, axes = np.linalg.eigh(moments.sum(axis=0))
-    return centre, np.ascontiguousarray(axes.T)

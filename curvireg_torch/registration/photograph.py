@@ -10,6 +10,7 @@ from torch import Tensor
 from ..errors import CurviregError
 from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
+from ..matching import Ranking
 from ..terms import QueryFeatures
 from .confidence import are_near
 from .described import evidence_of
@@ -28,6 +29,7 @@ from .poses import (
     with_edge_support,
     with_quick_fit,
 )
+from .priors import Limits
 from .refits import best_inside, fitted_again
 from .result import Registration
 from .search import search
@@ -56,9 +58,8 @@ def register_item(target: Target, item: ImageItem) -> Registration:
     # Without a camera, poses are derived from their boxes.
     if target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None:
         box = projected_box(target.describer, result.projection)
-        frames = [target.frame_of(part, item.size) for part in (item.box, box)]
         # in a frame and without one, similarities mean different things
-        alike = (frames[0] is None) == (frames[1] is None)
+        alike = target.has_frame(item.box, item.size) == target.has_frame(box, item.size)
         if alike and item.shows_other_part(box):
             with suppress(CurviregError):
                 again = _register_box(target, replace(item, box=box.float()))
@@ -153,9 +154,7 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
     target.report_progress("ranking")
     exact = target.is_exact
     limits = None if item.prior is None else limits_of(target, item)
-    ranking = target.matcher.rank_together(
-        query, None if limits is None else limits.allowed()[None]
-    )
+    ranking = _ranking(target, query, limits)
     symmetries = target.symmetries_of(exact=exact)
     crops = None
     if target.pipeline.contours:
@@ -174,6 +173,11 @@ def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
         symmetries=symmetries,
         frame=frame,
     )
+
+
+def _ranking(target: Target, query: QueryFeatures, limits: Limits | None) -> Ranking:
+    allowed = None if limits is None else limits.allowed()[None]
+    return target.matcher.rank_together(query, allowed)
 
 
 def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
@@ -236,8 +240,7 @@ def _of_best_views(target: Target, work: Work, count: int) -> Poses:
 def _with_box(target: Target, work: Work, box: Tensor) -> Work:
     """The photograph with another box, ranked for it."""
     query = target.matcher.query_together(work.item.image, box)
-    allowed = None if work.limits is None else work.limits.allowed()[None]
-    ranking = target.matcher.rank_together(query, allowed)
+    ranking = _ranking(target, query, work.limits)
     return replace(work, item=replace(work.item, box=box), ranking=ranking)
 
 

@@ -19,7 +19,7 @@ from ..mesh.mesh import mirrored
 from ..terms import QueryFeatures
 from ..utils.threads import map_on_threads
 from .detector import Detector
-from .framing import Frame, border_sides
+from .framing import CropFrame, border_sides
 from .inputs import ImageItem
 from .shape_symmetries import TellingSymmetries, telling_symmetries
 
@@ -84,17 +84,20 @@ class Target:
             return TellingSymmetries(torch.eye(4, dtype=torch.float64)[None])
         return telling_symmetries(self.bank.mesh, symmetries)
 
-    def frame_of(self, box: Tensor, size: tuple[int, int]) -> Frame | None:
+    def frame_of(self, box: Tensor, size: tuple[int, int]) -> CropFrame | None:
         """The frame in which fitted poses are compared with a box (4,) at the border of a
         photograph of ``size`` (H, W). None inside of it: the view of a pose that is a little off
         resembles the object more by itself. None for a similar mesh, without the contour fit, and
         for orthographic views, too."""
-        settings = self.bank.settings
-        is_fitted = self.is_exact and self.pipeline.contours
-        is_perspective = settings.camera != "orthographic"
-        if not (is_fitted and is_perspective and border_sides(box, size)):
+        if not self.has_frame(box, size):
             return None
-        return Frame.of(box, size, settings)
+        return CropFrame.of(box, size, self.bank.settings)
+
+    def has_frame(self, box: Tensor, size: tuple[int, int]) -> bool:
+        """Whether there is a :meth:`frame_of` a box."""
+        is_fitted = self.is_exact and self.pipeline.contours
+        is_perspective = self.bank.settings.camera != "orthographic"
+        return is_fitted and is_perspective and border_sides(box, size) > 0
 
     @property
     def uses_keypoints(self) -> bool:

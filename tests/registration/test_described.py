@@ -10,7 +10,7 @@ from curvireg_torch import Pipeline
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import FitSettings
 from curvireg_torch.registration.described import ComparedPoses, DescribedPhotograph
-from curvireg_torch.registration.framing import Frame
+from curvireg_torch.registration.framing import CropFrame
 from curvireg_torch.registration.poses import Poses
 from tests._support.scenes import CAMERA, SIZE, learned_registrar, scene
 
@@ -32,7 +32,7 @@ def test_what_lies_outside_the_photograph_is_not_compared():
     poses = Poses.at(
         T[None], CAMERA[None], target.describer.centre, nothing.long(), nothing.double()
     )
-    frame = Frame.of(box, SIZE, target.bank.settings)
+    frame = CropFrame.of(box, SIZE, target.bank.settings)
     (field,), _ = target.describer.seen_by(T[None], (frame.transform @ CAMERA)[None], shaded=False)
     photograph = DescribedPhotograph(
         query=None,

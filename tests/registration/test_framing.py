@@ -8,7 +8,7 @@ import trimesh
 from curvireg_torch.geometry import camera_matrix
 from curvireg_torch.pipeline import BankSettings
 from curvireg_torch.registration.framing import (
-    Frame,
+    CropFrame,
     border_sides,
     clipped,
     outside_fraction,
@@ -108,7 +108,7 @@ def test_frame_knows_what_of_a_crop_lies_in_the_photograph():
     # a square of 80 px without margin that goes on for 20 px to the left and 30 px below
     settings = BankSettings(image_size=16, margin=0.0)
     box = torch.tensor([-20.5, 49.5, 59.5, 129.5])
-    frame = Frame.of(box, (100, 200), settings)
+    frame = CropFrame.of(box, (100, 200), settings)
     corners = torch.tensor([[-20.5, 49.5, 1.0], [59.5, 129.5, 1.0]]).double()
     expected = torch.tensor([[-0.5, -0.5, 1.0], [15.5, 15.5, 1.0]]).double()
     torch.testing.assert_close(corners @ frame.transform.T, expected)
