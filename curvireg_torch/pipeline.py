@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
