@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..features import field_points
+from ..features.backbone import images_at_a_time
 from ..geometry import ViewSphere
 from ..mesh import mesh_radius
 from ..pipeline import Pipeline
@@ -39,8 +40,6 @@ from .describe import ViewDescriber, hog_layer
 _PREPARED = ("_terms", "_described_views", "describer")
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
-FEATURES_AT_A_TIME = 4  # Views whose appearance is computed at a time
-FEATURES_ON_DEVICE = 256  # the same on another device than the CPU
 
 
 @dataclass(frozen=True)
@@ -410,7 +409,7 @@ class ViewMatcher(nn.Module):
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        at_a_time = FEATURES_AT_A_TIME if self.bank.device.type == "cpu" else FEATURES_ON_DEVICE
+        at_a_time = images_at_a_time(self.bank.device)
         chunks = [views[k : k + at_a_time] for k in range(0, len(views), at_a_time)]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 
