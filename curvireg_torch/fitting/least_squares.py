@@ -4,6 +4,7 @@ on a pose."""
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -50,11 +51,18 @@ class PointMatches(Rows):
 
     def measurements(self, T: Tensor, K: Tensor, centre: Tensor, scale: float) -> Measurements:
         """Two for each point, along x and y, with Geman-McClure weights of ``scale`` px."""
-        axes = torch.eye(2, dtype=T.dtype).repeat(self.model.shape[1], 1)[None]
-        uv, J = project(self.model.repeat_interleave(2, dim=1), axes, T, K, centre)
+        uv, J = project(*self._twice, T, K, centre)
         residual = self.uv - uv[:, ::2]
-        weight = (self.weight * _geman_mcclure(residual, scale)).repeat_interleave(2, dim=1)
-        return Measurements(J, residual.flatten(1)[..., None], weight[..., None])
+        weight = self.weight * _geman_mcclure(residual, scale)
+        weights = weight[..., None].expand_as(residual)
+        return Measurements(J, residual.flatten(1)[..., None], weights.flatten(1)[..., None])
+
+    @cached_property
+    def _twice(self) -> tuple[Tensor, Tensor]:
+        """Each point (1, 2 C, 3), along the x axis of the image and along its y axis (1, 2 C,
+        2)."""
+        axes = torch.eye(2, dtype=self.model.dtype).repeat(self.model.shape[1], 1)[None]
+        return self.model.repeat_interleave(2, dim=1), axes
 
     def inlier_ratio(
         self, T: Tensor, K: Tensor, centre: Tensor, *, scale: float = INLIER_SCALE

@@ -223,8 +223,13 @@ class _Resampling:
         """(C, samples, W) of one crop, or of all in sequence, from the (C, end - first, W) input,
         converted where it is used."""
         which = slice(None) if crop is None else slice(crop, crop + 1)
-        centres, order = self._centres[which].flatten().sort(stable=True)
-        widths = self._widths[which].flatten()[order]
+        centres = self._centres[which].flatten()
+        widths = self._widths[which].flatten()
+        order = None  # the samples of one crop are in order
+        if len(centres) > self._centres.shape[1]:
+            order = centres.argsort(stable=True)
+            centres = centres[order]
+            widths = widths[order]
         parts = []
         for centre, width in zip(
             centres.split(SAMPLES_AT_A_TIME), widths.split(SAMPLES_AT_A_TIME), strict=True
@@ -239,4 +244,5 @@ class _Resampling:
             )
             weights = (1.0 - (samples - centre[:, None]).abs() / width[:, None]).clamp(min=0.0)
             parts.append((weights / weights.sum(dim=1, keepdim=True)).to(part) @ part)
-        return torch.cat(parts, dim=1).index_select(1, order.argsort())
+        resampled = torch.cat(parts, dim=1)
+        return resampled if order is None else resampled.index_select(1, order.argsort())

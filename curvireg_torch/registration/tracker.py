@@ -27,8 +27,8 @@ from ..fitting.least_squares import (
 )
 from ..fitting.regions import RegionModel, line_posterior
 from ..fitting.texture_fit import surface_corners
-from ..geometry import rotation_error
-from ..geometry.cameras import point_in_cameras, pose_around, projected_boxes
+from ..geometry.cameras import boxes_around, point_in_cameras, pose_around, projected
+from ..geometry.viewpoint import angles_between
 from ..rendering.contours import MeshContours
 from .confidence import RELIABLE, tracking_confidence
 
@@ -64,7 +64,7 @@ PYRAMID_LAST = 3
 PYRAMID_KEYFRAME = 1
 # Scale of the weights in px in each least-squares step: at first all matches count, in the end
 # those that agree
-FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0, 2.0, 2.0)
+FLOW_SCALES = (24.0, 12.0, 6.0, 3.0, 2.0)
 # Least strength of a keyframe's corners, as a fraction of the strongest one's, and their least
 # distance in px from the outline: nearer to it, patches show the background
 CORNER_QUALITY = 0.01
@@ -76,7 +76,7 @@ def boxes_at(hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]) -> tuple
     ``size`` (H, W). And (N,) bool, False where the mesh lies behind the camera, or outside the
     image: there the box means nothing."""
     depth = (hull.to(T) @ T[:, 2, :3].mT + T[:, 2, 3]).amin(dim=0)
-    boxes = projected_boxes(hull, T, K)
+    boxes = boxes_around(projected(hull, T, K))
     limits = torch.tensor([size[1], size[0]], dtype=boxes.dtype) - 0.5
     outside = (boxes[:, :2] >= limits) | (boxes[:, 2:] <= -0.5) | (depth <= 0)[:, None]
     return boxes, ~outside.any(dim=1)
@@ -231,7 +231,8 @@ class Tracker:
         for radius in SEARCH_RADII:
             for _ in range(STEPS_PER_ROUND):
                 state = replace(state, T=self._step(frame, state, corners, radius))
-            state = frame.problem.with_current_contours(replace(state, T=nearest_rigid(state.T)))
+            state = frame.problem.with_current_contours(state)
+        state = replace(state, T=nearest_rigid(state.T))
         return self._tracked(frame, state, flows)
 
     def _step(
@@ -245,8 +246,8 @@ class Tracker:
         silhouette = self._silhouette(frame, state, uv)
         colours = self._colours(frame, silhouette, J[:, points.outline[0]], math.ceil(radius))
         matches = corners.measurements(state.T, frame.K, self.centre, INLIER_SCALE)
-        others = [colours.equations(), matches.equations()]
-        step = problem.selected_step(points, uv, J, radius, others)
+        others = Measurements.cat_within([colours, matches])
+        step = problem.selected_step(points, uv, J, radius, [others.equations()])
         fraction = problem.step_fraction(step, state.T)
         return apply_twist(state.T, step * fraction[:, None], self.centre)
 
@@ -269,7 +270,8 @@ class Tracker:
         if uv is None:
             uv = pixels(points.model, state.T, frame.K, self.centre)
         here = uv[0, points.outline[0]]
-        x, y = (here - pixels(self.centre[None, None], state.T, frame.K, self.centre)[0]).unbind(-1)
+        middle = frame.K[0] @ point_in_cameras(state.T, self.centre)[0]
+        x, y = (here - middle[:2] / middle[2]).unbind(-1)
         return _Silhouette(here, points.normals[0, points.outline[0]], torch.atan2(y, x))
 
     def _ends(self, frame: Frame, silhouette: _Silhouette, radius: int) -> tuple[Tensor, Tensor]:
@@ -316,9 +318,8 @@ class Tracker:
 
     def _angles(self, T: Tensor) -> Tensor:
         """(K,) degrees between the rotations of a pose (1, 4, 4) and of the keyframes."""
-        return rotation_error(
-            torch.cat([keyframe.T for keyframe in self._keyframes])[:, :3, :3], T[:, :3, :3]
-        )
+        known = torch.cat([keyframe.T for keyframe in self._keyframes])
+        return angles_between(T[:, :3, :3], known[:, :3, :3])[0]
 
     def _frame(self, image: Tensor, K: Tensor, T: Tensor) -> Frame:
         """The square around the mesh at ``T`` (1, 4, 4) in an image with camera matrix ``K`` (3,
