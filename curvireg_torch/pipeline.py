@@ -11,7 +11,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import nn
 
 from .errors import InvalidInputError, MissingFileError
@@ -20,7 +19,7 @@ from .features.fields import DEPTH_FIELDS, FIELDS
 from .features.learned_field import SHA256
 from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
-from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, jittered_boxes
+from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, check_box_jitter
 from .utils.checks import check_integer, check_option, check_positive, check_probability
 from .utils.choices import DEFAULT as DEFAULT
 from .utils.files import tensor_digest
@@ -322,7 +321,7 @@ class Pipeline:
             raise InvalidInputError(
                 "search: the paper's search takes the place of the contour fit; set contours=False"
             )
-        jittered_boxes(torch.ones(0, 4), self.box_jitter)  # checks box_jitter
+        check_box_jitter(self.box_jitter)
 
     def with_pose_prior(self, pose: str) -> "Pipeline":
         """A copy with another ``pose`` of the view policy."""

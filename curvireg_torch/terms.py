@@ -45,7 +45,6 @@ VIEWS_AT_A_TIME = 64
 CELLS_AT_A_TIME = 64
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = (
-    (0, 0, 0),
     (-0.75, 0, 0),
     (0.75, 0, 0),
     (0, -0.75, 0),
@@ -57,17 +56,16 @@ _JITTER = (
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """B photographs, each described in K crops: of its box first, then of jittered copies of the
-    box.
+    """B photographs, each described as its box shows it first, then as jittered copies of the box
+    would, K in all.
 
     Attributes:
-        regions: (B, K, C, S, S) the crops, in [0, 1]; NaN where pixels of the photograph are
-            missing.
-        field: (B, 2, S, S) of the first crop.
+        crops: (B, C, S, S) of the boxes, in [0, 1]; NaN where pixels of the photograph are missing.
+        field: (B, 2, S, S) of the crops.
         descriptors: (B, K, D).
         points: (B, K, S, S) bool feature points.
         shapes: (B,) log of width / height of the boxes, NaN where unknown.
-        mask: (B, 1, S, S) probability that pixels of the first crop belong to the object, where the
+        mask: (B, 1, S, S) probability that pixels of the crops belong to the object, where the
             field predicts it.
         computed: features of the crops that terms have computed, by the term's name.
 
@@ -81,7 +79,7 @@ class QueryFeatures:
         (torch.Size([1, 3, 64, 64]), torch.Size([1, 2, 64, 64]))
     """
 
-    regions: Tensor
+    crops: Tensor
     field: Tensor
     descriptors: Tensor
     points: Tensor
@@ -89,16 +87,11 @@ class QueryFeatures:
     mask: Tensor | None = None
     computed: dict[str, Tensor] = dataclass_field(default_factory=dict, compare=False)
 
-    @property
-    def crops(self) -> Tensor:
-        """(B, C, S, S) crops of the boxes themselves."""
-        return self.regions[:, 0]
-
     def split(self) -> "list[QueryFeatures]":
         """Each photograph by itself."""
         names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
         known = [getattr(self, name) for name in names]
-        count = len(self.regions)
+        count = len(self.crops)
         parts = [[None] * count if x is None else x.split(1) for x in known]
         queries = [QueryFeatures(*row) for row in zip(*parts, strict=True)]
         for name, x in self.computed.items():
@@ -145,49 +138,49 @@ def _has_hooks(module: nn.Module) -> bool:
     return any(own) or bool(of_all._global_forward_hooks or of_all._global_forward_pre_hooks)
 
 
-def jittered_boxes(boxes: Tensor, box_jitter: float) -> Tensor:
-    """(B, K, 4) of (B, 4) boxes: each box, four copies shifted by 3/4 ``box_jitter`` of its longer
-    side, two scaled. ``box_jitter`` is a fraction in [0, 0.45]; K = 7, or 1 for ``box_jitter`` =
-    0."""
+def jittered_fields(field: Tensor, box_jitter: float, margin: float) -> Tensor:
+    """(B, K, 2, S, S) of the fields (B, 2, S, S) of crops of boxes with a ``margin``: each field,
+    then as it would be of the box shifted by 3/4 ``box_jitter`` of its longer side, four times, and
+    scaled by 1 + ``box_jitter``, twice; 0 beyond the crop. ``box_jitter`` is a fraction in [0,
+    0.45]; K = 7, or 1 for ``box_jitter`` = 0."""
+    check_box_jitter(box_jitter)
+    if box_jitter == 0.0:
+        return field[:, None]
+    jitter = torch.tensor(_JITTER, dtype=field.dtype, device=field.device)
+    scale = (1.0 + box_jitter) ** jitter[:, 2]
+    # from -1 to 1 lies the square crop, of which a box's longer side is a part
+    shift = jitter[:, :2] * (2.0 * box_jitter / (1.0 + 2.0 * margin))
+    maps = torch.cat([torch.diag_embed(scale[:, None].expand(-1, 2)), shift[:, :, None]], dim=2)
+    B, _, H, W = field.shape
+    grid = F.affine_grid(maps, [len(maps), 2, H, W], align_corners=False)
+    copies = field[:, None].expand(-1, len(maps), -1, -1, -1)
+    sampled = F.grid_sample(copies.flatten(0, 1), grid.repeat(B, 1, 1, 1), align_corners=False)
+    return torch.cat([field[:, None], sampled.view(copies.shape)], dim=1)
+
+
+def check_box_jitter(box_jitter: float) -> None:
+    """Refuse what is no fraction in [0, 0.45]."""
     if not 0.0 <= box_jitter <= 0.45:
         raise InvalidInputError(f"box_jitter: expected a fraction in [0, 0.45], got {box_jitter}")
-    jitter = torch.tensor(
-        _JITTER if box_jitter else _JITTER[:1], dtype=boxes.dtype, device=boxes.device
-    )
-    sides = boxes[:, 2:] - boxes[:, :2]
-    shift = box_jitter * jitter[None, :, :2] * sides.amax(dim=1)[:, None, None]
-    centre = 0.5 * (boxes[:, None, :2] + boxes[:, None, 2:]) + shift
-    half = 0.5 * sides[:, None] * (1.0 + box_jitter) ** jitter[None, :, 2:]
-    return torch.cat([centre - half, centre + half], dim=2)
 
 
-def crop_regions(
+def crop_photographs(
     images: Tensor | Sequence[Tensor], boxes: Tensor, *, size: int, margin: float
 ) -> Tensor:
-    """(B, K, C, S, S) crops of K boxes per image, as :func:`crop_images` cuts them, on the device
-    of the boxes.
-
-    Args:
-        images: (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if channel counts
-            differ, grey images get three channels.
-        boxes: (B, K, 4) in px, from :func:`jittered_boxes`. A box entirely outside its image is
-            replaced by the first box, which must not be outside.
-    """
+    """(B, C, S, S) crops of the boxes (B, 4) in px, as :func:`crop_images` cuts them, on the device
+    of the boxes. Images are (B, C, H, W), or a list of (C, H, W), floating in [0, 1] or uint8; if
+    channel counts differ, grey ones get three channels."""
     for image in images:
         check_photograph(image)
-    sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
-    check_boxes(boxes[:, 0], sizes)
-    if not sizes:
-        return boxes.new_zeros(0, boxes.shape[1], 3, size, size)
+    check_boxes(boxes, [(int(image.shape[-2]), int(image.shape[-1])) for image in images])
+    if not len(images):
+        return boxes.new_zeros(0, 3, size, size)
     channels = max(image.shape[0] for image in images)
     crops = []
-    for image, each, (H, W) in zip(images, boxes, sizes, strict=True):
-        end = torch.tensor([W - 0.5, H - 0.5], dtype=each.dtype, device=each.device)
-        visible = (each[:, 2:] > -0.5).all(dim=1) & (each[:, :2] < end).all(dim=1)
-        each = torch.where(visible[:, None], each, each[:1])
-        cut = crop_squares(image, square_boxes(each, margin), size).to(boxes.device)
-        crops.append(cut.expand(-1, channels, -1, -1))
-    return torch.stack(crops)
+    for image, square in zip(images, square_boxes(boxes, margin), strict=True):
+        crop = crop_squares(image, square[None], size).to(boxes.device)
+        crops.append(crop.expand(-1, channels, -1, -1))
+    return torch.cat(crops)
 
 
 def box_shapes(boxes: Tensor) -> Tensor:

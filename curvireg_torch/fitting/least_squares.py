@@ -38,13 +38,9 @@ class Measurements(Rows):
         WJ = (self.weight * self.J).mT
         return torch.bmm(WJ, self.J), torch.bmm(WJ, self.distance)
 
-    def scaled(self, factor: float) -> "Measurements":
-        """The same with weights times ``factor``."""
-        return Measurements(self.J, self.distance, factor * self.weight)
-
 
 @dataclass(frozen=True)
-class PointMatches:
+class PointMatches(Rows):
     """Points of a mesh ``model`` (1, C, 3) that were found at ``uv`` (1, C, 2) px with ``weight``
     (1, C) in [0, 1]; 0 marks a point that was not found."""
 
@@ -67,6 +63,10 @@ class PointMatches:
         of it counts at ``scale`` px."""
         near = _geman_mcclure(self.uv - pixels(self.model, T, K, centre), scale)
         return float((near * self.weight).sum()) / max(self.weight.shape[1], 1)
+
+    def scaled(self, factor: float) -> "PointMatches":
+        """The same with weights times ``factor``."""
+        return PointMatches(self.model, self.uv, factor * self.weight)
 
     def moved(self, before: Tensor, after: Tensor) -> "PointMatches":
         """The same in another crop of the photograph: ``before`` and ``after`` are the crops'

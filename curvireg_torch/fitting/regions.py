@@ -3,11 +3,11 @@
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
 SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
+DIRECTIONS = 72  # Directions of which the log ratios are kept, each between two sectors
 LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors
 # Added to probabilities, so that a colour never seen is not proof
 MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3
@@ -49,56 +49,52 @@ class RegionModel:
 
     def __init__(self) -> None:
         self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
-        self._log_ratio = torch.zeros(SECTORS * COLOUR_LEVELS**3)
+        self._log_ratio = torch.zeros(DIRECTIONS * COLOUR_LEVELS**3)
 
     def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor) -> None:
-        """Move the histograms towards the colours at ``uv`` (M, 2) px of ``bins`` (S, S), in
-        ``directions`` (M,) rad from the object's centre, ``inside`` (M,) bool the object; empty
-        histograms take all of them."""
+        """Move the histograms towards the colours of ``bins`` (S, S) at ``uv`` (P, L, 2) px of
+        lines in ``directions`` (P,) rad from the object's centre, ``inside`` (P, L) bool the
+        object; empty histograms take all of them."""
         colour, seen = _colours_at(bins, uv)
-        colour = colour[seen]
-        low, high, fraction = _sectors(directions[seen])
-        side = (~inside[seen]).long()
         new = torch.zeros_like(self._histograms)
+        low, high, fraction = (x[:, None] for x in _sectors(directions.float()))
         for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
-            new.view(-1).index_add_(
-                0, (side * SECTORS + sector) * COLOUR_LEVELS**3 + colour, weight.float()
-            )
+            place = ((~inside).long() * SECTORS + sector) * COLOUR_LEVELS**3 + colour
+            new.view(-1).index_add_(0, place.flatten(), (weight * seen).flatten())
         count = new.sum(dim=-1, keepdim=True)
         new = new / count.clamp(min=1e-9)
         step = LEARNING_RATE * count / (count + HALF_RATE_COUNT)
         empty = self._histograms.sum(dim=-1, keepdim=True) == 0
         self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
-        cube = self._histograms.view(-1, 1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS)
-        for axis in range(3):  # smooth along each colour channel
-            shape = [1, 1, 1]
-            pad = [0] * 6
-            shape[axis], pad[4 - 2 * axis], pad[5 - 2 * axis] = 3, 1, 1
-            kernel = torch.tensor([0.2, 0.6, 0.2]).view(1, 1, *shape)
-            cube = F.conv3d(F.pad(cube, pad, mode="replicate"), kernel)
-        p = cube.view_as(self._histograms)
+        p = _smooth(self._histograms)
         p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
-        self._log_ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(
-            -MAX_LOG_RATIO, MAX_LOG_RATIO
-        ).view(-1)
+        ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
+        low, high, fraction = _sectors(torch.arange(DIRECTIONS) * (2.0 * math.pi / DIRECTIONS))
+        self._log_ratio = torch.lerp(ratio[low], ratio[high], fraction[:, None]).view(-1)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
         """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``,
         at (P, L, 2) px of lines in ``directions`` (P,); 0 outside the window."""
         colour, seen = _colours_at(bins, uv)
-        low, high, fraction = (x[:, None] for x in _sectors(directions))
-        of_low, of_high = (
-            self._log_ratio[sector * COLOUR_LEVELS**3 + colour] for sector in (low, high)
-        )
-        return torch.lerp(of_low, of_high, fraction.to(of_low.dtype)) * seen
+        row = (directions * (DIRECTIONS / (2.0 * math.pi))).round().long() % DIRECTIONS
+        return self._log_ratio[COLOUR_LEVELS**3 * row[:, None] + colour] * seen
 
 
 def _colours_at(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Bins (...) of the pixels nearest to ``uv`` (..., 2), and whether they lie in the window."""
-    side = bins.shape[-1]
-    x, y = uv.round().long().unbind(-1)
-    seen = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-    return bins[y.clamp(0, side - 1), x.clamp(0, side - 1)], seen
+    pixel = uv.round().long()
+    nearest = pixel.clamp(0, bins.shape[-1] - 1)
+    return bins[nearest[..., 1], nearest[..., 0]], (nearest == pixel).all(dim=-1)
+
+
+def _smooth(histograms: Tensor) -> Tensor:
+    """Histograms (2, SECTORS, bins), smoothed along each colour channel."""
+    rest = torch.full((COLOUR_LEVELS - 1,), 0.2)
+    kernel = torch.eye(COLOUR_LEVELS) * 0.6 + rest.diag(1) + rest.diag(-1)
+    kernel[0, 0] = kernel[-1, -1] = 0.8  # the first and the last level repeat beyond
+    by_blue = histograms.view(-1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS) @ kernel
+    by_green = kernel @ by_blue
+    return (kernel @ by_green.flatten(2)).view_as(histograms)
 
 
 def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

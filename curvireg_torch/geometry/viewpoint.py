@@ -13,7 +13,7 @@ Other shapes and dtypes, and matrices that are no rotations, raise :class:`Inval
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import torch
 from torch import Tensor
@@ -199,7 +199,7 @@ class ViewSphere(Rows):
                 "ViewSphere: expected distances > 1 object radius (the camera outside the object)"
             )
 
-    @property
+    @cached_property
     def rotations(self) -> Tensor:
         """(N, 3, 3) rotations model -> camera."""
         return rotation_from_viewpoint(self.azimuth, self.elevation, self.theta)

@@ -154,56 +154,48 @@ class ViewDescriber:
 
     def depth(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]:
         """Depth (N, 1, S, S) of the framed views, and their boxes (N, 4)."""
-        depth, _, boxes = self._seen(rotations, distances)
-        return depth, boxes
-
-    def _seen(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Depth (N, 1, S, S), camera matrices (N, 3, 3) and boxes (N, 4) of the framed views."""
         T, K, boxes = self.cameras(rotations, distances)
-        depth = self.view_renderer.render(
-            T, K, (self.settings.image_size,) * 2, orthographic=self._orthographic
-        )
-        return depth.to(self._device), K.to(self._device), boxes.to(self._device)
+        return self._depth(T, K), boxes.to(self._device)
+
+    def _depth(self, T: Tensor, K: Tensor) -> Tensor:
+        """Depth (N, 1, S, S) of poses (N, 4, 4) seen by cameras (N, 3, 3)."""
+        size = (self.settings.image_size,) * 2
+        depth = self.view_renderer.render(T, K, size, orthographic=self._orthographic)
+        return depth.to(self._device)
 
     def fields(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, 2, S, S) fields of the framed views."""
-        depth, K, _ = self._seen(rotations, distances)
-        return self.field(depth, K)
+        T, K, _ = self.cameras(rotations, distances)
+        return self.field(self._depth(T, K), K)
 
     def field(self, depth: Tensor, K: Tensor) -> Tensor:
         """(N, 2, S, S) field of depth (N, 1, S, S) that was seen by cameras (N, 3, 3) of the
         settings' kind."""
         of_surface = None if self._orthographic else OF_SURFACE.get(self.settings.depth_field)
-        field: Tensor = (
-            self._filter(depth) if of_surface is None else of_surface(depth, camera_matrix=K)
-        )
-        return field
+        if of_surface is None:
+            field: Tensor = self._filter(depth)
+            return field
+        return of_surface(depth, camera_matrix=K.to(depth.device))
 
     @torch.no_grad()
     def shaded(self, rotations: Tensor, distances: Tensor) -> Tensor:
         """(N, 1, S, S) grey pictures of the framed views, see
         :func:`curvireg_torch.rendering.shade`. With the mesh's colours (N, 4, S, S): grey, then RGB
         of :func:`curvireg_torch.rendering.render_colour`."""
-        return self._shaded(*self._framed(rotations, distances))
+        T, K, _ = self.cameras(rotations, distances)
+        return self._shaded(self._depth(T, K), T, K)
 
     @torch.no_grad()
     def seen_by(self, T: Tensor, K: Tensor, *, shaded: bool) -> tuple[Tensor, Tensor | None]:
         """Fields (N, 2, S, S) of poses (N, 4, 4) seen by cameras (N, 3, 3), and, if ``shaded``, the
         pictures of :meth:`shaded`, of the same depth images."""
-        size = (self.settings.image_size,) * 2
-        depth = self.view_renderer.render(T, K, size, orthographic=self._orthographic)
-        field = self.field(depth.to(self._device), K.to(self._device))
-        return field, self._shaded(depth, T, K) if shaded else None
-
-    def _framed(self, rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        T, K, _ = self.cameras(rotations, distances)
-        size = (self.settings.image_size,) * 2
-        return self.view_renderer.render(T, K, size, orthographic=self._orthographic), T, K
+        depth = self._depth(T, K)
+        return self.field(depth, K), self._shaded(depth, T, K) if shaded else None
 
     def _shaded(self, depth: Tensor, T: Tensor, K: Tensor) -> Tensor:
         S = self.settings.image_size
         projection = {"orthographic": self._orthographic}
-        grey = shade(depth, K, **projection).to(self._device)
+        grey = shade(depth, K, **projection)
         if not self._coloured:
             return grey
         colour = render_colour(self._mesh, T, K, (S, S), renderer=self.renderer, **projection)
@@ -236,7 +228,9 @@ class ViewDescriber:
         seen = torch.ones_like(distances) if self._orthographic else distances
         source, quarters = quarter_turns(rotations, seen)
         rendered = source == torch.arange(len(source))
-        depth, K, boxes = self._seen(rotations[rendered], distances[rendered])
+        T, K, boxes = self.cameras(rotations[rendered], distances[rendered])
+        boxes = boxes.to(self._device)
+        depth = self._depth(T, K)
         field = self.field(depth, K)
         points = field_points(field, fraction=self.settings.point_fraction)[:, 0]
         silhouettes = depth[:, 0] > 0

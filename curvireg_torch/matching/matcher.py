@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInputError
 from ..features import field_points
+from ..features.backbone import images_at_a_time
 from ..geometry import ViewSphere
 from ..mesh import mesh_radius
 from ..pipeline import Pipeline
@@ -21,8 +22,8 @@ from ..terms import (
     Correlation,
     QueryFeatures,
     Term,
-    crop_regions,
-    jittered_boxes,
+    crop_photographs,
+    jittered_fields,
     photograph_field,
     whole_box_shapes,
 )
@@ -39,8 +40,6 @@ from .describe import ViewDescriber, hog_layer
 _PREPARED = ("_terms", "_described_views", "describer")
 # Trace of a rotation by 30 degrees: views within that of the best one are no rivals of it
 NEAR_TRACE = 1.0 + 3.0**0.5
-FEATURES_AT_A_TIME = 4  # Views whose appearance is computed at a time
-FEATURES_ON_DEVICE = 256  # the same on another device than the CPU
 
 
 @dataclass(frozen=True)
@@ -229,32 +228,29 @@ class ViewMatcher(nn.Module):
     def query(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> QueryFeatures:
         """Crop and describe photographs, see :meth:`forward`; :meth:`rank` rejects missing
         pixels."""
-        return self.describe(*self._regions(images, boxes))
+        return self.describe(*self._crops(images, boxes))
 
-    def _regions(
-        self, images: Tensor | Sequence[Tensor], boxes: BoxesLike
-    ) -> tuple[Tensor, Tensor]:
-        """Crops (B, K, C, S, S) of the boxes, jittered, and their shapes (B,)."""
+    def _crops(self, images: Tensor | Sequence[Tensor], boxes: BoxesLike) -> tuple[Tensor, Tensor]:
+        """Crops (B, C, S, S) of the boxes, and their shapes (B,)."""
         settings = self.bank.settings
         boxes = as_boxes(boxes, len(images)).to(self.bank.device, torch.float32)
-        jittered = jittered_boxes(boxes, self.pipeline.box_jitter)
-        regions = crop_regions(images, jittered, size=settings.image_size, margin=settings.margin)
+        crops = crop_photographs(images, boxes, size=settings.image_size, margin=settings.margin)
         sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
-        return regions, whole_box_shapes(boxes, sizes)
+        return crops, whole_box_shapes(boxes, sizes)
 
     def query_together(self, image: Tensor, box: Tensor) -> QueryFeatures:
         """:meth:`query` of one photograph (C, H, W) with a box (4,), described with those that
         other jobs of ``map_in_company`` have."""
         image = image.to(self.bank.device)
-        return compute_together(self._described, self._regions([image], box[None]))
+        return compute_together(self._described, self._crops([image], box[None]))
 
     def _described(self, requests: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
         if len(requests) == 1:
             return [self.describe(*requests[0])]
 
         def describe(some: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
-            regions, shapes = (torch.cat(parts) for parts in zip(*some, strict=True))
-            return self.describe(regions, shapes).split()
+            crops, shapes = (torch.cat(parts) for parts in zip(*some, strict=True))
+            return self.describe(crops, shapes).split()
 
         return by_key(requests, lambda request: request[0].shape, describe)
 
@@ -277,27 +273,35 @@ class ViewMatcher(nn.Module):
 
         def key(request: tuple[QueryFeatures, Tensor | None]) -> tuple[Any, ...]:
             query, allowed = request
-            return (query.regions.shape, query.mask is None, allowed is None)
+            return (query.crops.shape, query.mask is None, allowed is None)
 
         return by_key(requests, key, rank)
 
     def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
-        return self.describe(crops[:, None], torch.full_like(crops[:, 0, 0, 0], torch.nan))
+        unknown = torch.full_like(crops[:, 0, 0, 0], torch.nan)
+        return self.describe(crops, unknown, box_jitter=0.0)
 
     @in_full_precision
-    def describe(self, regions: Tensor, shapes: Tensor) -> QueryFeatures:
-        """Field, descriptors and points of (B, K, C, S, S) crops; ``shapes`` (B,) of the boxes."""
-        B, K = regions.shape[:2]
-        field, mask = photograph_field(self.field, regions.flatten(0, 1))
-        points = field_points(field, fraction=self.bank.settings.point_fraction)[:, 0]
+    def describe(
+        self, crops: Tensor, shapes: Tensor, *, box_jitter: float | None = None
+    ) -> QueryFeatures:
+        """Field, descriptors and points of (B, C, S, S) crops; ``shapes`` (B,) of the boxes.
+        ``box_jitter`` is by default the pipeline's."""
+        settings = self.bank.settings
+        jitter = self.pipeline.box_jitter if box_jitter is None else box_jitter
+        field, mask = photograph_field(self.field, crops)
+        jittered = jittered_fields(field, jitter, settings.margin)
+        B, K = jittered.shape[:2]
+        fields = jittered.flatten(0, 1)
+        points = field_points(fields, fraction=settings.point_fraction)[:, 0]
         return QueryFeatures(
-            regions=regions,
-            field=field.unflatten(0, (B, K))[:, 0],
-            descriptors=self.descriptor(field).unflatten(0, (B, K)),
+            crops=crops,
+            field=field,
+            descriptors=self.descriptor(fields).unflatten(0, (B, K)),
             points=points.unflatten(0, (B, K)),
-            shapes=shapes.to(regions),
-            mask=None if mask is None else mask.unflatten(0, (B, K))[:, 0],
+            shapes=shapes.to(crops),
+            mask=mask,
         )
 
     @in_full_precision
@@ -405,7 +409,7 @@ class ViewMatcher(nn.Module):
             return appearance.describe(self.describer.shaded(R, distances))
 
         # One thread per chunk, so that rounding does not depend on which photograph came first.
-        at_a_time = FEATURES_AT_A_TIME if self.bank.device.type == "cpu" else FEATURES_ON_DEVICE
+        at_a_time = images_at_a_time(self.bank.device)
         chunks = [views[k : k + at_a_time] for k in range(0, len(views), at_a_time)]
         return torch.cat(map_on_threads(describe, chunks, device=self.bank.device))
 

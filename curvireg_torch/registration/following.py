@@ -80,9 +80,7 @@ class Follower:
         self.prior = prior
         describer = self.registrar.describer
         self._reliable = self.registrar.pipeline.fit.reliable
-        self._tracker = Tracker(
-            describer.renderer, describer.contours, describer.hull, reliable=self._reliable
-        )
+        self._tracker = Tracker(describer.contours, describer.hull, reliable=self._reliable)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
 

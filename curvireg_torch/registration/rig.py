@@ -23,7 +23,7 @@ from ..geometry.conversions import axis_angle_from_rotation, cross_matrix
 from ..geometry.crops import box_iou
 from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
-from ..terms import crop_regions
+from ..terms import crop_photographs
 from .confidence import MAX_MARGIN, refinement_confidence
 from .described import DescribedPhotograph, evidence_of
 from .framing import shown_in
@@ -139,9 +139,9 @@ class RigPhotograph(DescribedPhotograph):
         settings = target.bank.settings
         boxes = box.float()[None]
         image = item.image.expand(3, -1, -1)
-        crop = crop_regions(
-            [image], boxes[:, None], size=settings.image_size, margin=settings.margin
-        )[:, 0].float()
+        crop = crop_photographs(
+            [image], boxes, size=settings.image_size, margin=settings.margin
+        ).float()
         query = target.matcher.features(crop.to(target.bank.device))
         frame = target.frame_of(box, item.size)
         mask = target.object_mask(query, [replace(item, box=boxes[0])])

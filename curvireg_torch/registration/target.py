@@ -210,8 +210,8 @@ class Target:
 
 def nearest_view(target: Target, rotation: Tensor) -> int:
     """The view of the bank that is most similar to an allocentric rotation (3, 3)."""
-    R = target.bank.rotations.cpu().double()
-    return int((R.flatten(1) @ rotation.flatten()).argmax())
+    R = target.bank.rotations
+    return int((R.flatten(1) @ rotation.flatten().to(R)).argmax())
 
 
 def flat_mesh_warnings(mesh: trimesh.Trimesh) -> tuple[str, ...]:

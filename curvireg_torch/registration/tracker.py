@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from ..fitting.least_squares import (
     INLIER_SCALE,
     Measurements,
     PointMatches,
+    apply_twist,
     fit_points,
     nearest_rigid,
     pixels,
@@ -27,13 +29,17 @@ from ..fitting.regions import RegionModel, line_posterior
 from ..fitting.texture_fit import surface_corners
 from ..geometry import rotation_error
 from ..geometry.cameras import point_in_cameras, pose_around, projected_boxes
-from ..rendering import DepthRenderer
 from ..rendering.contours import MeshContours
 from .confidence import RELIABLE, tracking_confidence
 
 # Added around the object's box, as a fraction of its longer side: room for motion that was not
 # predicted
 WINDOW_MARGIN = 0.3
+# Difference in px between the mesh at the predicted pose and at that of the flow, up to which the
+# crop of the predicted one serves
+WINDOW_SHIFT = 16.0
+# Size of the crops for which the mesh is simplified from which corners get their depth
+DEPTH_SIZE = 128
 # Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
 # Search radius in px of edges and of the end of the object's colours, one a round
@@ -93,6 +99,19 @@ class TrackedPose:
         return tracking_confidence(self.features)
 
 
+class _Silhouette(NamedTuple):
+    """Q contour points that have the background beside them: pixels ``uv`` (Q, 2), unit ``normals``
+    (Q, 2) that point there, and ``directions`` (Q,) rad from the object's centre."""
+
+    uv: Tensor
+    normals: Tensor
+    directions: Tensor
+
+    def lines(self, offsets: Tensor) -> Tensor:
+        """Pixels (Q, L, 2) at offsets (L,) px along the normals."""
+        return self.uv[:, None] + offsets[:, None] * self.normals[:, None]
+
+
 class Tracker:
     """Follows an object from a known pose, by the ``contours`` of its mesh and the points ``hull``
     (V, 3) around it.
@@ -109,18 +128,17 @@ class Tracker:
 
     def __init__(
         self,
-        renderer: DepthRenderer,
         contours: MeshContours,
         hull: Tensor,
         *,
         reliable: float = RELIABLE,
     ) -> None:
         self.reliable = reliable
-        self.renderer = renderer
         self.contours = contours
         self.hull = hull.double()
         self.centre = contours.centre
         self.radius = contours.radius
+        self._renderer = contours.renderer(DEPTH_SIZE)
         self._poses: list[Tensor] = []
         self._keyframes: list[Keyframe] = []
         self._last: Keyframe | None = None
@@ -163,7 +181,7 @@ class Tracker:
     def accept(self, pose: TrackedPose) -> None:
         """Go on from a pose of :meth:`track` or :meth:`measure`, and learn from its frame."""
         self._poses = [*self._poses[-1:], pose.state.T]
-        depth = self.renderer.render(pose.state.T, pose.frame.K, (CROP_SIZE, CROP_SIZE)).cpu()
+        depth = self._renderer.render(pose.state.T, pose.frame.K, (CROP_SIZE, CROP_SIZE))
         self._learn(pose.frame, pose.state, depth)
         self._remember(pose.frame, pose.state.T, depth)
 
@@ -197,67 +215,73 @@ class Tracker:
         assert self._last is not None
         first = self._frame(image, K, T)
         flow = track_points(self._last, first, T, self.centre, levels=PYRAMID_LAST)
+        predicted = pixels(self.hull, T, first.K, self.centre)
         T = fit_points(flow, T, first.K, self.centre, FLOW_SCALES)
-        frame = self._frame(image, K, T)
-        flows = [(POINT_WEIGHT, flow.moved(first.K, frame.K))]
+        shift = (pixels(self.hull, T, first.K, self.centre) - predicted).abs().max()
+        frame = first if float(shift) < WINDOW_SHIFT else self._frame(image, K, T)
+        flows = [flow.moved(first.K, frame.K)]
         keyframe = self._keyframes[int(self._angles(T).argmin())]
         if keyframe is not self._last:
-            flows.append(
-                (
-                    KEYFRAME_WEIGHT,
-                    track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME),
-                )
-            )
+            flows.append(track_points(keyframe, frame, T, self.centre, levels=PYRAMID_KEYFRAME))
+        weights = (POINT_WEIGHT, KEYFRAME_WEIGHT)
+        corners = PointMatches.cat_within(
+            [flow.scaled(weight) for flow, weight in zip(flows, weights, strict=False)]
+        )
         state = frame.problem.state(T)
         for radius in SEARCH_RADII:
             for _ in range(STEPS_PER_ROUND):
-                others = self._measurements(frame, state, flows, radius)
-                state = replace(state, T=frame.problem.step(state.points, state.T, radius, others))
+                state = replace(state, T=self._step(frame, state, corners, radius))
             state = frame.problem.with_current_contours(replace(state, T=nearest_rigid(state.T)))
-        return self._tracked(frame, state, [flow for _, flow in flows])
+        return self._tracked(frame, state, flows)
 
-    def _measurements(
-        self,
-        frame: Frame,
-        state: ContourState,
-        flows: list[tuple[float, PointMatches]],
-        radius: float,
-    ) -> list[Measurements]:
-        """Colours and points, beside the edges."""
-        mean, variance = self._ends(frame, state, math.ceil(radius))
-        flat = math.ceil(radius) ** 2 / 3.0  # variance of lines along which colours say nothing
+    def _step(
+        self, frame: Frame, state: ContourState, corners: PointMatches, radius: float
+    ) -> Tensor:
+        """(1, 4, 4) the pose after a least-squares step towards edges within ``radius`` px, the end
+        of the object's colours, and ``corners``."""
+        problem = frame.problem
+        points = state.points
+        uv, J = project(points.model, points.normals, state.T, frame.K, self.centre)
+        silhouette = self._silhouette(frame, state, uv)
+        colours = self._colours(frame, silhouette, J[:, points.outline[0]], math.ceil(radius))
+        matches = corners.measurements(state.T, frame.K, self.centre, INLIER_SCALE)
+        others = [colours.equations(), matches.equations()]
+        step = problem.selected_step(points, uv, J, radius, others)
+        fraction = problem.step_fraction(step, state.T)
+        return apply_twist(state.T, step * fraction[:, None], self.centre)
+
+    def _colours(
+        self, frame: Frame, silhouette: _Silhouette, J: Tensor, radius: int
+    ) -> Measurements:
+        """Where the object's colours end within ``radius`` px of its silhouette, whose points shift
+        along their normals by ``J`` (1, Q, 6)."""
+        mean, variance = self._ends(frame, silhouette, radius)
+        flat = radius**2 / 3.0  # variance of lines along which colours say nothing
         information = (1.0 / (variance + REGION_VARIANCE) - 1.0 / flat).clamp(min=0.0)
-        model, normals = _silhouette(state)
-        _, J = project(model[None], normals[None], state.T, frame.K, self.centre)
-        colours = Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
-        points = [
-            flow.measurements(state.T, frame.K, self.centre, INLIER_SCALE).scaled(w)
-            for w, flow in flows
-        ]
-        return [colours, *points]
+        weight = REGION_WEIGHT * information
+        return Measurements(J, mean[None, :, None], weight[None, :, None])
 
-    def _ends(self, frame: Frame, state: ContourState, radius: int) -> tuple[Tensor, Tensor]:
+    def _silhouette(
+        self, frame: Frame, state: ContourState, uv: Tensor | None = None
+    ) -> _Silhouette:
+        """The contour points, at ``uv`` (1, P, 2) px, that have the background beside them."""
+        points = state.points
+        if uv is None:
+            uv = pixels(points.model, state.T, frame.K, self.centre)
+        here = uv[0, points.outline[0]]
+        x, y = (here - pixels(self.centre[None, None], state.T, frame.K, self.centre)[0]).unbind(-1)
+        return _Silhouette(here, points.normals[0, points.outline[0]], torch.atan2(y, x))
+
+    def _ends(self, frame: Frame, silhouette: _Silhouette, radius: int) -> tuple[Tensor, Tensor]:
         """Mean and variance (Q,) of where the object's colours end along the normals of its
         silhouette."""
-        samples, directions = self._lines(
-            frame, state, torch.arange(-radius, radius + 1, dtype=torch.float64)
-        )
-        return line_posterior(
-            self._regions.log_ratio(frame.bins, samples, directions).double(), radius
-        )
-
-    def _lines(self, frame: Frame, state: ContourState, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (Q, L, 2) at offsets (L,) px along the normals of the silhouette, and directions
-        (Q,) rad of these lines from the object's centre."""
-        model, normals = _silhouette(state)
-        points = torch.cat([self.centre[None], model])[None]
-        middle, uv = pixels(points, state.T, frame.K, self.centre)[0].split([1, len(model)])
-        x, y = (uv - middle).unbind(-1)
-        return uv[:, None] + offsets[:, None] * normals[:, None], torch.atan2(y, x)
+        lines = silhouette.lines(torch.arange(-radius, radius + 1, dtype=torch.float64))
+        ratio = self._regions.log_ratio(frame.bins, lines, silhouette.directions)
+        return line_posterior(ratio.double(), radius)
 
     def _tracked(self, frame: Frame, state: ContourState, flows: list[PointMatches]) -> TrackedPose:
         """A pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
-        mean, variance = self._ends(frame, state, REGION_FEATURE_RADIUS)
+        mean, variance = self._ends(frame, self._silhouette(frame, state), REGION_FEATURE_RADIUS)
         clear = torch.exp(-0.125 * mean.square()) * (
             1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2
         ).clamp(min=0.0)
@@ -274,13 +298,11 @@ class Tracker:
         """Learn the colours beside the outline; where the mesh hides the background again, they are
         the object's."""
         distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
-        samples, directions = self._lines(frame, state, torch.cat([-distance, distance]))
-        x, y = samples.round().long().clamp(0, CROP_SIZE - 1).unbind(-1)
+        silhouette = self._silhouette(frame, state)
+        lines = silhouette.lines(torch.cat([-distance, distance]))
+        x, y = lines.round().long().clamp(0, CROP_SIZE - 1).unbind(-1)
         inside = depth[0, 0, y, x] > 0
-        directions = directions[:, None].expand(inside.shape)
-        self._regions.learn(
-            frame.bins, samples.flatten(0, 1), directions.flatten(), inside.flatten()
-        )
+        self._regions.learn(frame.bins, lines, silhouette.directions, inside)
 
     def _remember(self, frame: Frame, T: Tensor, depth: Tensor) -> None:
         """Keep the frame as the last one, and if none from a similar direction is kept, as a
@@ -309,9 +331,3 @@ class Tracker:
         crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
         grey = (255.0 * crops.crops[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
         return Frame(crops, grey, crops.transforms @ K, self.contours)
-
-
-def _silhouette(state: ContourState) -> tuple[Tensor, Tensor]:
-    """Contour points (Q, 3) that have the background beside them, and unit normals (Q, 2) that
-    point there."""
-    return state.points.model[state.points.outline], state.points.normals[state.points.outline]

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..utils.rows import Rows
-from .embree import RayScene, float32
+from .embree import RasterRenderer, RayScene, float32
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
 MAX_CREASES = 128  # Points per pose on creases
@@ -77,10 +77,16 @@ class _Level:
     def __init__(
         self, mesh: trimesh.Trimesh, centre: np.ndarray, radius: float, max_faces: int
     ) -> None:
+        self.centre = centre
         self.radius = radius
         self.edges = MeshEdges(mesh, centre, max_faces)
         self._vertices = float32(self.edges.vertices)
         self._scene = RayScene(self.edges.vertices / radius, self.edges.faces)
+
+    def mesh(self) -> trimesh.Trimesh:
+        """The simplified mesh, in the frame of the given one."""
+        vertices = self.edges.vertices + self.centre
+        return trimesh.Trimesh(vertices, self.edges.faces, process=False)
 
     def vertices_in_cameras(self, R: np.ndarray, position: np.ndarray) -> np.ndarray:
         """(N, V, 3) float32 vertices in the cameras' frames, of poses with rotations (N, 3, 3) and
@@ -264,15 +270,17 @@ class MeshContours:
         for size, faces in reversed(LEVELS):  # each is simplified from the next finer one
             level = _Level(mesh, self.centre.numpy(), self.radius, faces)
             self._levels[size] = level
-            mesh = trimesh.Trimesh(
-                level.edges.vertices + self.centre.numpy(), level.edges.faces, process=False
-            )
+            mesh = level.mesh()
 
     def level_of(self, size: int) -> tuple[int, _Level]:
         """The largest crop that the simplified mesh for crops of ``size`` px serves, and this
         mesh."""
         limit = next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])
         return limit, self._levels[limit]
+
+    def renderer(self, size: int) -> RasterRenderer:
+        """Draws the mesh, simplified for crops of ``size`` px."""
+        return RasterRenderer(self.level_of(size)[1].mesh())
 
     def points(
         self, T_cam_from_model: Tensor, camera_matrices: Tensor, size: int, *, density: float = 1.0

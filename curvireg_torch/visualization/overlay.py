@@ -15,8 +15,8 @@ from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
-from ..registration.result import pose_in_words, two_decimals
-from ..terms import crop_regions, photograph_field
+from ..registration.words import pose_in_words, two_decimals
+from ..terms import crop_photographs, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike
 from .contours import Drawn, close_up, draw_window
@@ -147,9 +147,9 @@ def side_pictures(
     """
     item = image_item(image, as_numbers(box, "box"))
     settings = registrar.bank.settings
-    crop = crop_regions(
-        [item.image], item.box[None, None], size=settings.image_size, margin=settings.margin
-    )[0]
+    crop = crop_photographs(
+        [item.image], item.box[None], size=settings.image_size, margin=settings.margin
+    )
     field = photograph_field(registrar.matcher.field, crop.to(registrar.bank.device))[0]
     at = result.allocentric_rotation[None], torch.tensor([result.distance])
     shaded = registrar.describer.shaded(*at)[0]  # grey, or grey and RGB

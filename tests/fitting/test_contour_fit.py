@@ -20,7 +20,7 @@ from curvireg_torch.mesh.mesh import mesh_centre
 from curvireg_torch.registration import ContourFit, fit_contours
 from curvireg_torch.rendering.contours import ContourPoints, MeshContours
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
-from curvireg_torch.terms import crop_regions
+from curvireg_torch.terms import crop_photographs
 from tests.fitting.cube import BOX, CUBE_POSE, K, cube, fitted, noise, pose, silhouette
 
 CENTRE = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)
@@ -402,7 +402,7 @@ def test_a_quick_fit_reaches_far_and_counts_the_mask():
         1
     ].tolist()
     assert far > 0.95 * right
-    inside = crop_regions([image], BOX[None, None], size=64, margin=0.1)[0, :, :1].clamp(0, 1)
+    inside = crop_photographs([image], BOX[None], size=64, margin=0.1)[:, :1].clamp(0, 1)
     with_mask, against = (
         float(
             quick_fit(

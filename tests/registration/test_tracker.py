@@ -12,10 +12,17 @@ import trimesh
 
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import ImageError, LostObjectError
+from curvireg_torch.fitting import regions
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.flow import Frame, Keyframe, track_points
 from curvireg_torch.fitting.least_squares import fit_points, pixels
-from curvireg_torch.fitting.regions import HALF_RATE_COUNT, RegionModel, colour_bins, line_posterior
+from curvireg_torch.fitting.regions import (
+    HALF_RATE_COUNT,
+    SECTORS,
+    RegionModel,
+    colour_bins,
+    line_posterior,
+)
 from curvireg_torch.fitting.texture_fit import surface_corners
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.geometry.cameras import transform
@@ -36,7 +43,7 @@ ZERO = torch.zeros(3, dtype=torch.float64)
 
 
 def make_tracker(mesh):
-    return Tracker(make_renderer(mesh), MeshContours(mesh), extreme_points(mesh))
+    return Tracker(MeshContours(mesh), extreme_points(mesh))
 
 
 def moved(T, angles, shift):
@@ -221,7 +228,7 @@ def test_log_ratio_has_the_sign_of_the_learned_colours():
     bins, uv = halves()
     model = RegionModel()
     zero = torch.zeros(8)
-    model.learn(bins, uv.flatten(0, 1), zero.repeat_interleave(16), (uv[..., 0] < 8).flatten())
+    model.learn(bins, uv, zero, uv[..., 0] < 8)
     ratio = model.log_ratio(bins, uv, zero)
     assert (ratio[:, :8] > 0.3).all()
     assert (ratio[:, 8:] < -0.3).all()
@@ -236,15 +243,43 @@ def test_log_ratio_has_the_sign_of_the_learned_colours():
 def test_histograms_move_by_the_rate_towards_new_colours():
     bins, uv = halves()
     model = RegionModel()
-    directions = torch.zeros(128)
+    directions = torch.zeros(8)
     red = bins[0, 0]
     green = bins[0, 15]
-    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] < 8).flatten())
+    model.learn(bins, uv, directions, uv[..., 0] < 8)
     assert float(model._histograms[0, 0, red]) == 1.0
-    model.learn(bins, uv.flatten(0, 1), directions, (uv[..., 0] >= 8).flatten())  # the colours swap
+    model.learn(bins, uv, directions, uv[..., 0] >= 8)  # the colours swap
     step = 0.2 * 64 / (64 + HALF_RATE_COUNT)
     assert float(model._histograms[0, 0, green]) == pytest.approx(step)
     assert float(model._histograms[0, 0, red]) == pytest.approx(1.0 - step)
+
+
+def test_log_ratio_changes_evenly_between_the_middles_of_two_sectors():
+    """Red and green are learned to the right, and swapped in the next sector."""
+    bins, uv = halves()
+    model = RegionModel()
+    right = torch.zeros(8)
+    sector = 2.0 * math.pi / SECTORS
+    model.learn(bins, uv, right, uv[..., 0] < 8)
+    model.learn(bins, uv, right + sector, uv[..., 0] >= 8)
+    first, between, second = (
+        float(model.log_ratio(bins, uv, right + part * sector)[0, 0]) for part in (0.0, 0.5, 1.0)
+    )
+    assert first > 0.3 > -0.3 > second
+    assert between == pytest.approx(0.5 * (first + second), abs=1e-6)
+    assert float(model.log_ratio(bins, uv, right - 2.0 * math.pi)[0, 0]) == first
+
+
+def test_histograms_are_smoothed_along_each_channel():
+    """What lies beyond the first and the last level counts as these."""
+    counts = torch.rand(2, 3, 8, 8, 8, generator=torch.Generator().manual_seed(0))
+    expected = counts
+    for axis in (2, 3, 4):
+        levels = expected.unbind(axis)
+        below = torch.stack([levels[0], *levels[:-1]], dim=axis)
+        above = torch.stack([*levels[1:], levels[-1]], dim=axis)
+        expected = 0.6 * expected + 0.2 * (below + above)
+    assert torch.allclose(regions._smooth(counts.flatten(2)), expected.flatten(2))
 
 
 def test_a_prediction_among_unusable_pixels_does_not_hide_another():

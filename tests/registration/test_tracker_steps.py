@@ -1,7 +1,7 @@
 """The tracker's steps in closed cases: predictions, keyframes, features, what is learned."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,12 +48,12 @@ def test_boxes_of_meshes_outside_the_image_mean_nothing():
 
 @dataclass
 class Flow:
-    """A flow measured in a crop with camera ``K``; how it was ``scaled``."""
+    """A flow measured in a crop with camera ``K``, and its weight."""
 
     K: Tensor
     start: str = ""
     ratio: float = 0.0
-    scale: list[float] = field(default_factory=list)
+    weight: float = 1.0
 
     def moved(self, before: Tensor, after: Tensor) -> "Flow":
         assert before.equal(self.K)
@@ -62,11 +62,8 @@ class Flow:
     def inlier_ratio(self, *_: Any) -> float:
         return self.ratio
 
-    def measurements(self, *_: Any) -> "Flow":
-        return self
-
-    def scaled(self, weight: float) -> tuple[str, float]:
-        return self.start, weight
+    def scaled(self, weight: float) -> "Flow":
+        return replace(self, weight=weight)
 
 
 @dataclass(frozen=True)
@@ -79,41 +76,43 @@ class Problem:
     def state(self, T: Tensor) -> State:
         return State(T)
 
-    def step(self, points: Any, T: Tensor, radius: float, others: Any) -> Tensor:
-        return T
-
     def with_current_contours(self, state: State) -> State:
         return state
 
 
-def fitted(monkeypatch: pytest.MonkeyPatch, keyframes: list[Any], last: Any) -> list[Any]:
-    """The weighted flows that a fit uses, of the keyframe that is nearest: the second."""
-    cameras = [torch.eye(3), 2.0 * torch.eye(3)]
+def fitted(
+    monkeypatch: pytest.MonkeyPatch, keyframes: list[Any], last: Any, shift: float = 100.0
+) -> list[Any]:
+    """The weighted flows that a fit uses, of the keyframe that is nearest: the second. In the first
+    crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px."""
+    cameras = [torch.tensor([zoom, zoom, 1.0]).double().diag()[None] for zoom in (1.0, 2.0)]
     frames = [SimpleNamespace(K=camera, problem=Problem()) for camera in cameras]
     used: list[Any] = []
 
     def track(keyframe: Any, frame: Any, *_: Any, levels: int) -> Flow:
         return Flow(frame.K, f"{keyframe.name} {levels}")
 
-    def measurements(_: Any, __: Any, flows: list[Any], ___: float) -> list[Any]:
-        used[:] = [(weight, flow.start, float(flow.K[0, 0])) for weight, flow in flows]
-        return []
+    def step(_: Any, state: State, corners: list[Flow], __: float) -> Tensor:
+        used[:] = [(flow.weight, flow.start, float(flow.K[0, 0, 0])) for flow in corners]
+        return state.T
 
     monkeypatch.setattr(tracker, "track_points", track)
-    monkeypatch.setattr(tracker, "fit_points", lambda _, T, *__: T)
+    monkeypatch.setattr(tracker, "fit_points", lambda *_: at(x=5.0 * shift))
+    monkeypatch.setattr(tracker, "PointMatches", SimpleNamespace(cat_within=list))
     angles = torch.tensor([9.0, 2.0, 5.0])
     follow: Any = SimpleNamespace(
         _last=last,
         _keyframes=keyframes,
         _frame=lambda *_: frames.pop(0),
         _angles=lambda _: angles[: len(keyframes)],
-        _measurements=measurements,
-        _tracked=lambda frame, _, flows: (float(frame.K[0, 0]), len(flows)),
-        centre=torch.zeros(3),
+        _step=step,
+        _tracked=lambda frame, _, flows: (float(frame.K[0, 0, 0]), len(flows)),
+        centre=torch.zeros(3).double(),
+        hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
     )
     image: Any = None
     camera, flows = Tracker._fit(follow, image, K, at())
-    assert camera == 2.0, "the second frame"
+    assert camera == used[0][2]
     assert flows == len(used)
     return used
 
@@ -132,9 +131,18 @@ def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(m
     assert fitted(monkeypatch, keyframes, keyframes[1]) == [alone]
 
 
+def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(monkeypatch):
+    limit = tracker.WINDOW_SHIFT
+    for shift, camera in ((0.99 * limit, 1.0), (-0.99 * limit, 1.0), (1.01 * limit, 2.0)):
+        used = fitted(monkeypatch, [named("a"), named("b")], named("last"), shift)
+        assert [flow[2] for flow in used] == [camera, camera], shift
+
+
 def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
     ends = torch.tensor(mean).double(), torch.tensor(variance).double()
-    follow: Any = SimpleNamespace(_ends=lambda *_: ends, centre=torch.zeros(3))
+    follow: Any = SimpleNamespace(
+        _ends=lambda *_: ends, _silhouette=lambda *_: None, centre=torch.zeros(3)
+    )
     problem = SimpleNamespace(edge_support=lambda _: torch.tensor(0.4))
     frame: Any = SimpleNamespace(problem=problem, K=K)
     state: Any = State(at())
@@ -177,10 +185,11 @@ def test_the_prediction_that_convinces_ends_the_search_else_the_best_counts(conf
 
 def test_starting_again_forgets_what_was_seen(monkeypatch):
     """Of three accepted poses the last two predict the next one."""
-    rendered = SimpleNamespace(render=lambda *_: torch.zeros(1))
-    contours: Any = SimpleNamespace(centre=torch.zeros(3).double(), radius=1.0)
-    renderer: Any = rendered
-    follow = Tracker(renderer, contours, HULL)
+    renderer = SimpleNamespace(render=lambda *_: torch.zeros(1))
+    contours: Any = SimpleNamespace(
+        centre=torch.zeros(3).double(), radius=1.0, renderer=lambda _: renderer
+    )
+    follow = Tracker(contours, HULL)
     monkeypatch.setattr(follow, "_learn", lambda *_: None)
     monkeypatch.setattr(follow, "_remember", lambda *_: follow._keyframes.append(None))
     poses = {x: SimpleNamespace(state=State(at(x)), frame=SimpleNamespace(K=K)) for x in (0, 1, 3)}
@@ -229,14 +238,18 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     depth[..., 128:] = 5.0
     learned: list[Tensor] = []
 
-    def lines(_: Any, __: Any, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        x = 128.0 - offsets.expand(3, -1)
-        return torch.stack([x, torch.full_like(x, 90.0)], dim=-1), torch.zeros(3)
+    outline = tracker._Silhouette(
+        torch.tensor([[128.0, 90.0]]).expand(3, 2),
+        torch.tensor([[-1.0, 0.0]]).expand(3, 2),
+        torch.zeros(3),
+    )
 
     def learn(_: Any, samples: Tensor, __: Tensor, inside: Tensor) -> None:
-        learned.extend([samples[:, 0], inside])
+        learned.extend([samples[..., 0].flatten(), inside.flatten()])
 
-    follow: Any = SimpleNamespace(_lines=lines, _regions=SimpleNamespace(learn=learn))
+    follow: Any = SimpleNamespace(
+        _silhouette=lambda *_: outline, _regions=SimpleNamespace(learn=learn)
+    )
     frame: Any = SimpleNamespace(bins=None)
     state: Any = None
     Tracker._learn(follow, frame, state, depth)
@@ -250,22 +263,18 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     assert float((x - 128.0).abs().max()) == last
 
 
-def test_lines_along_which_colours_say_nothing_do_not_count(monkeypatch):
+def test_lines_along_which_colours_say_nothing_do_not_count():
     """A variance as flat as a search of 4 px has: 16 / 3, of which half a px² is the tracker's."""
-    radius = 4.0
+    radius = 4
     flat = radius**2 / 3.0 - tracker.REGION_VARIANCE
     mean = torch.tensor([1.0, 2.0, -1.0]).double()
     variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
     J = torch.ones(1, 3, 6).double()
-    monkeypatch.setattr(tracker, "_silhouette", lambda _: (torch.zeros(3, 3), torch.zeros(3, 2)))
-    monkeypatch.setattr(tracker, "project", lambda *_: (None, J))
-    follow: Any = SimpleNamespace(_ends=lambda *_: (mean, variance), centre=torch.zeros(3))
-    frame: Any = SimpleNamespace(K=K)
-    state: Any = State(at())
-    flows: Any = [(0.3, Flow(K, "last")), (0.5, Flow(K, "keyframe"))]
-    colours, *points = Tracker._measurements(follow, frame, state, flows, radius)
+    follow: Any = SimpleNamespace(_ends=lambda *_: (mean, variance))
+    nothing: Any = None
+    colours = Tracker._colours(follow, nothing, nothing, J, radius)
     information = 1.0 / tracker.REGION_VARIANCE - 3.0 / radius**2
     expected = [tracker.REGION_WEIGHT * information, 0.0, 0.0]
     assert colours.weight.flatten().tolist() == pytest.approx(expected)
     assert colours.distance.flatten().tolist() == mean.tolist()
-    assert points == [("last", 0.3), ("keyframe", 0.5)]
+    assert colours.J is J

@@ -9,6 +9,7 @@ import trimesh
 from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
+from curvireg_torch.rendering import render_depth
 from curvireg_torch.rendering.contours import MAX_OCCLUDING, ContourPoints, MeshContours
 
 K = torch.tensor([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]], dtype=torch.float64)
@@ -90,3 +91,19 @@ def test_normals_of_outlines_point_away_from_the_object(inside_out):
     cosine = (points.normals[points.outline] * radial).sum(dim=1)
     assert len(model) > 100
     assert float(cosine.min()) > np.cos(np.radians(2.0)), "of the sphere, not of its facets"
+
+
+def test_the_simplified_mesh_is_drawn_where_the_mesh_is():
+    """A dented ball, which is not simplified for nothing, away from the origin."""
+    mesh = trimesh.creation.icosphere(subdivisions=5)
+    mesh.vertices *= 1.0 + 0.1 * np.sin(4.0 * mesh.vertices).mean(axis=1, keepdims=True)
+    mesh.apply_translation((3.0, -2.0, 1.0))
+    T = poses().clone()
+    T[:, :3, 3] -= T[:, :3, :3] @ torch.tensor(mesh.bounding_box.centroid)
+    renderer = MeshContours(mesh).renderer(128)
+    assert len(renderer._faces) <= 2500 < len(mesh.faces)
+    simple = renderer.render(T, K[None], (128, 128))
+    exact = render_depth(mesh, T, K, (128, 128))
+    assert float(((simple > 0) != (exact > 0)).sum()) < 0.01 * float((exact > 0).sum())
+    both = (simple > 0) & (exact > 0)
+    assert float((simple - exact)[both].abs().quantile(0.95)) < 0.01

@@ -179,17 +179,36 @@ def test_whitening_refuses_covariances_that_cannot_be_inverted():
         terms.Whitening(torch.zeros(3), torch.eye(2))
 
 
-def test_jittered_boxes_are_shifted_and_scaled():
-    box = torch.tensor([[10.0, 20, 110, 70]])
-    jittered = terms.jittered_boxes(box, 0.2)
-    assert jittered[0, 0].equal(box[0])
-    centres = 0.5 * (jittered[0, :, :2] + jittered[0, :, 2:]) - torch.tensor([60.0, 45])
-    expected = torch.tensor([[0.0, 0], [-15, 0], [15, 0], [0, -15], [0, 15], [0, 0], [0, 0]])
-    torch.testing.assert_close(centres, expected)
-    width = jittered[0, :, 2] - jittered[0, :, 0]
-    assert width.tolist() == pytest.approx([100] * 5 + [100 / 1.2, 120], rel=1e-5)
-    assert terms.jittered_boxes(box, 0.0).equal(box[None])
-    assert terms.jittered_boxes(box, 0.45).shape == (1, 7, 4)
+def test_jittered_fields_are_those_of_shifted_and_scaled_boxes():
+    x, y = torch.meshgrid(torch.arange(160.0), torch.arange(120.0), indexing="xy")
+    picture = 0.5 + 0.2 * torch.stack([(0.06 * x).sin() + (0.05 * y).cos(), (0.04 * (x + y)).sin()])
+    picture = torch.cat([picture, picture[:1]])
+    x0, y0, x1, y1 = box = (40.0, 30, 100, 70)
+    half = 0.5 * torch.tensor([x1 - x0, y1 - y0])
+    middle = torch.tensor([x0, y0]) + half
+    # 3/4 of 0.2 of the longer side, 60 px, is 9 px
+    copies = [((0, 0), 1.0), ((-9, 0), 1.0), ((9, 0), 1.0), ((0, -9), 1.0), ((0, 9), 1.0)]
+    copies += [((0, 0), 1 / 1.2), ((0, 0), 1.2)]
+    boxes = torch.stack(
+        [
+            torch.cat([middle + torch.tensor(shift) + sign * scale * half for sign in (-1, 1)])
+            for shift, scale in copies
+        ]
+    )
+    size = {"size": 64, "margin": 0.1}
+    direct = terms.crop_photographs([picture] * 7, boxes, **size)[:, :2]
+    field = terms.crop_photographs([picture], torch.tensor([box]), **size)[:, :2]
+    jittered = terms.jittered_fields(field, 0.2, 0.1)
+    assert jittered.shape == (1, 7, 2, 64, 64)
+    assert jittered[:, 0].equal(field)
+    inner = (..., slice(12, 52), slice(12, 52))
+    torch.testing.assert_close(jittered[0][inner], direct[inner], atol=0.01, rtol=0)
+    assert jittered[0, 2, :, :, -1].eq(0).all()  # beyond the crop
+    both = terms.jittered_fields(torch.cat([field, 2 * field]), 0.2, 0.1)
+    torch.testing.assert_close(both[1], 2 * both[0])
+    assert terms.jittered_fields(field, 0.0, 0.1).equal(field[:, None])
+    with pytest.raises(InvalidInputError, match="box_jitter"):
+        terms.jittered_fields(field, 0.5, 0.1)
 
 
 def test_box_jitter_recovers_a_shifted_view(bank):
