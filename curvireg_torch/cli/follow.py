@@ -18,6 +18,7 @@ from ..errors import CurviregError, ImageError, InvalidInputError, MissingFileEr
 from ..jobs.options import CAMERA_OPTIONS
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
+from .libraries import load_libraries
 from .options import (
     BOXES,
     PHOTOGRAPH,
@@ -101,6 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingFileError(
             "no such folder or video; or give the number of a camera, or rtsp://...", subject=source
         )
+    load_libraries()
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])

@@ -16,6 +16,7 @@ from ..errors import InvalidInputError, LostObjectError
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
+from .libraries import load_libraries
 from .options import (
     BOXES,
     PHOTOGRAPH,
@@ -223,6 +224,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
+    load_libraries()
     from ..jobs.store import STARTED, run_processes
     from ..utils.threads import one_torch_thread
 
