@@ -16,15 +16,11 @@ from typing import Any
 from ..errors import CurviregError, CurviregWarning
 from ..jobs.options import with_advice
 from ..utils.files import terminable
-from ..utils.modules import postpone_imports
 from ..version import __version__
 from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
-
-# what trimesh imports and no command uses: 0.15 s
-UNUSED = ("scipy.ndimage", "cascadio")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -87,7 +83,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    postpone_imports(*UNUSED)
     with warnings.catch_warnings(), terminable():
         if not arguments.debug:
             warnings.showwarning = _show_warning

@@ -13,6 +13,7 @@ from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import check_writable, write_file
 from ..version import __version__
+from .libraries import load_libraries
 from .options import (
     BOXES,
     MESH,
@@ -69,6 +70,7 @@ def build_bank(arguments: argparse.Namespace) -> None:
         )
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    load_libraries()
     from ..jobs.outputs import check_output_file
 
     check_output_file(arguments.out, input_files(arguments, arguments.mesh), mark=b"curvireg")
@@ -253,6 +255,7 @@ def view(arguments: argparse.Namespace) -> None:
         message = "a table where a photograph is expected; drop a rig file on the page"
         raise InvalidInputError(message, subject=photos[0])
     check_given(photos, meshes, packages=["nicegui"])
+    load_libraries()
     from ..utils.threads import one_torch_thread
     from ..viewer.server import serve
 
@@ -287,6 +290,7 @@ def draw(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(
             f"--out {arguments.out}: expected a name that ends in {', '.join(FORMATS)}"
         )
+    load_libraries()
     from ..jobs.outputs import check_output_file
 
     check_output_file(
@@ -337,6 +341,7 @@ def add_demo(commands: Any) -> None:
 def demo(arguments: argparse.Namespace) -> None:
     """Generate a photograph of the example mesh, register it and print the error."""
     out = arguments.out
+    load_libraries()
     from ..data import read_photo
     from ..geometry import Camera, rotation_error
     from ..jobs.entry import entry_of, observe

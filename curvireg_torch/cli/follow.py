@@ -18,6 +18,7 @@ from ..errors import CurviregError, ImageError, InvalidInputError, MissingFileEr
 from ..jobs.options import CAMERA_OPTIONS
 from ..utils.choices import check_given
 from ..utils.files import CsvFile
+from .libraries import load_libraries
 from .options import (
     BOXES,
     PHOTOGRAPH,
@@ -101,6 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingFileError(
             "no such folder or video; or give the number of a camera, or rtsp://...", subject=source
         )
+    load_libraries()
     from ..utils.threads import one_torch_thread
 
     options = register_options(arguments, [Path(source)], [arguments.mesh])
@@ -172,7 +174,7 @@ class Tally:
         return self.frames - self.counts["lost"] - self.counts["failed"]
 
     def __str__(self) -> str:
-        from ..registration.result import verdict_counts
+        from ..registration.words import verdict_counts
 
         rate = ""
         if self.frames > 1:
@@ -401,7 +403,7 @@ def _live(source: str) -> tuple[Iterator["Frame"], None, float]:
 def _camera_in_words(result: "Registration | FailedRegistration") -> str:
     """A camera that is not known exactly; "" of one that is, and of a frame without a pose."""
     from ..registration import FailedRegistration
-    from ..registration.result import focal_length_in_words
+    from ..registration.words import focal_length_in_words
 
     if isinstance(result, FailedRegistration) or result.camera is None:
         return ""

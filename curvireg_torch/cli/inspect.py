@@ -9,6 +9,7 @@ from ..errors import InvalidInputError
 from ..jobs.options import whole_number
 from ..utils.choices import check_given
 from ..utils.files import write_file
+from .libraries import load_libraries
 from .options import MESH, METHOD, add_command, add_options, input_files, register_options
 
 STAGES = {
@@ -99,6 +100,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     check_given([], [arguments.mesh])
     if arguments.mesh.suffix == ".safetensors":
         raise InvalidInputError("a bank where a mesh is expected", subject=arguments.mesh)
+    load_libraries()
     from ..inspection import inspect
     from ..inspection.page import report_lines, report_page
     from ..jobs.lists import find_photographs

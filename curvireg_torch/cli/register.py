@@ -16,6 +16,7 @@ from ..errors import InvalidInputError, LostObjectError
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
+from .libraries import load_libraries
 from .options import (
     BOXES,
     PHOTOGRAPH,
@@ -223,6 +224,7 @@ def complete(arguments: argparse.Namespace) -> str | None:
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
+    load_libraries()
     from ..jobs.store import STARTED, run_processes
     from ..utils.threads import one_torch_thread
 
@@ -306,7 +308,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     from ..jobs.photograph import register_observation
     from ..jobs.result_files import write_lost
     from ..mesh import mesh_up
-    from ..registration.result import camera_in_words
+    from ..registration.words import camera_in_words
 
     out = arguments.out
     path = options.photos[0]
@@ -351,7 +353,7 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     reliable."""
     from ..jobs.result_files import write_views
     from ..jobs.rigs import read_rig, register_rig
-    from ..registration.result import view_in_words
+    from ..registration.words import view_in_words
 
     out = arguments.out
     rig = read_rig(arguments.views, options.meshes[0])
@@ -443,9 +445,9 @@ def _register_several(
 
 
 def print_result(document: Mapping[str, Any], out: Path) -> None:
-    """Print a :func:`~curvireg_torch.registration.result.result_document`; ``out`` is the folder of
-    its files."""
-    from ..registration.result import remarks, two_decimals
+    """Print a :func:`~curvireg_torch.registration.documents.result_document`; ``out`` is the folder
+    of its files."""
+    from ..registration.words import remarks, two_decimals
 
     confidence = NOT_CALIBRATED
     if document["confidence"] is not None:
@@ -485,7 +487,7 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
 
 def _print_objects(document: Mapping[str, Any]) -> None:
     """Print where objects were detected, and the confidence of each if there are several."""
-    from ..registration.result import corners, two_decimals
+    from ..registration.words import corners, two_decimals
 
     instances = document.get("detection", {}).get("instances", [])
     several = len(instances) > 1
@@ -517,7 +519,8 @@ def _angles(pose: Mapping[str, Any]) -> str:
 
 def _print_rivals(document: Mapping[str, Any]) -> None:
     """Print rivals that are nearly as probable as the best pose, if there are any."""
-    from ..registration.result import RIVAL_FRACTION, two_decimals
+    from ..registration.result import RIVAL_FRACTION
+    from ..registration.words import two_decimals
 
     if document["ambiguous"] is None:
         return

@@ -18,7 +18,7 @@ from ..matching import cached_bank
 from ..mesh import load_mesh
 from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
-from ..registration.result import two_decimals
+from ..registration.words import two_decimals
 from ..utils.checks import check_positive
 from ..utils.files import write_file
 from ..version import __version__

@@ -15,7 +15,7 @@ from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
-from ..registration.result import two_decimals, verdict_counts
+from ..registration.words import two_decimals, verdict_counts
 from ..utils.choices import IMAGES, VIDEOS, is_pattern
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet

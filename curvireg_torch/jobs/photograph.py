@@ -24,11 +24,11 @@ from ..mesh.mesh import mesh_unit
 from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_items
+from ..registration.documents import detection_document, result_document
 from ..registration.inputs import image_item
 from ..registration.poses import projected_box
 from ..registration.refinement import refine_items
 from ..registration.registrar import ObjectLike
-from ..registration.result import detection_document, result_document
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink

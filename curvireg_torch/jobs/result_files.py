@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from ..registration import Registrar, Registration
-from ..registration.result import SCHEMA
+from ..registration.documents import SCHEMA
 from ..utils.files import write_file
 from ..utils.threads import map_on_threads
 from ..visualization import pose_glb, registration_sheet

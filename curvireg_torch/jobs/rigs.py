@@ -19,7 +19,7 @@ from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFil
 from ..geometry import Camera
 from ..geometry.cameras import transform
 from ..registration import Registrar, Registration
-from ..registration.result import result_document
+from ..registration.documents import result_document
 from ..utils.checks import check_pose
 from ..utils.files import FindFile, check_table_size, finite_numbers, found_in, read_csv, read_json
 from .lists import BOX, CAMERA, POSE_COLUMNS, camera_of, numbers_of

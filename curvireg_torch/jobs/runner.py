@@ -23,7 +23,8 @@ from ..errors import (
 )
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
-from ..registration.result import SCHEMA, line_document, places_document, verdict_of_error
+from ..registration.documents import SCHEMA, line_document, places_document
+from ..registration.result import verdict_of_error
 from ..utils.company import map_in_company
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest

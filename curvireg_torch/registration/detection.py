@@ -23,10 +23,11 @@ from .focal import usual_camera
 from .inputs import ImageItem, check_crop, image_items
 from .photograph import register
 from .poses import projected_box
-from .result import Detection, FailedRegistration, Registration, corners, two_decimals
+from .result import Detection, FailedRegistration, Registration
 from .target import Target
 from .tracker import boxes_at
 from .unknown_camera import limits_of
+from .words import corners, two_decimals
 from .work import keypoint_poses, map_items
 
 TEMPLATE_SIDE = 96  # Side of the template views in px

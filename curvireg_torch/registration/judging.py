@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..evidence import Evidence
+from .candidates import Candidates
 from .confidence import (
     are_near,
     concentration,
@@ -30,10 +31,7 @@ of the evidence of contours."""
 def judged(
     target: Target,
     work: Work,
-    poses: Poses,
-    evidence: Evidence,
-    distinct: Tensor,
-    outside: Tensor,
+    found: Candidates,
     *,
     siblings: int = 0,
 ) -> Registration:
@@ -43,15 +41,15 @@ def judged(
     Args:
         target: the object.
         work: the photograph.
-        poses: H of them.
-        evidence: of them.
-        distinct: (H,) bool, False of poses that merged with a better one and returned to their
-            views.
-        outside: (H,) bool, those that lie outside the limits and are not reported.
+        found: the poses; those that merged with a better one have returned to their views.
         siblings: how many of the last poses a symmetry of the shape makes of the best one, which a
             feature of the mesh tells apart.
     """
     weights = target.score_weights(exact=work.exact)
+    poses = found.poses
+    evidence = found.evidence
+    outside = found.outside
+    distinct = found.distinct
     scores = evidence.scores(weights)
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]

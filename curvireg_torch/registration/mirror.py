@@ -16,11 +16,12 @@ import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..evidence import Evidence, EvidenceWeights
+from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
 from ..matching import Ranking
 from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius, principal_rotation
+from .candidates import Candidates
 from .confidence import resolution
 from .described import DescribedPhotograph, evidence_of
 from .poses import Poses, placed, with_quick_fit
@@ -44,34 +45,32 @@ def compared_with_mirror_image(
     target: Target,
     work: Work,
     crops: EdgeCrops,
-    pose: Poses,
-    evidence: Evidence,
+    best: Candidates,
     result: Registration,
 ) -> Registration:
-    """A result with its best ``pose`` and the evidence of it. If it is probably right and the
-    mirror image of the mesh fits better, it gets a warning, and ``DOUBT`` of its confidence."""
-    is_printed = float(evidence.landmarks) >= DETERMINING_KEYPOINTS
+    """A result whose ``best`` pose is one. If it is probably right and the mirror image of the mesh
+    fits better, it gets a warning, and ``DOUBT`` of its confidence."""
+    is_printed = float(best.evidence.landmarks) >= DETERMINING_KEYPOINTS
     # a print that is found is not mirrored
     if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:
         return result
-    gain = mirror_gain(target, work, crops, pose, evidence)
+    gain = mirror_gain(target, work, crops, best)
     if gain <= resolution(exact=True):
         return result
     probabilities = tuple(DOUBT * probability for probability in result.probabilities)
     return replace(result, probabilities=probabilities, warnings=(*result.warnings, WARNING))
 
 
-def mirror_gain(
-    target: Target, work: Work, crops: EdgeCrops, pose: Poses, evidence: Evidence
-) -> float:
-    """By how much the mirror image of the mesh scores more in a photograph than the mesh at one
-    ``pose``, by shape alone and after a short fit; 0 for a mesh that is its own mirror image."""
+def mirror_gain(target: Target, work: Work, crops: EdgeCrops, best: Candidates) -> float:
+    """By how much the mirror image of the mesh scores more in a photograph than the mesh at its
+    ``best`` pose, by shape alone and after a short fit; 0 for a mesh that is its own mirror
+    image."""
     plane = reflection_plane(target.bank.mesh)
     if plane is None:
         return 0.0
     image = target.mirror_image
     centre = image.describer.centre
-    starts = reflected_poses(pose, plane, target.describer.centre, centre)
+    starts = reflected_poses(best.poses, plane, target.describer.centre, centre)
     fitted, _ = with_quick_fit(image.describer, crops, starts)
     photograph = DescribedPhotograph(
         work.query, Ranking.none(), work.descriptor, crops, keypoints=None, frame=work.frame
@@ -79,7 +78,7 @@ def mirror_gain(
     seen = evidence_of(image, photograph, placed(fitted, fitted.quick, centre))
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    return float(seen.scores(of_shape).max() - evidence.scores(of_shape))
+    return float(seen.scores(of_shape).max() - best.evidence.scores(of_shape))
 
 
 def reflected_poses(pose: Poses, plane: Tensor, centre: Tensor, image_centre: Tensor) -> Poses:

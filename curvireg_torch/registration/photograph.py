@@ -1,17 +1,18 @@
 """One photograph with a box: rank views, fit the contours of the most promising, judge, report."""
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ..errors import CurviregError
-from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..terms import QueryFeatures
+from ..utils.rows import Rows
+from .candidates import Candidates
 from .confidence import are_near
 from .described import evidence_of
 from .focal import FINISHED
@@ -30,7 +31,7 @@ from .poses import (
     with_quick_fit,
 )
 from .priors import Limits
-from .refits import best_inside, fitted_again
+from .refits import fitted_again
 from .result import Registration
 from .search import search
 from .siblings import Rival, with_siblings
@@ -48,7 +49,6 @@ from .work import (
     least_starts,
     poses_in_box,
     poses_of_views,
-    with_replaced,
 )
 
 
@@ -89,65 +89,75 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
         work = with_possible_cameras(target, work)
     if target.pipeline.search:
         return _searched(target, work)
-    starts, outside, repeated = _starts(target, work)
-    poses = starts
+    starts = _starts(target, work)
+    poses = starts.poses
     if work.crops is not None:
         target.report_progress("contours")
-        unknown = poses.quick[:, 0, 0].isnan().nonzero()[:, 0]
-        if len(unknown):
-            poses = poses.replaced(
-                unknown, with_quick_fit(target.describer, work.crops, poses[unknown])[0]
-            )
-        finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
-        if work.frame is not None:  # at the border as many poses of larger boxes compete
-            finish *= 2
-        poses = fitted_poses(target, work, work.crops, poses, quick=poses.quick, finish=finish)
-    evidence = evidence_of(target, work, poses)
-    sibling = Rival.none(poses, evidence)
+        poses = _fitted(target, work, work.crops, poses)
+    found = Candidates.of(poses, evidence_of(target, work, poses), starts.outside)
+    rival = Rival(found[:0])
     if work.crops is not None and work.exact:
-        if work.item.focal_deviation:
-            poses, evidence = with_fitted_focal_lengths(
-                target, work, work.crops, poses, evidence, outside
-            )
-        poses, evidence = fitted_again(target, work, work.crops, poses, evidence, outside)
-        poses, evidence, sibling = with_siblings(target, work, work.crops, poses, evidence, outside)
-        poses, evidence = _with_texture(target, work, work.crops, poses, evidence, outside)
-    inside = (~outside).nonzero()[:, 0]
-    scores = evidence[inside].scores(target.score_weights(exact=work.exact))
-    angle = target.pipeline.fit.same_pose_angle
-    found = distinct_poses(poses[inside], scores, work.symmetries, angle=angle)
-    distinct = outside.index_copy(0, inside, found)
+        found, rival = _improved(target, work, work.crops, found)
+    found = _merged(target, work, found)
     # Unlike another view, these started near the pose that they merged with: they are no
     # rivals.
-    other = (distinct | ~repeated).nonzero()[:, 0]
-    starts = starts[other]
-    poses = poses[other]
-    evidence = evidence[other]
-    distinct = distinct[other]
-    outside = outside[other]
-    keep = _kept(target, work, poses, distinct, outside)
-    if not bool(keep.all()):
-        # Poses that merged, or whose fit is not trusted, go back to the views that they started
-        # from.
-        back = (~keep).nonzero()[:, 0]
-        restored = starts[back]
-        if work.crops is not None:
-            restored = with_edge_support(target.describer, work.crops, restored)
-        poses = poses.replaced(back, restored)
-        evidence = evidence.replaced(back, evidence_of(target, work, restored))
+    other = (found.distinct | ~starts.repeated).nonzero()[:, 0]
+    found = _with_views_again(target, work, found[other], starts.poses[other])
     if work.crops is not None and work.item.focal_deviation:
-        work, poses = with_focal_deviation(target, work, work.crops, poses, evidence, outside)
-    poses = Poses.cat([poses, sibling.poses])
-    evidence = Evidence.cat([evidence, sibling.evidence])
-    distinct = F.pad(distinct, (0, len(sibling.poses)), value=True)
-    outside = F.pad(outside, (0, len(sibling.poses)))
-    siblings = len(sibling.poses)
-    result = judged(target, work, poses, evidence, distinct, outside, siblings=siblings)
-    result = replace(result, feature_is_hidden=sibling.feature_is_hidden)
+        work, found = with_focal_deviation(target, work, work.crops, found)
+    found = Candidates.cat([found, rival.found])
+    result = judged(target, work, found, siblings=len(rival.found))
+    result = replace(result, feature_is_hidden=rival.feature_is_hidden)
     if work.crops is None or not work.exact:
         return result
-    best = best_inside(target, evidence, outside | ~distinct)
-    return compared_with_mirror_image(target, work, work.crops, poses[best], evidence[best], result)
+    best = found.best(target.score_weights(exact=True))
+    return compared_with_mirror_image(target, work, work.crops, found[best], result)
+
+
+def _fitted(target: Target, work: Work, crops: EdgeCrops, starts: Poses) -> Poses:
+    """Fit the contours of the starts, those without a short fit after one."""
+    unknown = starts.quick[:, 0, 0].isnan().nonzero()[:, 0]
+    if len(unknown):
+        quick, _ = with_quick_fit(target.describer, crops, starts[unknown])
+        starts = starts.replaced(unknown, quick)
+    finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
+    if work.frame is not None:  # at the border as many poses of larger boxes compete
+        finish *= 2
+    return fitted_poses(target, work, crops, starts, quick=starts.quick, finish=finish)
+
+
+def _improved(
+    target: Target, work: Work, crops: EdgeCrops, found: Candidates
+) -> tuple[Candidates, Rival]:
+    """Fit the best poses further, with all that is known of the exact mesh; and the rival of the
+    best one among its siblings."""
+    if work.item.focal_deviation:
+        found = with_fitted_focal_lengths(target, work, crops, found)
+    found = fitted_again(target, work, crops, found)
+    found, rival = with_siblings(target, work, crops, found)
+    return _with_texture(target, work, crops, found), rival
+
+
+def _merged(target: Target, work: Work, found: Candidates) -> Candidates:
+    """Poses that end where a better one does are not distinct."""
+    inside = (~found.outside).nonzero()[:, 0]
+    some = found[inside]
+    scores = some.evidence.scores(target.score_weights(exact=work.exact))
+    angle = target.pipeline.fit.same_pose_angle
+    distinct = distinct_poses(some.poses, scores, work.symmetries, angle=angle)
+    return replace(found, distinct=found.distinct.index_copy(0, inside, distinct))
+
+
+def _with_views_again(target: Target, work: Work, found: Candidates, starts: Poses) -> Candidates:
+    """Put poses that merged, or whose fit is not trusted, back to the views that they started
+    from."""
+    back = (~_kept(target, work, found)).nonzero()[:, 0]
+    if not len(back):
+        return found
+    restored = starts[back]
+    if work.crops is not None:
+        restored = with_edge_support(target.describer, work.crops, restored)
+    return found.with_fitted(back, restored, evidence_of(target, work, restored))
 
 
 def _rank(target: Target, item: ImageItem, query: QueryFeatures) -> Work:
@@ -180,14 +190,24 @@ def _ranking(target: Target, query: QueryFeatures, limits: Limits | None) -> Ran
     return target.matcher.rank_together(query, allowed)
 
 
-def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
-    """Poses of the most promising distinct views, and (H,) bool: which lies outside the limits,
-    the last one at most, and which repeats another one: the same view with another camera, or a
-    pose that keypoints agree on, in place of the views near it.
+@dataclass(frozen=True)
+class Starts(Rows):
+    """Poses of the most promising distinct views.
 
-    That outside is the best view there; it is never reported, and tells whether the limits are
-    wrong.
+    Attributes:
+        poses: H of them.
+        outside: (H,) bool, which lies outside the limits, the last one at most: the best view
+            there. It is never reported, and tells whether the limits are wrong.
+        repeated: (H,) bool, which repeats another one: the same view with another camera, or a pose
+            that keypoints agree on, in place of the views near it.
     """
+
+    poses: Poses
+    outside: Tensor
+    repeated: Tensor
+
+
+def _starts(target: Target, work: Work) -> Starts:
     poses = _promising(target, work) if work.starts is None else work.starts
     repeated = _are_repeated(poses.view)
     if work.crops is not None and work.exact:
@@ -197,19 +217,15 @@ def _starts(target: Target, work: Work) -> tuple[Poses, Tensor, Tensor]:
             far = ~are_near(poses.rotation, found.rotation[0], work.symmetries)
             poses = Poses.cat([poses[far], found[torch.tensor([0])]])
             repeated = F.pad(repeated[far], (0, 1), value=True)
-    outside = torch.zeros_like(repeated)
+    starts = Starts(poses, torch.zeros_like(repeated), repeated)
     if work.limits is None:
-        return poses, outside, repeated
+        return starts
     assert work.ranking.outside is not None
     view = work.ranking.outside.cpu()
     if int(view) < 0:
-        return poses, outside, repeated
+        return starts
     other = poses_of_views(target, work, view, torch.zeros(1, dtype=torch.float64))
-    return (
-        Poses.cat([poses, other]),
-        F.pad(outside, (0, 1), value=True),
-        F.pad(repeated, (0, 1)),
-    )
+    return Starts.cat([starts, Starts(other, torch.tensor([True]), torch.tensor([False]))])
 
 
 def _promising(target: Target, work: Work) -> Poses:
@@ -264,29 +280,26 @@ def _searched(target: Target, work: Work) -> Registration:
     poses = poses_of_views(target, work, view, rank).replaced(torch.tensor([0]), found)
     if work.limits is not None:
         poses = work.limits.moved_inside(poses)
-    distinct = torch.ones(len(poses), dtype=torch.bool)
     by_rank = replace(work, exact=False)
-    return judged(target, by_rank, poses, evidence_of(target, work, poses), distinct, ~distinct)
+    return judged(target, by_rank, Candidates.of(poses, evidence_of(target, work, poses)))
 
 
-def _with_texture(
-    target: Target, work: Work, crops: EdgeCrops, poses: Poses, evidence: Evidence, outside: Tensor
-) -> tuple[Poses, Evidence]:
+def _with_texture(target: Target, work: Work, crops: EdgeCrops, found: Candidates) -> Candidates:
     """Fit the best pose to the mesh's colours as well."""
-    best = best_inside(target, evidence, outside)
-    fitted = fit_texture_of(target.describer, crops, poses, int(best))
+    best = found.best(target.score_weights(exact=True))
+    fitted = fit_texture_of(target.describer, crops, found.poses, int(best))
     if fitted is None:
-        return poses, evidence
-    return with_replaced(work, poses, evidence, best, fitted, evidence_of(target, work, fitted))
+        return found
+    return found.with_fitted(best, fitted, evidence_of(target, work, fitted), work.limits)
 
 
-def _kept(target: Target, work: Work, poses: Poses, distinct: Tensor, outside: Tensor) -> Tensor:
+def _kept(target: Target, work: Work, found: Candidates) -> Tensor:
     """(H,) bool: poses that do not return to their views."""
-    kept = distinct
+    kept = found.distinct
     if target.pipeline.contours and not work.exact:
         # Where the contours of a similar object do not fit, the view has the smaller error.
-        kept = kept & poses.fit.trustworthy
-    return kept if work.limits is None else kept & (work.limits.keeps(poses) | outside)
+        kept = kept & found.poses.fit.trustworthy
+    return kept if work.limits is None else kept & (work.limits.keeps(found.poses) | found.outside)
 
 
 def _are_repeated(views: Tensor) -> Tensor:

@@ -1,12 +1,9 @@
-"""The results of a registration: poses with their probabilities, as values, as JSON documents, and
-in words."""
+"""The results of a registration: poses with their probabilities."""
 
 import html
 import math
-import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from typing import Any, Generic, Self, TypeVar, overload
 
 import torch
@@ -16,15 +13,12 @@ from torch import Tensor
 from ..errors import CurviregError, LostObjectError
 from ..geometry.calibration import Camera
 from ..geometry.cameras import transform
-from ..geometry.pose_prior import PosePrior, object_frame
+from ..geometry.pose_prior import PosePrior
 from ..geometry.viewpoint import rotation_error, viewpoint_from_rotation
 from ..matching import Ranking
-from ..mesh.mesh import mesh_unit
 from ..pipeline import FitSettings
-from ..utils.choices import SIDE_NAMES
-from ..version import __version__
 from .confidence import RELIABLE
-from .target import Target
+from .words import two_decimals
 
 Value = TypeVar("Value")
 
@@ -38,30 +32,6 @@ RIVAL_FRACTION = 0.5
 HALF_TURN = 150.0  # Degrees from which the rotation between two poses counts as a half turn
 # Degrees within which two directions of view count as mirror images of each other
 MIRROR_ANGLE = 30.0
-STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
-# Deviation of an estimated focal length, as a fraction, from which it is hardly measured
-WEAK_PERSPECTIVE = 0.15
-# Version of the keys of result.json; raised when a key is removed or changes its meaning
-SCHEMA = 4
-# How sure an answer is, surest first; the last two have no pose
-VERDICTS = ("reliable", "unsure", "no match", "lost", "failed")
-# Keys of result.json that have another name in the lines of results.jsonl
-LINE_KEYS = {"hypotheses": "top", "no_match_probability": "none"}
-CONVENTIONS = {  # docs/results.md describes all keys
-    "rotation": "x_cam = R x_model + t, OpenCV camera: x right, y down, z forward; model frame of "
-    "the mesh file",
-    "translation": "in the mesh file's unit; null with a similar mesh and no camera",
-    "viewpoint": "PASCAL3D+ azimuth, elevation, theta in degrees",
-    "pixels": "(0, 0) is the centre of the top-left pixel of the picture as viewers show it (EXIF "
-    "orientation applied)",
-    "boxes": "x0, y0, x1, y1 in those pixels",
-    "confidence": "estimated probability that the rotation is within 30 degrees of the truth",
-    "reliable": "confidence of at least pipeline.fit.reliable, and nothing questionable; false = "
-    "the pose is a guess",
-    "covariance": "of rotation (rad) about the camera's x, y, z, then translation along them: "
-    "R_true = exp([w]x) R, "
-    "t_true = t + e; of the camera's errors, that of an estimated focal length is in it",
-}
 
 
 @dataclass(frozen=True)
@@ -494,163 +464,6 @@ def ambiguity(rotations: Tensor) -> str | None:
     return "mirror" if float(angles.min()) <= MIRROR_ANGLE else "several"
 
 
-def result_document(
-    result: Registration, target: Target, seconds: Mapping[str, float]
-) -> dict[str, Any]:
-    """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank``
-    and ``register``."""
-    target = target.of_model(result.model)
-    bank = target.bank
-    symmetries = target.symmetries_of(exact=target.is_exact)
-    return {
-        "schema": SCHEMA,
-        "unit": mesh_unit(bank.mesh),
-        "bank_views": len(bank),
-        **result.to_dict(),
-        "symmetries": 1 if symmetries is None else len(symmetries),
-        "pipeline": target.pipeline.describe(),
-        "seconds": dict(seconds),
-        "versions": {
-            "curvireg_torch": __version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "kornia": version("kornia"),
-            "trimesh": version("trimesh"),
-        },
-        "conventions": CONVENTIONS,
-    }
-
-
-def detection_document(results: Sequence[Registration]) -> dict[str, Any]:
-    """The key ``detection``: the objects that :func:`.detect` found in one photograph."""
-    found = [(result, result.detection) for result in results if result.detection is not None]
-    instances = [
-        {
-            "box": at.box.tolist(),
-            "score": at.score,
-            "verdict": result.verdict,
-            "confidence": result.confidence,
-            "reliable": result.reliable,
-            "warnings": [*result.warnings, *result.notes],
-            **result.hypotheses[0].pose_dict(),
-        }
-        for result, at in found
-    ]
-    return {**places_document(found[0][1]), "instances": instances}
-
-
-def places_document(detection: Detection) -> dict[str, Any]:
-    """Where the object may be: the first place's score, and all proposals."""
-    pairs = zip(detection.boxes, detection.responses, strict=True)
-    return {
-        "score": detection.score,
-        "proposals": [{"box": b.tolist(), "response": float(r)} for b, r in pairs],
-    }
-
-
-def two_decimals(probability: float) -> str:
-    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
-
-    Example:
-        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
-        ('0.89', '0.29', '1.00')
-    """
-    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"
-
-
-def corners(box: Sequence[float]) -> str:
-    """A box in whole px, as ``--box`` takes it."""
-    return " ".join(f"{v:.0f}" for v in box)
-
-
-def remarks(document: Mapping[str, Any]) -> list[str]:
-    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a
-    symmetric mesh."""
-    box = document["corrected_box"]
-    contradiction = document.get("prior", {}).get("contradiction")
-    lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
-    if contradiction == "better outside":
-        lines.append("the photograph fits much better outside the pose prior; check it")
-    elif contradiction is not None:
-        lines.append("the pose lies at one of its limits; widen it to see whether it stays")
-    if (count := document.get("symmetries", 1)) > 1:
-        lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
-    return lines
-
-
-def camera_in_words(document: Mapping[str, Any]) -> list[str]:
-    """A line about a camera that was not given exactly: where it is from, and how well its focal
-    length is known."""
-    camera = document["camera"]
-    line = "" if camera is None else focal_length_in_words(camera, document["inputs"]["picture"])
-    return [line] if line else []
-
-
-def focal_length_in_words(
-    camera: Mapping[str, Any], picture: Mapping[str, Any] | None = None
-) -> str:
-    """Where a camera, as :meth:`.Camera.describe` has it, is from, and how well its focal length is
-    known; "" if it was given exactly. ``picture`` has the ``focal_35mm`` of the EXIF data."""
-    if not camera["focal_deviation"]:
-        return ""
-    if camera["source"] == "exif":
-        millimetres = "" if picture is None else f", {picture['focal_35mm']:.3g} mm"
-        return f"camera: from the file's EXIF{millimetres}"
-    widths = camera["matrix"][0][0] / camera["size"][1]
-    deviation = 100.0 * camera["focal_deviation"]
-    known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
-    if camera["source"] == "given":
-        return f"camera: field of view given, focal length {known}"
-    weak = (
-        ", as perspective is too weak to measure it"
-        if camera["focal_deviation"] > WEAK_PERSPECTIVE
-        else ""
-    )
-    return f"camera: focal length estimated, {known}{weak}"
-
-
-def view_in_words(view: Mapping[str, Any]) -> str:
-    """Why a photograph of several, one of a document's ``photographs``, does not count, or how
-    much it does; empty if its pose was set by hand, so that nobody has compared it."""
-    counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"
-    return view["failure"] or counts
-
-
 def verdict_of_error(error: Exception) -> str:
     """The verdict on a photograph without a pose: "lost" or "failed"."""
     return "lost" if isinstance(error, LostObjectError) else "failed"
-
-
-def verdict_counts(verdicts: Mapping[str, int]) -> str:
-    """Numbers of photographs by verdict, in words; the counts of other words do not matter.
-
-    Example:
-        >>> verdict_counts({"reliable": 2, "failed": 1})
-        '2 reliable, 0 unsure, 0 no match, 0 lost, 1 failed'
-    """
-    return ", ".join(f"{verdicts.get(verdict, 0)} {verdict}" for verdict in VERDICTS)
-
-
-def line_document(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of ``result.json`` under the keys of a line of ``results.jsonl``."""
-    return {LINE_KEYS.get(key, key): value for key, value in document.items()}
-
-
-def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
-    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left
-    (azimuth 310°), 20° above the horizon"; ``up`` and ``front`` are axes of the mesh, see
-    :func:`.object_frame`."""
-    R = rotation.detach().cpu().double()
-    azimuth, elevation, theta = (
-        round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT)
-    )
-    side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"
-    if abs(elevation) > STEEP_ELEVATION:
-        side = "above" if elevation > 0 else "below"
-    height = (
-        f"{abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
-        if elevation
-        else "level"
-    )
-    tilt = f", tilted by {abs(theta)}° to the {'left' if theta > 0 else 'right'}" if theta else ""
-    return f"seen from {side} (azimuth {azimuth % 360}°), {height}{tilt}"

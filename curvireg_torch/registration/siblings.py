@@ -12,12 +12,12 @@ from ..fitting.edges import EdgeCrops
 from ..fitting.together import details_together
 from ..geometry.viewpoint import rotation_error
 from ..matching import ViewDescriber
+from .candidates import Candidates
 from .confidence import RIVAL_ANGLE
 from .described import evidence_of
 from .poses import Poses, placed
-from .refits import best_inside
 from .target import Target
-from .work import Work, fitted_poses, with_replaced
+from .work import Work, fitted_poses
 
 BETTER = 0.1  # Score by which a sibling replaces the pose: more than rounding
 
@@ -27,21 +27,13 @@ class Rival:
     """The strongest rival of the best pose among its siblings.
 
     Attributes:
-        poses: of it, one; none if it is the same pose of a symmetric mesh.
-        evidence: of as many poses.
+        found: of it, one; none if it is the same pose of a symmetric mesh.
         feature_is_hidden: whether a small feature of the mesh tells the siblings apart, and the
             photograph does not show it.
     """
 
-    poses: Poses
-    evidence: Evidence
+    found: Candidates
     feature_is_hidden: bool = False
-
-    @classmethod
-    def none(cls, poses: Poses, evidence: Evidence) -> "Rival":
-        """No rival of these poses."""
-        nothing = torch.zeros(0, dtype=torch.long)
-        return cls(poses[nothing], evidence[nothing])
 
 
 @dataclass(frozen=True)
@@ -109,38 +101,33 @@ class Siblings:
         evidence = Evidence.from_table(gained)
         details = evidence.details + self.details[chosen, best]
         evidence = replace(evidence, details=details)
-        return Rival(self.poses[chosen], evidence, bool(alike.any()))
+        return Rival(Candidates.of(self.poses[chosen], evidence), bool(alike.any()))
 
 
 def with_siblings(
-    target: Target,
-    work: Work,
-    crops: EdgeCrops,
-    poses: Poses,
-    evidence: Evidence,
-    outside: Tensor,
-) -> tuple[Poses, Evidence, Rival]:
+    target: Target, work: Work, crops: EdgeCrops, found: Candidates
+) -> tuple[Candidates, Rival]:
     """Replace the best pose by what a symmetry of the shape makes of it, if small features say so;
     and return its strongest rival among these. Given symmetries are trusted."""
     symmetries = target.telling_symmetries
     if len(symmetries) == 1:
-        return poses, evidence, Rival.none(poses, evidence)
-    best = best_inside(target, evidence, outside)
+        return found, Rival(found[:0])
+    weights = target.score_weights(exact=True)
+    best = found.best(weights)
 
     def measure(some: Poses) -> Evidence:
         return evidence_of(target, work, some)
 
-    weights = target.score_weights(exact=True)
     siblings = Siblings.of(
-        poses[best], symmetries.transforms, target.describer, crops, measure, weights
+        found.poses[best], symmetries.transforms, target.describer, crops, measure, weights
     )
     kept = siblings.best()
     if kept:
         fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], again=True)
         new = evidence_of(target, work, fitted)
-        poses, evidence = with_replaced(work, poses, evidence, best, fitted, new)
-    rival = siblings.rival(kept, evidence[best], notable=symmetries.notable)
+        found = found.with_fitted(best, fitted, new, work.limits)
+    rival = siblings.rival(kept, found.evidence[best], notable=symmetries.notable)
     if work.limits is not None:
-        allowed = work.limits.keeps(rival.poses)
-        rival = replace(rival, poses=rival.poses[allowed], evidence=rival.evidence[allowed])
-    return poses, evidence, rival
+        allowed = work.limits.keeps(rival.found.poses)
+        rival = replace(rival, found=rival.found[allowed])
+    return found, rival

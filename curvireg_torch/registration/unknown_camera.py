@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import USUAL_DEVIATION
+from .candidates import Candidates
 from .confidence import are_near
 from .described import evidence_of
 from .focal import (
@@ -26,9 +26,8 @@ from .focal import (
 from .inputs import ImageItem
 from .poses import Poses, best_views, close_rivals
 from .priors import Limits
-from .refits import best_inside, scores_inside
 from .target import Target
-from .work import Work, least_starts, poses_of_views, with_replaced
+from .work import Work, least_starts, poses_of_views
 
 OTHER_FOCAL = 0.2
 """Difference of log f from which a fit from another focal length may end elsewhere."""
@@ -84,32 +83,27 @@ def with_possible_cameras(target: Target, work: Work) -> Work:
 
 
 def with_fitted_focal_lengths(
-    target: Target,
-    work: Work,
-    crops: EdgeCrops,
-    poses: Poses,
-    evidence: Evidence,
-    outside: Tensor,
-) -> tuple[Poses, Evidence]:
+    target: Target, work: Work, crops: EdgeCrops, found: Candidates
+) -> Candidates:
     """The best poses and close rivals, each fitted together with its own focal length, where that
     does not lower its score noticeably: where perspective tells nothing, a usual focal length is
     better than one of those tried."""
-    scores = scores_inside(target, evidence, outside)
+    weights = target.score_weights(exact=True)
+    scores = found.scores(weights)
+    inside = int((~found.outside).sum())
     behind = target.pipeline.fit.close_score
-    chosen = _to_be_fitted(work, poses, scores, int((~outside).sum()), behind=behind)
-    index, focal = _focal_starts(chosen, poses.cameras[:, 0, 0])
-    starts = zoomed(poses[index], focal, target.describer.centre)
+    chosen = _to_be_fitted(work, found.poses, scores, inside, behind=behind)
+    index, focal = _focal_starts(chosen, found.poses.cameras[:, 0, 0])
+    starts = zoomed(found.poses[index], focal, target.describer.centre)
     fitted = with_focal_length(target.describer, crops, starts, work.item)
     new = evidence_of(target, work, fitted)
-    gain = new.scores(target.score_weights(exact=True)) - scores[index]
+    gain = new.scores(weights) - scores[index]
     for h in chosen.tolist():
         own = torch.where(index == h, gain, -torch.inf)
         if float(own.max()) >= -SAME_SCORE:
             best = own.argmax()[None]
-            poses, evidence = with_replaced(
-                work, poses, evidence, index[best], fitted[best], new[best]
-            )
-    return poses, evidence
+            found = found.with_fitted(index[best], fitted[best], new[best], work.limits)
+    return found
 
 
 def _focal_starts(chosen: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
@@ -141,17 +135,14 @@ def _to_be_fitted(
 
 
 def with_focal_deviation(
-    target: Target,
-    work: Work,
-    crops: EdgeCrops,
-    poses: Poses,
-    evidence: Evidence,
-    outside: Tensor,
-) -> tuple[Work, Poses]:
+    target: Target, work: Work, crops: EdgeCrops, found: Candidates
+) -> tuple[Work, Candidates]:
     """The photograph with the camera of the best pose and what is known of its focal length, and
     the poses with the covariance that follows; the others have none."""
-    best = best_inside(target, evidence, outside)
+    best = found.best(target.score_weights(exact=True))
+    poses = found.poses
     covariance, deviation = focal_covariance(target.describer, crops, poses[best], work.item)
     unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
     item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)
-    return replace(work, item=item), replace(poses, covariance=unknown)
+    poses = replace(poses, covariance=unknown)
+    return replace(work, item=item), replace(found, poses=poses)

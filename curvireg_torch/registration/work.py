@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError
-from ..evidence import Evidence
 from ..fitting.edges import EdgeCrops
 from ..fitting.keypoints import KeypointMatches
 from ..fitting.measured_fit import measure_contours
@@ -129,13 +128,3 @@ def fitted_poses(
             )
             poses = poses.replaced(left, kept.with_fit(seen, target.describer.centre))
     return poses
-
-
-def with_replaced(
-    work: Work, poses: Poses, evidence: Evidence, index: Tensor, fitted: Poses, new: Evidence
-) -> tuple[Poses, Evidence]:
-    """Put ``fitted`` poses with ``new`` evidence in the places ``index``, unless that exceeds
-    the limits."""
-    if work.limits is not None and not bool(work.limits.keeps(fitted)):
-        return poses, evidence
-    return poses.replaced(index, fitted), evidence.replaced(index, new)

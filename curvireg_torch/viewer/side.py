@@ -11,7 +11,7 @@ from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
-from ..registration.result import pose_in_words, remarks, two_decimals, view_in_words
+from ..registration.words import pose_in_words, remarks, two_decimals, view_in_words
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot, numbers

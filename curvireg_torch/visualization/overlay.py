@@ -15,7 +15,7 @@ from ..matching import ViewDescriber
 from ..mesh import mesh_unit, mesh_up
 from ..registration import Hypothesis, Registrar, Registration
 from ..registration.inputs import ImageItem, image_item
-from ..registration.result import pose_in_words, two_decimals
+from ..registration.words import pose_in_words, two_decimals
 from ..terms import crop_photographs, photograph_field
 from ..utils.checks import as_numbers
 from ..utils.likes import BoxLike, ImageLike

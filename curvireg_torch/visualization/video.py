@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..registration import FailedRegistration, Registrar, Registration
-from ..registration.result import two_decimals
+from ..registration.words import two_decimals
 from .contours import draw_window
 from .overlay import VERDICT_COLOURS
 

@@ -42,7 +42,7 @@ from curvireg_torch.matching import ViewBank, ViewDescriber, ViewMatcher
 from curvireg_torch.mesh import load_mesh
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
-from curvireg_torch.registration.result import line_document
+from curvireg_torch.registration.documents import line_document
 from curvireg_torch.terms import Appearance, BoxShape
 from curvireg_torch.utils.files import file_digest, text_digest, write_csv
 from curvireg_torch.utils.threads import map_on_threads

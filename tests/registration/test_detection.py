@@ -24,7 +24,7 @@ from curvireg_torch.registration import detection as detection_module
 from curvireg_torch.registration.detection import Candidate, Found, _add, _allowed_views
 from curvireg_torch.registration.detector import _medoids
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.result import corners
+from curvireg_torch.registration.words import corners
 from curvireg_torch.synthetic import example_mesh, procedural_background
 from tests._support.scenes import CAMERA, scene, unrefined
 

@@ -13,6 +13,7 @@ from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
+from curvireg_torch.registration.candidates import Candidates
 from curvireg_torch.registration.judging import better_of, judged
 from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.result import FailedRegistration, Registration
@@ -90,14 +91,9 @@ def judgement(
     known |= {name: changes.pop(name) for name in list(changes) if name in known}
     vars(item).update(changes)
     work: Any = SimpleNamespace(exact=True, item=item, ranking=ranking, printed=printed, **known)
-    return judged(
-        target,
-        work,
-        poses,
-        evidence,
-        torch.tensor(distinct or [True] * H),
-        torch.tensor(outside or [False] * H),
-    )
+    are_outside = torch.tensor(outside or [False] * H)
+    are_distinct = torch.tensor(distinct or [True] * H)
+    return judged(target, work, Candidates(poses, evidence, are_outside, are_distinct))
 
 
 def order_of(result: Registration) -> list[int]:

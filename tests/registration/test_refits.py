@@ -12,6 +12,7 @@ from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import refits
+from curvireg_torch.registration.candidates import Candidates
 from curvireg_torch.registration.poses import Poses
 from tests._support.scenes import CAMERA
 
@@ -76,8 +77,9 @@ class Refits:
         work: Any = SimpleNamespace(limits=None, symmetries=symmetries)
         crops: Any = None
         excluded = torch.tensor(outside or [False] * len(poses))
-        after, changed = refits.fitted_again(target, work, crops, poses, evidence, excluded)
-        return (after.T != poses.T).flatten(1).any(dim=1).tolist(), changed
+        before = Candidates.of(poses, evidence, excluded)
+        after = refits.fitted_again(target, work, crops, before)
+        return (after.poses.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 
 def test_the_best_pose_and_its_close_rivals_are_fitted_again(monkeypatch):

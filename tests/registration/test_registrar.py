@@ -26,7 +26,6 @@ from curvireg_torch.registration import (
     FailedRegistration,
     Follower,
     photograph,
-    refits,
     work,
 )
 from curvireg_torch.registration import described as described_module
@@ -160,13 +159,6 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
     result = photograph.register(registrar, item, query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == right
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
-
-
-def test_the_best_pose_is_not_one_outside_the_limits():
-    similarity = torch.tensor([0.5, 0.7, 0.9, 0.6], dtype=torch.float64)
-    evidence = replace(Evidence.zeros(4), similarity=similarity)
-    outside = torch.tensor([False, False, True, False])
-    assert refits.best_inside(truck_registrar(), evidence, outside).tolist() == [1]
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])

@@ -16,6 +16,7 @@ from curvireg_torch.geometry import (
     transform,
 )
 from curvireg_torch.registration import siblings
+from curvireg_torch.registration.candidates import Candidates
 from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.shape_symmetries import TellingSymmetries
 from curvireg_torch.registration.siblings import Siblings
@@ -56,28 +57,28 @@ def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
     family = four(rows, equal, [0, 20, 100, 200])
     fitted = evidence(0.9)
     rival = family.rival(0, fitted, notable=False)
-    assert torch.equal(rival.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
-    assert float(rival.evidence.similarity) == pytest.approx(0.8)
+    assert torch.equal(rival.found.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
+    assert float(rival.found.evidence.similarity) == pytest.approx(0.8)
     assert not rival.feature_is_hidden
     alike = family.look_different.clone()
     alike[0, 2] = False
     rival = replace(family, look_different=alike).rival(0, fitted, notable=False)
-    assert torch.equal(rival.poses.T[0], family.poses.T[3])
-    assert float(rival.evidence.similarity) == pytest.approx(0.7)
+    assert torch.equal(rival.found.poses.T[0], family.poses.T[3])
+    assert float(rival.found.evidence.similarity) == pytest.approx(0.7)
     assert rival.feature_is_hidden
     told = [[0.0] * 4, [0.0] * 4, [-0.5, 0, 0, 0], [-2.0, 0, 0, 0]]
     rival = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
-    assert float(rival.evidence.details) == -0.5
+    assert float(rival.found.evidence.details) == -0.5
 
 
 def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     family = four([0.80, 0.79, 0.70], [[0.0] * 3] * 3, [0, 20, 100])
     family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
     small = family.rival(0, evidence(0.9), notable=False)
-    assert len(small.poses) == len(small.evidence) == 0
+    assert len(small.found) == 0
     assert small.feature_is_hidden
     notable = family.rival(0, evidence(0.9), notable=True)
-    assert torch.equal(notable.poses.T[0], family.poses.T[2])
+    assert torch.equal(notable.found.poses.T[0], family.poses.T[2])
     assert notable.feature_is_hidden
 
 
@@ -125,8 +126,9 @@ class Case:
         work: Any = SimpleNamespace(limits=limits if keeps else None)
         crops: Any = None
         outside = torch.tensor([True, False, False])
-        similarity = evidence(0.99, 0.9, 0.5)
-        return siblings.with_siblings(target, work, crops, self.poses, similarity, outside)
+        before = Candidates.of(self.poses, evidence(0.99, 0.9, 0.5), outside)
+        after, rival = siblings.with_siblings(target, work, crops, before)
+        return after.poses, after.evidence, rival
 
 
 def test_the_best_pose_stays_and_its_sibling_is_its_rival(monkeypatch):
@@ -135,8 +137,8 @@ def test_the_best_pose_stays_and_its_sibling_is_its_rival(monkeypatch):
     assert poses is case.poses
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
     # a symmetry turns the model, before it is posed
-    torch.testing.assert_close(rival.poses.T[0], case.poses.T[1] @ case.symmetries[1])
-    assert float(rival.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
+    torch.testing.assert_close(rival.found.poses.T[0], case.poses.T[1] @ case.symmetries[1])
+    assert float(rival.found.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
     assert not case.fitted
 
 
@@ -148,8 +150,8 @@ def test_a_better_sibling_is_fitted_and_the_pose_before_is_its_rival(monkeypatch
     assert float(poses.T[1, 0, 3] - start.T[0, 0, 3]) == pytest.approx(1e-3)
     assert torch.equal(poses.T[[0, 2]], case.poses.T[[0, 2]])
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.95, 0.5])
-    torch.testing.assert_close(rival.poses.T[0], case.poses.T[1])
-    assert float(rival.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
+    torch.testing.assert_close(rival.found.poses.T[0], case.poses.T[1])
+    assert float(rival.found.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
 
 
 def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
@@ -157,7 +159,7 @@ def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
     poses, changed, rival = case.run(keeps=[False, False])
     assert torch.equal(poses.T, case.poses.T)
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
-    assert len(rival.poses) == len(rival.evidence) == 0
+    assert len(rival.found) == 0
 
 
 def test_meshes_without_a_telling_feature_have_no_siblings(monkeypatch):
@@ -165,4 +167,4 @@ def test_meshes_without_a_telling_feature_have_no_siblings(monkeypatch):
     case.symmetries = torch.eye(4).double()[None]
     poses, _, rival = case.run()
     assert poses is case.poses
-    assert len(rival.poses) == 0
+    assert len(rival.found) == 0

@@ -21,6 +21,7 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import focal, unknown_camera
+from curvireg_torch.registration.candidates import Candidates
 from curvireg_torch.registration.inputs import ImageItem
 from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.work import Work
@@ -168,11 +169,10 @@ def refitted(
     )
     work: Any = SimpleNamespace(starts=starts, item=None, limits=None, symmetries=None)
     excluded = torch.tensor(outside or [False] * len(poses))
-    after, changed = unknown_camera.with_fitted_focal_lengths(
-        target, work, NOTHING, poses, evidence, excluded
-    )
-    differ = (after.cameras != poses.cameras).flatten(1).any(dim=1)
-    return tried, differ.nonzero()[:, 0].tolist(), changed
+    before = Candidates.of(poses, evidence, excluded)
+    after = unknown_camera.with_fitted_focal_lengths(target, work, NOTHING, before)
+    differ = (after.poses.cameras != poses.cameras).flatten(1).any(dim=1)
+    return tried, differ.nonzero()[:, 0].tolist(), after.evidence
 
 
 def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
@@ -217,9 +217,9 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
 
     given: dict[str, Any] = {field.name: None for field in fields(Work)} | {"item": item}
     outside = torch.tensor([False, False, True])
-    work, after = unknown_camera.with_focal_deviation(
-        target, Work(**given), NOTHING, poses, evidence_of(0.7, 0.8, 0.9), outside
-    )
+    before = Candidates.of(poses, evidence_of(0.7, 0.8, 0.9), outside)
+    work, found = unknown_camera.with_focal_deviation(target, Work(**given), NOTHING, before)
+    after = found.poses
     assert work.item.focal_deviation == 0.07
     assert torch.equal(work.item.camera_matrix, poses.cameras[1])
     assert bool(after.covariance[[0, 2]].isnan().all())

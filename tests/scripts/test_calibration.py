@@ -12,7 +12,7 @@ from curvireg_torch.mesh import has_colours
 from curvireg_torch.registration.framing import outside_fraction
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
-from scripts.calibration import calibrate
+from scripts.calibration import fits, measure, sets
 from scripts.scenes.scene import cut, look_at
 
 
@@ -30,10 +30,10 @@ def test_logistic_fit_recovers_weights_and_respects_signs():
         {"features": dict(zip("abc", x, strict=True)), "right": y}
         for x, y in zip(X, right, strict=True)
     ]
-    free = calibrate.fit_logistic(rows, np.ones(4000), {})
+    free = fits.fit_logistic(rows, np.ones(4000), {})
     assert list(free["weights"].values()) == pytest.approx([2.0, -1.0, 0.5], abs=0.15)
     assert free["bias"] == pytest.approx(0.7, abs=0.15)
-    bound = calibrate.fit_logistic(rows, np.ones(4000), {"a": 1.0, "b": 1.0, "c": -1.0})
+    bound = fits.fit_logistic(rows, np.ones(4000), {"a": 1.0, "b": 1.0, "c": -1.0})
     assert bound["weights"]["a"] > 1.0
     assert (bound["weights"]["b"], bound["weights"]["c"]) == (0.0, 0.0)
 
@@ -53,16 +53,16 @@ def test_shares_fit_recovers_slope_and_resolution():
                 "right": True,
             }
         )
-    fitted = calibrate.fit_shares(rows, np.ones(len(rows)), ties=True)
+    fitted = fits.fit_shares(rows, np.ones(len(rows)), ties=True)
     assert fitted["slope"] == pytest.approx(2.0, abs=0.5)
     assert fitted["resolution"] == pytest.approx(0.5, abs=0.21)
-    assert calibrate.fit_shares(rows, np.ones(len(rows)), ties=False)["resolution"] == 0.0
+    assert fits.fit_shares(rows, np.ones(len(rows)), ties=False)["resolution"] == 0.0
 
 
 def test_sets_of_furniture_are_left_out_where_there_is_none(tmp_path):
-    assert "furniture" not in calibrate.sets_of(["instance"], None)
-    assert "furniture" in calibrate.sets_of(["instance"], tmp_path)
-    assert set(calibrate.SHARES) < set(calibrate.sets_of(["instance"], None))
+    assert "furniture" not in sets.sets_of(["instance"], None)
+    assert "furniture" in sets.sets_of(["instance"], tmp_path)
+    assert set(sets.SHARES) < set(sets.sets_of(["instance"], None))
 
 
 def test_twins_have_the_same_shape_and_another_print():
@@ -112,7 +112,7 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
         share = 1.0 / (1.0 + np.exp(-1.5 * (1.0 - 0.5)))  # of two scores, a point apart
         first = bool(generator.random() < share / (1.0 + np.exp(-logit)))
         rows.append({"features": {"a": a, "b": b}, "scores": [3.0, 2.0], "first": first})
-    fitted = calibrate.fit_level(rows, np.ones(len(rows)), constants)
+    fitted = fits.fit_level(rows, np.ones(len(rows)), constants)
     assert fitted["weights"]["a"] == pytest.approx(1.0, abs=0.15)
     assert fitted["weights"]["b"] == pytest.approx(-0.5, abs=0.08)
     assert fitted["bias"] == pytest.approx(0.25 - 1.0, abs=0.15)
@@ -122,8 +122,8 @@ def test_level_of_few_rows_keeps_the_proportions_of_the_weights():
 def test_grey_meshes_have_no_colours(tmp_path):
     path = tmp_path / "painted.glb"
     example_mesh(painted=True).export(path)
-    assert has_colours(calibrate.mesh_of(path, grey=False))
-    assert not has_colours(calibrate.mesh_of(path, grey=True))
-    assert calibrate.is_grey("shelves", 4)
-    assert not calibrate.is_grey("shelves", 3)
-    assert not calibrate.is_grey("wrong", 4)
+    assert has_colours(measure.mesh_of(path, grey=False))
+    assert not has_colours(measure.mesh_of(path, grey=True))
+    assert measure.is_grey("shelves", 4)
+    assert not measure.is_grey("shelves", 3)
+    assert not measure.is_grey("wrong", 4)

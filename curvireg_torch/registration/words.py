@@ -1,0 +1,115 @@
+"""Results in words."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from ..geometry.pose_prior import object_frame
+from ..geometry.viewpoint import viewpoint_from_rotation
+from ..utils.choices import SIDE_NAMES
+
+# How sure an answer is, surest first; the last two have no pose
+VERDICTS = ("reliable", "unsure", "no match", "lost", "failed")
+STEEP_ELEVATION = 70  # Degrees of elevation beyond which an object is seen from above or below
+# Deviation of an estimated focal length, as a fraction, from which it is hardly measured
+WEAK_PERSPECTIVE = 0.15
+
+
+def two_decimals(probability: float) -> str:
+    """A probability as it is shown, never rounded up: 0.897 is not yet 0.90, reliable.
+
+    Example:
+        >>> two_decimals(0.897), two_decimals(0.29), two_decimals(1.0)
+        ('0.89', '0.29', '1.00')
+    """
+    return f"{math.floor(100.0 * probability + 1e-9) / 100.0:.2f}"
+
+
+def corners(box: Sequence[float]) -> str:
+    """A box in whole px, as ``--box`` takes it."""
+    return " ".join(f"{v:.0f}" for v in box)
+
+
+def remarks(document: Mapping[str, Any]) -> list[str]:
+    """Lines about numbers that did not fit, a replaced box or contradicted limits, and about a
+    symmetric mesh."""
+    box = document["corrected_box"]
+    contradiction = document.get("prior", {}).get("contradiction")
+    lines = [] if box is None else [f"the box did not fit the pose; one that does: {corners(box)}"]
+    if contradiction == "better outside":
+        lines.append("the photograph fits much better outside the pose prior; check it")
+    elif contradiction is not None:
+        lines.append("the pose lies at one of its limits; widen it to see whether it stays")
+    if (count := document.get("symmetries", 1)) > 1:
+        lines.append(f"the mesh looks the same in {count} orientations: the pose is one of as many")
+    return lines
+
+
+def camera_in_words(document: Mapping[str, Any]) -> list[str]:
+    """A line about a camera that was not given exactly: where it is from, and how well its focal
+    length is known."""
+    camera = document["camera"]
+    line = "" if camera is None else focal_length_in_words(camera, document["inputs"]["picture"])
+    return [line] if line else []
+
+
+def focal_length_in_words(
+    camera: Mapping[str, Any], picture: Mapping[str, Any] | None = None
+) -> str:
+    """Where a camera, as :meth:`.Camera.describe` has it, is from, and how well its focal length is
+    known; "" if it was given exactly. ``picture`` has the ``focal_35mm`` of the EXIF data."""
+    if not camera["focal_deviation"]:
+        return ""
+    if camera["source"] == "exif":
+        millimetres = "" if picture is None else f", {picture['focal_35mm']:.3g} mm"
+        return f"camera: from the file's EXIF{millimetres}"
+    widths = camera["matrix"][0][0] / camera["size"][1]
+    deviation = 100.0 * camera["focal_deviation"]
+    known = f"{widths:.2g} widths +- {deviation:.0f} %; the distance is proportional to it"
+    if camera["source"] == "given":
+        return f"camera: field of view given, focal length {known}"
+    weak = (
+        ", as perspective is too weak to measure it"
+        if camera["focal_deviation"] > WEAK_PERSPECTIVE
+        else ""
+    )
+    return f"camera: focal length estimated, {known}{weak}"
+
+
+def view_in_words(view: Mapping[str, Any]) -> str:
+    """Why a photograph of several, one of a document's ``photographs``, does not count, or how
+    much it does; empty if its pose was set by hand, so that nobody has compared it."""
+    counts = "" if view["similarity"] is None else f"prefers the pose by {view['contribution']:.2f}"
+    return view["failure"] or counts
+
+
+def verdict_counts(verdicts: Mapping[str, int]) -> str:
+    """Numbers of photographs by verdict, in words; the counts of other words do not matter.
+
+    Example:
+        >>> verdict_counts({"reliable": 2, "failed": 1})
+        '2 reliable, 0 unsure, 0 no match, 0 lost, 1 failed'
+    """
+    return ", ".join(f"{verdicts.get(verdict, 0)} {verdict}" for verdict in VERDICTS)
+
+
+def pose_in_words(rotation: Tensor, *, up: str = "z", front: str | None = None) -> str:
+    """The side from which a (3, 3) rotation shows the object, such as "seen from the front-left
+    (azimuth 310°), 20° above the horizon"; ``up`` and ``front`` are axes of the mesh, see
+    :func:`.object_frame`."""
+    R = rotation.detach().cpu().double()
+    azimuth, elevation, theta = (
+        round(float(v)) for v in viewpoint_from_rotation(R @ object_frame(up, front).mT)
+    )
+    side = f"the {SIDE_NAMES[round(azimuth / 45.0) % 8]}"
+    if abs(elevation) > STEEP_ELEVATION:
+        side = "above" if elevation > 0 else "below"
+    height = (
+        f"{abs(elevation)}° {'above' if elevation > 0 else 'below'} the horizon"
+        if elevation
+        else "level"
+    )
+    tilt = f", tilted by {abs(theta)}° to the {'left' if theta > 0 else 'right'}" if theta else ""
+    return f"seen from {side} (azimuth {azimuth % 360}°), {height}{tilt}"

@@ -1,0 +1,209 @@
+"""Fits of confidences to measured rows, and how well they tell what is right."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import expit, logsumexp
+from sklearn.metrics import roc_auc_score
+
+from curvireg_torch.registration import mirror
+from curvireg_torch.registration.confidence import (
+    DOUBT_FEATURES,
+    EVIDENCE_FEATURES,
+    RELIABLE,
+    LogisticModel,
+)
+from scripts.calibration.measure import RIGHT, Row
+from scripts.calibration.sets import ABSENT, SHARES
+
+FOLDS = 5
+RESOLUTIONS = np.arange(0.5, 1.55, 0.1).round(2).tolist()
+"""Those that are tried. Scores of two poses that look the same differ by up to 0.5."""
+
+
+def folds_of(rows: Sequence[Row]) -> np.ndarray:
+    """(n,) fold of each row; groups are assigned so that folds have about equal sizes."""
+    groups, counts = np.unique([row["group"] for row in rows], return_counts=True)
+    size = [0] * FOLDS
+    fold = {}
+    for k in np.argsort(-counts, kind="stable"):
+        fold[groups[k]] = int(np.argmin(size))
+        size[fold[groups[k]]] += int(counts[k])
+    return np.array([fold[row["group"]] for row in rows])
+
+
+def fit_logistic(rows: Sequence[Row], weight: np.ndarray, signs: Mapping[str, float]) -> Row:
+    """Weights and bias of the probability that a row is ``right``.
+
+    The standardised weights have a unit Gaussian prior, and the sign in ``signs``, if there is one.
+    """
+    names = list(rows[0]["features"])
+    X = np.array([[row["features"][n] or 0.0 for n in names] for row in rows])
+    y = np.array([row["right"] for row in rows])
+    mean = X.mean(axis=0)
+    spread = X.std(axis=0)
+    spread[spread < 1e-6] = np.inf  # a constant feature gets weight 0
+    Z = (X - mean) / spread
+
+    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
+        logit = Z @ p[:-1] + p[-1]
+        value = float(weight @ (np.logaddexp(0.0, logit) - y * logit)) + 0.5 * float(
+            p[:-1] @ p[:-1]
+        )
+        slope = weight * (expit(logit) - y)
+        return value, np.append(Z.T @ slope + p[:-1], slope.sum())
+
+    ranges = {1.0: (0.0, None), -1.0: (None, 0.0)}
+    bounds = [*(ranges.get(signs.get(name, 0.0), (None, None)) for name in names), (None, None)]
+    found = minimize(loss, np.zeros(len(names) + 1), jac=True, bounds=bounds, method="L-BFGS-B").x
+    w = found[:-1] / spread
+    bias = float(found[-1] - w @ mean)
+    return {
+        "weights": dict(zip(names, w.round(4).tolist(), strict=True)),
+        "bias": round(bias, 4),
+        "n": len(y),
+    }
+
+
+def fit_level(rows: Sequence[Row], weight: np.ndarray, constants: Row) -> Row:
+    """The model of ``constants`` with a scale and a level of its logit, so that the confidence of
+    the first hypothesis, its share included, is right: two numbers, which few photographs
+    determine. Slope and resolution of the shares stay."""
+    logit = np.array([row_logit(row, constants) for row in rows])
+    share = np.array([first_share(row, constants) for row in rows])
+    first = np.array([row["first"] for row in rows])
+
+    def loss(p: np.ndarray) -> float:
+        confidence = np.clip(expit(p[0] * logit + p[1]) * share, 1e-9, 1.0 - 1e-9)
+        return float(-weight @ np.log(np.where(first, confidence, 1.0 - confidence)))
+
+    scale, level = minimize(loss, np.array([1.0, 0.0]), method="Nelder-Mead").x
+    weights = {name: round(float(scale) * value, 4) for name, value in constants["weights"].items()}
+    bias = round(float(scale * constants["bias"] + level), 4)
+    return constants | {"weights": weights, "bias": bias, "n": len(rows)}
+
+
+def row_logit(row: Row, constants: Row) -> float:
+    """Logit of the probability that any hypothesis of a row is right."""
+    weights = constants["weights"].items()
+    return float(constants["bias"] + sum(w * (row["features"][name] or 0.0) for name, w in weights))
+
+
+def fit_shares(rows: Sequence[Row], weight: np.ndarray, *, ties: bool) -> Row:
+    """Slope and resolution of :func:`curvireg_torch.registration.confidence.shares`, where some
+    pose is right and some are not; without ``ties`` the resolution is 0."""
+    decided = [k for k, row in enumerate(rows) if row["right"] and max(row["errors"]) >= RIGHT]
+    most = max((len(rows[k]["scores"]) for k in decided), default=1)
+    behind = np.full((len(decided), most), np.inf)
+    right = np.zeros((len(decided), most), bool)
+    for place, k in enumerate(decided):
+        scores = np.array(rows[k]["scores"])
+        behind[place, : len(scores)] = scores.max() - scores
+        right[place, : len(scores)] = np.array(rows[k]["errors"]) < RIGHT
+
+    def loss(slope: float, resolution: float) -> float:
+        logits = -slope * np.maximum(0.0, behind - resolution)
+        of_right = np.where(right, logits, -np.inf)
+        return float(
+            weight[decided] @ (logsumexp(logits, axis=1) - logsumexp(of_right, axis=1))
+            + 0.05 * slope**2
+        )
+
+    found = []
+    for resolution in RESOLUTIONS if ties else (0.0,):
+        best = minimize_scalar(loss, args=(resolution,), bounds=(0.01, 10.0), method="bounded")
+        found.append((best.fun, round(float(best.x), 4), resolution))
+    _, slope, resolution = min(found)
+    return {"slope": slope, "resolution": resolution}
+
+
+def first_probability(row: Row, constants: Row) -> float:
+    """Confidence of a row."""
+    any_right = LogisticModel(constants["weights"], constants["bias"])(row["features"])
+    doubt = mirror.DOUBT if row.get("mirror") else 1.0
+    return doubt * any_right * first_share(row, constants)
+
+
+def first_share(row: Row, constants: Row) -> float:
+    """Share of the first hypothesis in the probability that any is right."""
+    scores = np.array(row["scores"])
+    logits = -constants["slope"] * np.maximum(0.0, scores.max() - scores - constants["resolution"])
+    return float(np.exp(logits[0] - logsumexp(logits)))
+
+
+def quality_of(p: np.ndarray, right: np.ndarray, weight: np.ndarray) -> Row:
+    """How well probabilities (n,) tell the right answers (n,) bool."""
+    sure = p >= RELIABLE
+    quality: Row = {"n": len(p), "right": float(np.average(right, weights=weight))}
+    quality |= {
+        "said": float(np.average(p, weights=weight)),
+        "reliable": float(np.average(sure, weights=weight)),
+    }
+    quality["auc"] = (
+        float(roc_auc_score(right, p, sample_weight=weight))
+        if len(set(right.tolist())) == 2
+        else None
+    )
+    quality["right if reliable"] = (
+        float(np.average(right[sure], weights=weight[sure])) if sure.any() else None
+    )
+    quality["reliable and wrong"] = int((sure & ~right).sum())
+    return quality
+
+
+def errors_within(errors: np.ndarray) -> Row:
+    """Fractions of errors (n,) in degrees within 5 and 15, and their median."""
+    within = {f"within {limit}": float((errors < limit).mean()) for limit in (5, 15)}
+    return within | {"median": float(np.median(errors))}
+
+
+def fit_registrations(
+    rows: list[Row], *, exact: bool, present: Row | None = None
+) -> tuple[Row, Row]:
+    """Constants of a model of registrations, and their quality on held-out folds, in all and by
+    set. With the ``present`` constants only their scale and level are fitted, see
+    :func:`fit_level`."""
+    for row in rows:
+        is_present = row["set"] not in ABSENT
+        row["right"] = is_present and min(row["errors"]) < RIGHT
+        row["first"] = is_present and row["errors"][0] < RIGHT
+    sets = np.array([row["set"] for row in rows])
+    ordinary = float(sum(name not in SHARES for name in sets))
+    factor = ordinary / (1.0 - sum(SHARES[name] for name in set(sets) if name in SHARES))
+    weight = np.array(
+        [factor * SHARES[name] / (sets == name).sum() if name in SHARES else 1.0 for name in sets]
+    )
+    signs = dict.fromkeys(EVIDENCE_FEATURES, 1.0) | dict.fromkeys(DOUBT_FEATURES, -1.0)
+
+    def fit(train: np.ndarray) -> Row:
+        # what fits, but is less probable than the mirror image, tells nothing of what fits
+        train = train & ~is_mirrored
+        some = [row for row, chosen in zip(rows, train, strict=True) if chosen]
+        fitted = present or fit_logistic(some, weight[train], signs) | fit_shares(
+            some, weight[train], ties=exact
+        )
+        return fit_level(some, weight[train], fitted)
+
+    is_mirrored = np.array([row.get("mirror", False) for row in rows])
+    fold = folds_of(rows)
+    p = np.zeros(len(rows))
+    for k in range(FOLDS):
+        constants = fit(fold != k)
+        p[fold == k] = [
+            first_probability(row, constants)
+            for row, own in zip(rows, fold == k, strict=True)
+            if own
+        ]
+    first = np.array([row["first"] for row in rows])
+    quality = quality_of(p, first, weight)
+    by_set = {name: sets == name for name in dict.fromkeys(sets.tolist())}
+    by_set["grey"] = np.array([row["grey"] for row in rows])
+    by_set["with colours"] = ~by_set["grey"]
+    errors = np.array([row["errors"][0] for row in rows])
+    quality["sets"] = {
+        name: quality_of(p[own], first[own], weight[own]) | errors_within(errors[own])
+        for name, own in by_set.items()
+        if own.any()
+    }
+    return fit(np.full(len(rows), True)), quality

@@ -1,0 +1,261 @@
+"""What registrations, refinements, trackers and detections say of generated photographs, and
+whether it is true: a row for each."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import groupby
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+from tqdm import tqdm
+
+import curvireg_torch as cr
+from curvireg_torch.data import BOPDataset
+from curvireg_torch.errors import LostObjectError
+from curvireg_torch.evidence import Evidence
+from curvireg_torch.geometry import axis_angle_from_rotation, rotation_from_axis_angle
+from curvireg_torch.geometry.crops import box_iou
+from curvireg_torch.inspection.photographs import without_colours
+from curvireg_torch.registration import Follower, mirror
+from curvireg_torch.registration.confidence import are_near
+from curvireg_torch.registration.detection import SAME_OBJECT_OVERLAP
+from scripts.calibration.sets import ESTIMATED, GREY, MODELS, SETS, UPRIGHT, photographs_of
+
+Row: TypeAlias = dict[str, Any]
+
+RIGHT = 30.0  # degrees within which a registration is right
+# and fraction of the distance, within which a refined or tracked pose is right
+FINE_DEGREES = 10.0
+FINE_FRACTION = 0.1
+
+STARTS = (
+    (5.0, 0.0),
+    (10.0, 0.0),
+    (15.0, 0.0),
+    (20.0, 0.0),
+    (30.0, 0.0),
+    (0.0, 0.05),
+    (0.0, 0.1),
+    (0.0, 0.2),
+)
+"""Degrees and fraction of the distance by which the starts of refinements are off."""
+
+
+def symmetries_of(sample: Row, registrar: cr.Registrar | None = None) -> Tensor:
+    """(S, 3, 3) rotations after which the object counts as the same: those of the set, and those
+    that an exact mesh without colours has for the registrar, unless a notable feature of it tells
+    them apart."""
+    listed = sample["model_info"].get("symmetries_discrete", [])
+    known = [
+        torch.eye(3).double()[None],
+        *(torch.tensor(values).view(1, 4, 4)[:, :3, :3].double() for values in listed),
+    ]
+    found = None
+    if registrar is not None and not registrar.telling_symmetries.notable:
+        found = registrar.symmetries_of(exact=True)
+    return torch.cat(known if found is None else [*known, found[:, :3, :3].double()])
+
+
+def errors_of(R: Tensor, sample: Row, S: Tensor | None = None) -> Tensor:
+    """(N,) degrees between rotations (N, 3, 3) and the truth, up to symmetries ``S`` (S, 3, 3)."""
+    S = symmetries_of(sample) if S is None else S
+    return cr.rotation_error(R[:, None].double(), (sample["rotation"].double() @ S)[None]).amin(
+        dim=1
+    )
+
+
+def truth_of(sample: Row) -> Tensor:
+    """(4, 4) true pose of a sample."""
+    return cr.geometry.transform(sample["rotation"].double(), sample["translation"].double())
+
+
+def fine(T: Tensor, sample: Row) -> bool:
+    """Whether a pose (4, 4) is near the truth."""
+    t = sample["translation"].double()
+    near = (T[:3, 3] - t).norm() <= FINE_FRACTION * t.norm()
+    return bool(near and errors_of(T[None, :3, :3], sample) <= FINE_DEGREES)
+
+
+def registered(registrar: cr.Registrar, sample: Row, *, with_camera: bool) -> Iterator[Row]:
+    """One row: features, scores and errors of the hypotheses."""
+    K = sample["camera_matrix"].double() if with_camera else None
+    result = registrar([sample["image"]], sample["box"][None], K)[0]
+    if not result.ok:
+        return
+    seen = sample
+    R = torch.stack(
+        [h.rotation if K is not None else h.allocentric_rotation for h in result.hypotheses]
+    )
+    if K is None:  # compare as seen by a camera that looks straight at the object
+        ray = sample["rotation"].double() @ model_centre(sample) + sample["translation"].double()
+        seen = sample | {
+            "rotation": cr.geometry.rotation_towards(ray).T @ sample["rotation"].double()
+        }
+    evidence = Evidence.of_hypotheses([h.evidence for h in result.hypotheses])
+    scores = evidence.scores(registrar.score_weights(exact=registrar.is_exact))
+    S = symmetries_of(sample, registrar if registrar.is_exact else None)
+    # near the best one up to symmetries, they are right if it is
+    is_rival = ~are_near(R.float(), R[0].float(), S)
+    is_rival[0] = True
+    row = {"features": dict(result.confidence_features), "scores": scores[is_rival].tolist()}
+    row |= {"evidence": evidence.table[is_rival].tolist()}
+    row |= {"errors": errors_of(R, seen, S)[is_rival].tolist()}
+    row |= {"mirror": mirror.WARNING in result.warnings}
+    best = result.hypotheses[0]
+    is_unique = len(S) == 1  # else the covariance is that of another pose
+    if best.covariance is not None and is_unique and row["errors"][0] < RIGHT:
+        turn = axis_angle_from_rotation(sample["rotation"].double() @ best.rotation.T)
+        e = torch.cat([turn, sample["translation"].double() - best.translation])
+        row["distance2"] = float(e @ torch.linalg.solve(best.covariance.double(), e))
+    yield row
+
+
+def model_centre(sample: Row) -> Tensor:
+    """(3,) middle of the model's box, in mm."""
+    info = sample["model_info"]
+    return torch.tensor(
+        [info[f"min_{c}"] + 0.5 * info[f"size_{c}"] for c in "xyz"], dtype=torch.float64
+    )
+
+
+def refined(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+    """Rows of refinements from wrong starts, and in the photograph ``other``, which does not show
+    the object."""
+    T = truth_of(sample)
+    K = sample["camera_matrix"].double()
+    generator = torch.Generator().manual_seed(sample["scene_id"])
+    for degrees, fraction in (*STARTS, (0.0, 0.0)):
+        axis = torch.nn.functional.normalize(
+            torch.randn(3, generator=generator, dtype=torch.float64), dim=0
+        )
+        sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
+        start = T.clone()
+        start[:3, :3] = rotation_from_axis_angle(axis * np.radians(degrees)) @ T[:3, :3]
+        start[:3, 3] *= 1.0 + sign * fraction
+        absent = degrees == fraction == 0.0
+        result = registrar.refine([(other if absent else sample)["image"]], K, [start])[0]
+        if result.ok:
+            yield {
+                "features": dict(result.confidence_features),
+                "right": not absent and fine(result.transform, sample),
+            }
+
+
+def followed(registrar: cr.Registrar, frames: Sequence[Row]) -> Iterator[Row]:
+    """Rows of a sequence tracked from its first true pose, by every frame and by every third."""
+    for stride in (1, 3):
+        follow = Follower(registrar, frames[0]["camera_matrix"].double())
+        follow.start(frames[0]["image"], truth_of(frames[0]))
+        for sample in frames[stride::stride]:
+            result = follow(sample["image"])
+            if result.ok and "region" in result.confidence_features:
+                yield {
+                    "features": dict(result.confidence_features),
+                    "right": fine(result.transform, sample),
+                }
+
+
+def detected(registrar: cr.Registrar, sample: Row, other: Row) -> Iterator[Row]:
+    """Rows of detections without a box, in a photograph of the object and in one without it."""
+    for shown in (sample, other):
+        result = registrar([shown["image"]], None, shown["camera_matrix"].double())[0]
+        lost = not result.ok and isinstance(result.error, LostObjectError)
+        found = result.detection if result.ok else result.error.detection if lost else None
+        # not a number of keypoints
+        if found is not None and not float(found.response).is_integer():
+            query = registrar.matcher.query([shown["image"]], found.box[None].float())
+            features = {
+                "response": found.response,
+                "similarity": float(registrar.matcher.similarity(query)),
+            }
+            overlap = float(box_iou(found.box[None], shown["box"][None].double()))
+            yield {
+                "features": features,
+                "right": shown is sample and overlap >= SAME_OBJECT_OVERLAP,
+            }
+
+
+def is_grey(kind: str, obj_id: int) -> bool:
+    """Whether a mesh of a set loses its colours."""
+    return kind in GREY and obj_id % GREY[kind] == 0
+
+
+def mesh_of(path: Path, *, grey: bool) -> trimesh.Trimesh:
+    """The mesh in a file, ``grey`` without its colours."""
+    mesh = cr.load_mesh(path, unit="mm")
+    return without_colours(mesh) if grey else mesh
+
+
+def measure(task: tuple[str, Path, str, list[int], int]) -> list[Row]:
+    """Rows of one mesh's photographs."""
+    kind, folder, pose, indices, beside = task
+    torch.set_num_threads(1)
+    data = BOPDataset(folder)
+    samples = [data[i] for i in indices]
+    other = data[beside]
+    pipeline = cr.Pipeline().with_pose_prior(pose)
+    grey = is_grey(kind, samples[0]["obj_id"])
+    mesh = mesh_of(samples[0]["model_path"], grey=grey)
+    mesh_is = "similar" if "similar" in kind else "exact"
+    registrar = cr.Registrar(mesh, pipeline=pipeline, mesh_is=mesh_is)
+    if kind == "sequences":
+        found = [(samples[0], row) for row in followed(registrar, samples)]
+    else:
+        methods: dict[str, Callable[[Row], Iterator[Row]]] = {
+            "refined": lambda s: refined(registrar, s, other),
+            "detected": lambda s: detected(registrar, s, other),
+        }
+        method = methods.get(
+            kind,
+            lambda s: registered(
+                registrar, s, with_camera=kind not in (*MODELS["category"], *ESTIMATED)
+            ),
+        )
+        found = [(s, row) for s in samples for row in method(s)]
+    groups = json.loads((folder / "benchmark.json").read_text())["groups"]
+    more = {"set": kind, "object": samples[0]["obj_id"], "grey": grey}
+    return [
+        {"scene": s["scene_id"], "group": f"{kind} {groups[str(s['obj_id'])]}", **more, **row}
+        for s, row in found
+    ]
+
+
+def rows_of(work: Path, kind: str, jobs: int, limit: int | None = None) -> list[Row]:
+    """Rows of a set, or of refinements and detections in the set "shapes"; finished meshes are read
+    from the file."""
+    photographs = photographs_of(kind)
+    folder = work / (photographs if photographs in SETS else "shapes")
+    out = work / f"{kind}.jsonl"
+    data = BOPDataset(folder)
+    annotations = [data.annotation(i) for i in range(len(data))]
+    listed = [(int(s["scene_id"]), int(s["obj_id"]), i) for i, s in enumerate(annotations)][:limit]
+    done = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    known = {tuple(row["task"]) for row in done}
+
+    def mesh_and_pose(entry: tuple[int, int, int]) -> tuple[int, int]:
+        # of these, make.py alternates upright and any pose
+        upright = kind in UPRIGHT and entry[0] % 2 == 0
+        return entry[1], int(not upright)
+
+    tasks = []
+    for key, group in groupby(sorted(listed, key=mesh_and_pose), key=mesh_and_pose):
+        indices = [i for _, _, i in group]
+        if key not in known:
+            scenes = {scene for scene, obj_id, _ in listed if obj_id == key[0]}
+            beside = next((i for scene, _, i in listed if scene not in scenes), 0)
+            tasks.append((key, (kind, folder, "any" if key[1] else "upright", indices, beside)))
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool, out.open("a") as file:
+        found = pool.map(measure, [task for _, task in tasks])
+        for (key, _), rows in zip(
+            tasks, tqdm(found, total=len(tasks), desc=kind, unit="mesh"), strict=True
+        ):
+            done.append({"task": key, "rows": rows})
+            file.write(json.dumps(done[-1]) + "\n")
+            file.flush()
+    return [row for entry in done for row in entry["rows"]]

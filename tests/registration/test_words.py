@@ -1,0 +1,64 @@
+"""Results in words."""
+
+from collections import Counter
+
+import torch
+
+from curvireg_torch.geometry import rotation_from_viewpoint
+from curvireg_torch.geometry.pose_prior import object_frame
+from curvireg_torch.registration.words import (
+    VERDICTS,
+    pose_in_words,
+    remarks,
+    two_decimals,
+    verdict_counts,
+)
+
+
+def test_remarks_name_a_contradicted_prior_and_the_replaced_box_in_whole_pixels():
+    prior = {"azimuth": [0, 9], "contradiction": None}
+    assert (
+        remarks({"corrected_box": None}) == remarks({"corrected_box": None, "prior": prior}) == []
+    )
+    for contradiction, words in (
+        ("better outside", "much better outside"),
+        ("at the limit", "at one of"),
+    ):
+        (line,) = remarks(
+            {"corrected_box": None, "prior": {**prior, "contradiction": contradiction}}
+        )
+        assert words in line
+    (line,) = remarks({"corrected_box": [1.4, 2.6, 30.49, 40.51]})
+    assert line.endswith(": 1 3 30 41")
+
+
+def test_pose_in_words():
+    for viewpoint, words in (
+        ((0, 0, 0), "seen from the front (azimuth 0°), level"),
+        (
+            (88, -12, 5),
+            "seen from the right (azimuth 88°), 12° below the horizon, tilted by 5° to the left",
+        ),
+        (
+            (225, 30, -40),
+            "seen from the back-left (azimuth 225°), 30° above the horizon, tilted by 40° to the "
+            "right",
+        ),
+        ((45, 80, 0), "seen from above (azimuth 45°), 80° above the horizon"),
+        ((45, -80, 0), "seen from below (azimuth 45°), 80° below the horizon"),
+    ):
+        R = rotation_from_viewpoint(*torch.tensor(viewpoint, dtype=torch.float64))
+        assert pose_in_words(R) == words
+        for up, front in (("y", None), ("-x", None), ("z", "x")):
+            assert pose_in_words(R @ object_frame(up, front), up=up, front=front) == words
+
+
+def test_verdicts_are_counted_in_words():
+    assert VERDICTS[3:] == ("lost", "failed")
+    words = verdict_counts(Counter(["lost", "reliable", "reliable"]))
+    assert words == "2 reliable, 0 unsure, 0 no match, 1 lost, 0 failed"
+
+
+def test_confidence_is_never_shown_as_more_than_it_is():
+    shown = [two_decimals(p) for p in (0.897, 0.8999, 0.9, 0.29, 0.57, 0.0, 1.0)]
+    assert shown == ["0.89", "0.89", "0.90", "0.29", "0.57", "0.00", "1.00"]
