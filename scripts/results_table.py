@@ -18,22 +18,21 @@ from typing import Any
 from scripts._shared import REPOSITORY, RESULTS, commit, table_lines, today, update_page, write_json
 
 PASCAL3D = (
-    "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median | s/object",
+    "set | N | Acc 30° | Acc 10° | median | Acc 30°, symmetric | easy: Acc 30° | median",
     "Acc 30°, Acc 10°: share of the objects whose rotation error acos((tr(R1ᵀR2) - 1) / 2) is "
     "below; median: of that "
     "error; symmetric: a bottle's turns about its axis and a table's half turn do not count; "
     "easy: neither truncated, "
-    "occluded nor difficult. No camera is given. s/object: one thread, with other work on the "
-    "machine.",
+    "occluded nor difficult. No camera is given.",
 )
 BOP = (
     "set | N | Acc 15° | Acc 30° | median | ADD(-S) 0.1d | AR MSSD | AR MSPD | unoccluded: N | "
-    "Acc 30° | s/object",
+    "Acc 30°",
     "Rotation errors up to the object's symmetries; ADD(-S) 0.1d: share of the objects whose mean "
     "distance of model "
     "points is below a tenth of the diameter; AR MSSD, AR MSPD: BOP's average recalls; "
     "unoccluded: at least 95 % "
-    "visible. Box and camera matrix are given. s/object as above.",
+    "visible. Box and camera matrix are given.",
 )
 
 
@@ -157,7 +156,6 @@ def pascal3d_cells(name: str, s: dict[str, Any]) -> list[str]:
         *values,
         percent(easy["acc_pi_6"]),
         degrees(easy["med_err_deg"]),
-        seconds_each(s),
     ]
 
 
@@ -171,7 +169,6 @@ def bop_cells(name: str, s: dict[str, Any]) -> list[str]:
         *values,
         str(whole["n"]),
         percent(whole["acc_30_deg"]),
-        seconds_each(s),
     ]
 
 
@@ -192,11 +189,6 @@ def percent(fraction: float | None) -> str:
 
 def degrees(value: float | None) -> str:
     return "-" if value is None else f"{value:.1f}°"
-
-
-def seconds_each(summary: dict[str, Any]) -> str:
-    seconds = summary["seconds"]["register_each"]
-    return "-" if seconds is None else f"{seconds:.1f}"
 
 
 if __name__ == "__main__":

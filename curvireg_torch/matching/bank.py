@@ -31,6 +31,7 @@ from ..mesh.mesh import (
     mesh_up,
     principal_rotation,
 )
+from ..mesh.reflections import reflection_plane
 from ..pipeline import BankSettings, Pipeline, ViewPolicy
 from ..rendering import DepthRenderer
 from ..terms import Appearance, Precision, Whitening, ledoit_wolf
@@ -43,7 +44,7 @@ from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
-FORMAT_VERSION = 9
+FORMAT_VERSION = 10
 PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
 TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
@@ -283,6 +284,7 @@ class ViewBank:
             arrays[f"{kind}.faces"] = np.array(mesh.faces, np.int32)
         contents |= {name: torch.from_numpy(x.copy()) for name, x in arrays.items()}
         contents["extreme_points"] = extreme_points(self.mesh)
+        contents["reflection_plane"] = _rows(reflection_plane(self.mesh))
         if not has_colours(self.mesh):
             contents["mesh_symmetries"] = mesh_symmetries(self.mesh)
         angle = self._compared_angle()
@@ -414,6 +416,7 @@ def _mesh(tensors: Mapping[str, Tensor], unit: str, up: str) -> trimesh.Trimesh:
     )
     if len(mesh.faces) > VIEW_FACES:
         mesh._cache["view_mesh"] = _triangles(tensors, "view_mesh")
+    mesh._cache["reflection_plane"] = _plane(tensors["reflection_plane"])
     _check_extreme_points(mesh)
     check_option(up, UP_AXES, "up")
     if unit:
@@ -463,6 +466,20 @@ def _check_extreme_points(mesh: trimesh.Trimesh) -> None:
     gap = (bounds - torch.from_numpy(np.array(mesh.bounds))).abs().max()
     if not float(gap) <= EXTREME_TOLERANCE * mesh_radius(mesh):
         raise ValueError("extreme_points: those of another mesh")
+
+
+def _rows(plane: Tensor | None) -> Tensor:
+    """(1, 3) normal of a plane, (0, 3) for none."""
+    return torch.zeros(0, 3, dtype=torch.float64) if plane is None else plane[None]
+
+
+def _plane(rows: Tensor) -> Tensor | None:
+    """The plane of :func:`_rows`; ValueError for what is none."""
+    check_tensor(rows, "reflection_plane", (None, 3))
+    lengths = torch.linalg.vector_norm(rows.double(), dim=1)
+    if rows.dtype != torch.float64 or not torch.allclose(lengths, lengths.new_ones(len(rows))):
+        raise ValueError("reflection_plane: expected a float64 unit vector")
+    return rows[0] if len(rows) else None
 
 
 def colour_arrays(mesh: trimesh.Trimesh) -> dict[str, np.ndarray]:

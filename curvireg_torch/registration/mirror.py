@@ -9,18 +9,16 @@ contours.
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-import trimesh
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..evidence import EvidenceWeights
 from ..fitting.edges import EdgeCrops
 from ..geometry.cameras import transform
 from ..matching import Ranking
-from ..mesh.mesh import MIRROR, cached_in_mesh, mesh_radius, principal_rotation
+from ..mesh.mesh import MIRROR
+from ..mesh.reflections import reflection_plane
 from .candidates import Candidates
 from .confidence import resolution
 from .described import DescribedPhotograph, evidence_of
@@ -29,11 +27,6 @@ from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
 from .work import Work
 
-# Points of a surface that are reflected, and the distance from it, as a fraction of its radius,
-# within which that fraction of them lies if a mesh is its own mirror image
-POINTS = 2000
-SAME_SHAPE = 0.03
-SAME_POINTS = 0.995
 LEAST_CONFIDENCE = 0.5  # from which an answer is compared
 DOUBT = 0.3  # factor of the confidence where the mirror image fits better
 WARNING = (
@@ -93,27 +86,3 @@ def reflected_poses(pose: Poses, plane: Tensor, centre: Tensor, image_centre: Te
     R = reflections @ rotation @ MIRROR.to(T)
     copies = pose[torch.zeros(len(R), dtype=torch.long)]
     return placed(copies, transform(R, position - R @ image_centre.to(T)), image_centre)
-
-
-@cached_in_mesh
-def reflection_plane(mesh: trimesh.Trimesh) -> Tensor | None:
-    """(3,) normal of the plane to which a mesh is most nearly symmetric, of those of the principal
-    axes of its surface and of the mesh file's axes; None if it is symmetric to one of them,
-    and thus its own mirror image.
-
-    Example:
-        >>> reflection_plane(trimesh.creation.box((1, 2, 3))) is None
-        True
-    """
-    centre = np.asarray(mesh.centroid)
-    points = trimesh.sample.sample_surface(mesh, POINTS, seed=0)[0] - centre
-    tree = cKDTree(trimesh.sample.sample_surface(mesh, 20 * POINTS, seed=1)[0] - centre)
-    normals = np.concatenate([principal_rotation(mesh).numpy(), np.eye(3)])
-    means = []
-    for normal in normals:
-        reflected = points - 2.0 * (points @ normal)[:, None] * normal
-        distances, _ = tree.query(reflected)
-        if np.quantile(distances, SAME_POINTS) < SAME_SHAPE * mesh_radius(mesh):
-            return None
-        means.append(distances.mean())
-    return torch.from_numpy(normals[int(np.argmin(means))].copy())

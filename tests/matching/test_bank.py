@@ -17,8 +17,9 @@ from curvireg_torch.geometry import sample_views
 from curvireg_torch.matching import ViewBank, ViewMatcher
 from curvireg_torch.matching import bank as bank_module
 from curvireg_torch.matching.describe import view_mesh
-from curvireg_torch.mesh import mesh_symmetries, symmetry
+from curvireg_torch.mesh import mesh_symmetries, reflections, symmetry
 from curvireg_torch.mesh.mesh import extreme_points
+from curvireg_torch.mesh.reflections import reflection_plane
 from curvireg_torch.pipeline import Pipeline, ViewPolicy
 from curvireg_torch.registration import Registrar
 from curvireg_torch.terms import Correlation
@@ -161,6 +162,9 @@ def with_nan(x):
         ("extreme_points", lambda x: x.float(), "extreme_points: expected float64"),
         ("extreme_points", lambda x: x[:, 1:], "extreme_points: expected shape"),
         ("mesh_symmetries", lambda x: 2 * x, "symmetries: expected"),
+        ("reflection_plane", lambda x: x.new_ones(1, 3), "reflection_plane: .* unit"),
+        ("reflection_plane", lambda x: x.new_ones(1, 3).float(), "reflection_plane: .* float64"),
+        ("reflection_plane", lambda x: x[:, :2], "reflection_plane: expected shape"),
     ],
 )
 def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
@@ -169,6 +173,20 @@ def test_load_refuses_contents_that_no_bank_has(saved, name, change, message):
     rewrite(saved, tensors, checksum=tensor_checksum(tensors))
     with pytest.raises(BankError, match=message):
         ViewBank.load(saved)
+
+
+@pytest.mark.parametrize("is_lopsided", [False, True])
+def test_load_restores_the_plane_of_reflection(is_lopsided, tmp_path, monkeypatch):
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    if is_lopsided:
+        lump = trimesh.creation.box((0.5, 0.6, 0.7)).apply_translation((0.7, 0.6, 0.5))
+        mesh = trimesh.util.concatenate([mesh, lump])
+    build(mesh, sample_views(azimuth_step=180, elevations=[0])).save(path := tmp_path / "bank")
+    plane = reflection_plane(mesh)
+    monkeypatch.setattr(reflections, "cKDTree", None)  # would fail
+    loaded = reflection_plane(ViewBank.load(path).mesh)
+    assert (plane is None) is not is_lopsided
+    assert loaded is None if plane is None else torch.equal(loaded, plane)
 
 
 def test_load_restores_what_is_slow_to_find_about_a_mesh(tmp_path, monkeypatch):

@@ -22,7 +22,6 @@ def bop_summary(*, acc_15_deg: float = 0.5, med_err_deg: float | None = 3.25) ->
         "n": 8,
         **scores,
         "subsets": {"unoccluded": {"n": 4, "acc_30_deg": 1.0}},
-        "seconds": {"register_each": 0.25},
         "limit": None,
         "skipped": {"no box": 2},
         "failed": 1,
@@ -53,8 +52,7 @@ def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Pa
     assert {"date", "commit"} <= stored.keys()
     table = results_table.table(results)
     assert (
-        "| cups | 8 | 50.0 % | 75.0 % | 3.2° | 25.0 % | 40.0 % | 60.0 % | 4 | 100.0 % | 0.2 |"
-        in table
+        "| cups | 8 | 50.0 % | 75.0 % | 3.2° | 25.0 % | 40.0 % | 60.0 % | 4 | 100.0 % |\n" in table
     )
     assert "1 failed, 2 skipped" in table
 
