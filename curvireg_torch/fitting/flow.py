@@ -18,6 +18,7 @@ from .regions import colour_bins
 FLOW_PATCH = 15  # Side of the patches of the optical flow in px
 # Largest distance in px between a corner and where the flow back from its match ends
 MAX_RETURN_ERROR = 1.5
+RETURN_LEVELS = 1  # Levels of the pyramid of that flow, which starts at the corner
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def track_points(
         )
     guess = pixels(keyframe.model, T, frame.K, centre)[0].float().numpy()
     there, found = _optical_flow(keyframe.grey, frame.grey, keyframe.uv, guess, levels)
-    back, returned = _optical_flow(frame.grey, keyframe.grey, there, keyframe.uv, levels)
+    back, returned = _optical_flow(frame.grey, keyframe.grey, there, keyframe.uv, RETURN_LEVELS)
     kept = found & returned & (np.linalg.norm(back - keyframe.uv, axis=1) < MAX_RETURN_ERROR)
     return PointMatches(
         keyframe.model,

@@ -1,6 +1,7 @@
 """Colours of the object and of the background, and where along lines the object's colours end."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,11 +16,16 @@ MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
 LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
 LEARNING_RATE = 0.2  # Weight of a new frame in the histograms
 HALF_RATE_COUNT = 20.0  # Pixels of a sector with which it learns at half of the rate
+# Smooths along one channel; the first and the last level repeat beyond
+LEVEL_KERNEL = 0.6 * torch.eye(COLOUR_LEVELS) + sum(
+    0.2 * torch.ones(COLOUR_LEVELS - 1).diag(side) for side in (-1, 1)
+)
+LEVEL_KERNEL[0, 0] = LEVEL_KERNEL[-1, -1] = 0.8
 
 
 def colour_bins(colours: Tensor) -> Tensor:
-    """(S, S) int64 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
-    red, green, blue = (colours[0] * COLOUR_LEVELS).long().clamp(0, COLOUR_LEVELS - 1)
+    """(S, S) int32 histogram bin of each pixel of (1, 3, S, S) colours in [0, 1]."""
+    red, green, blue = (colours[0] * COLOUR_LEVELS).clamp(0, COLOUR_LEVELS - 1).int()
     bins: Tensor = (red * COLOUR_LEVELS + green) * COLOUR_LEVELS + blue
     return bins
 
@@ -42,6 +48,19 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     return mean, (p * (d - mean[..., None]).square()).sum(dim=-1)
 
 
+class Silhouette(NamedTuple):
+    """Q contour points that have the background beside them: pixels ``uv`` (Q, 2), unit ``normals``
+    (Q, 2) that point there, and ``directions`` (Q,) rad from the object's centre."""
+
+    uv: Tensor
+    normals: Tensor
+    directions: Tensor
+
+    def lines(self, offsets: Tensor) -> Tensor:
+        """Pixels (Q, L, 2) at offsets (L,) px along the normals."""
+        return self.uv[:, None] + offsets[:, None] * self.normals[:, None]
+
+
 class RegionModel:
     """Colour histograms of the object and of the background, a pair for each direction from the
     object's centre. Directions are angles in rad of the image's x, y axes; between the middles of
@@ -50,17 +69,20 @@ class RegionModel:
     def __init__(self) -> None:
         self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
         self._log_ratio = torch.zeros(DIRECTIONS * COLOUR_LEVELS**3)
+        apart = torch.arange(DIRECTIONS)[:, None] * (SECTORS / DIRECTIONS) - torch.arange(SECTORS)
+        apart = (apart + 0.5 * SECTORS) % SECTORS - 0.5 * SECTORS
+        self._sectors = (1.0 - apart.abs()).clamp(min=0.0)  # weights in each direction
 
     def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor) -> None:
         """Move the histograms towards the colours of ``bins`` (S, S) at ``uv`` (P, L, 2) px of
         lines in ``directions`` (P,) rad from the object's centre, ``inside`` (P, L) bool the
         object; empty histograms take all of them."""
         colour, seen = _colours_at(bins, uv)
-        new = torch.zeros_like(self._histograms)
-        low, high, fraction = (x[:, None] for x in _sectors(directions.float()))
-        for sector, weight in ((low, 1.0 - fraction), (high, fraction)):
-            place = ((~inside).long() * SECTORS + sector) * COLOUR_LEVELS**3 + colour
-            new.view(-1).index_add_(0, place.flatten(), (weight * seen).flatten())
+        row = torch.where(inside, 0, DIRECTIONS) + _nearest(directions)[:, None]
+        place = row * COLOUR_LEVELS**3 + colour
+        counts = torch.zeros(2, DIRECTIONS, COLOUR_LEVELS**3)
+        counts.view(-1).index_add_(0, place.flatten(), seen.float().flatten())
+        new = self._sectors.mT @ counts
         count = new.sum(dim=-1, keepdim=True)
         new = new / count.clamp(min=1e-9)
         step = LEARNING_RATE * count / (count + HALF_RATE_COUNT)
@@ -69,15 +91,21 @@ class RegionModel:
         p = _smooth(self._histograms)
         p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
         ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
-        low, high, fraction = _sectors(torch.arange(DIRECTIONS) * (2.0 * math.pi / DIRECTIONS))
-        self._log_ratio = torch.lerp(ratio[low], ratio[high], fraction[:, None]).view(-1)
+        self._log_ratio = (self._sectors @ ratio).view(-1)
+
+    def ends(self, bins: Tensor, silhouette: Silhouette, radius: int) -> tuple[Tensor, Tensor]:
+        """Mean and variance (Q,) of where within ``radius`` px of a silhouette the object's colours
+        end, see :func:`line_posterior`."""
+        lines = silhouette.lines(torch.arange(-radius, radius + 1, dtype=torch.float64))
+        ratio = self.log_ratio(bins, lines, silhouette.directions)
+        return line_posterior(ratio.double(), radius)
 
     def log_ratio(self, bins: Tensor, uv: Tensor, directions: Tensor) -> Tensor:
         """(P, L) log p(colour | object) - log p(colour | background), times ``LOG_RATIO_FACTOR``,
         at (P, L, 2) px of lines in ``directions`` (P,); 0 outside the window."""
         colour, seen = _colours_at(bins, uv)
-        row = (directions * (DIRECTIONS / (2.0 * math.pi))).round().long() % DIRECTIONS
-        return self._log_ratio[COLOUR_LEVELS**3 * row[:, None] + colour] * seen
+        row = _nearest(directions)[:, None]
+        return self._log_ratio[row * COLOUR_LEVELS**3 + colour] * seen
 
 
 def _colours_at(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
@@ -89,16 +117,10 @@ def _colours_at(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 def _smooth(histograms: Tensor) -> Tensor:
     """Histograms (2, SECTORS, bins), smoothed along each colour channel."""
-    rest = torch.full((COLOUR_LEVELS - 1,), 0.2)
-    kernel = torch.eye(COLOUR_LEVELS) * 0.6 + rest.diag(1) + rest.diag(-1)
-    kernel[0, 0] = kernel[-1, -1] = 0.8  # the first and the last level repeat beyond
-    by_blue = histograms.view(-1, COLOUR_LEVELS, COLOUR_LEVELS, COLOUR_LEVELS) @ kernel
-    by_green = kernel @ by_blue
-    return (kernel @ by_green.flatten(2)).view_as(histograms)
+    by_red = LEVEL_KERNEL @ histograms.view(-1, COLOUR_LEVELS, COLOUR_LEVELS**2)
+    return (by_red @ torch.kron(LEVEL_KERNEL, LEVEL_KERNEL)).view_as(histograms)
 
 
-def _sectors(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The two sectors beside each direction, and the weight of the second."""
-    place = (directions / (2.0 * math.pi) % 1.0) * SECTORS
-    low = place.floor()
-    return low.long() % SECTORS, (low.long() + 1) % SECTORS, place - low
+def _nearest(directions: Tensor) -> Tensor:
+    """The nearest of ``DIRECTIONS`` to each of some directions."""
+    return (directions * (DIRECTIONS / (2.0 * math.pi))).round().long() % DIRECTIONS

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +24,7 @@ from ..fitting.least_squares import (
     pose_covariance,
     project,
 )
-from ..fitting.regions import RegionModel, line_posterior
+from ..fitting.regions import RegionModel, Silhouette
 from ..fitting.texture_fit import surface_corners
 from ..geometry.cameras import boxes_around, point_in_cameras, pose_around, projected
 from ..geometry.viewpoint import angles_between
@@ -43,15 +42,15 @@ DEPTH_SIZE = 128
 # Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
 # Search radius in px of edges and of the end of the object's colours, one a round
-SEARCH_RADII = (6.0, 4.0, 2.5)
+SEARCH_RADII = (6.0, 2.5)
 STEPS_PER_ROUND = 2  # Least-squares steps per round
 # Weights, relative to edges, of colours and of points from the last frame and from a keyframe
 REGION_WEIGHT = 2.0
 POINT_WEIGHT = 0.3
 KEYFRAME_WEIGHT = 0.5
 REGION_VARIANCE = 0.5  # Variance in px² added to that of the end of the object's colours
-# Nearest and farthest distance in px from the outline at which colours are learned
-LEARNED_BAND = (2, 24)
+# Distances in px from the outline at which colours are learned
+LEARNED_BAND = range(2, 25, 2)
 # Radius in px of the posterior from which TrackedPose.features are computed
 REGION_FEATURE_RADIUS = 8
 # Keyframes that are kept, and the rotation in degrees from the nearest one at which a frame becomes
@@ -97,19 +96,6 @@ class TrackedPose:
     def confidence(self) -> float:
         """Probability that the pose is within 10 degrees and 10 % of the distance of the truth."""
         return tracking_confidence(self.features)
-
-
-class _Silhouette(NamedTuple):
-    """Q contour points that have the background beside them: pixels ``uv`` (Q, 2), unit ``normals``
-    (Q, 2) that point there, and ``directions`` (Q,) rad from the object's centre."""
-
-    uv: Tensor
-    normals: Tensor
-    directions: Tensor
-
-    def lines(self, offsets: Tensor) -> Tensor:
-        """Pixels (Q, L, 2) at offsets (L,) px along the normals."""
-        return self.uv[:, None] + offsets[:, None] * self.normals[:, None]
 
 
 class Tracker:
@@ -243,47 +229,33 @@ class Tracker:
         problem = frame.problem
         points = state.points
         uv, J = project(points.model, points.normals, state.T, frame.K, self.centre)
-        silhouette = self._silhouette(frame, state, uv)
-        colours = self._colours(frame, silhouette, J[:, points.outline[0]], math.ceil(radius))
+        colours = self._colours(frame, state, J[:, points.outline[0]], math.ceil(radius))
         matches = corners.measurements(state.T, frame.K, self.centre, INLIER_SCALE)
         others = Measurements.cat_within([colours, matches])
         step = problem.selected_step(points, uv, J, radius, [others.equations()])
         fraction = problem.step_fraction(step, state.T)
         return apply_twist(state.T, step * fraction[:, None], self.centre)
 
-    def _colours(
-        self, frame: Frame, silhouette: _Silhouette, J: Tensor, radius: int
-    ) -> Measurements:
+    def _colours(self, frame: Frame, state: ContourState, J: Tensor, radius: int) -> Measurements:
         """Where the object's colours end within ``radius`` px of its silhouette, whose points shift
         along their normals by ``J`` (1, Q, 6)."""
-        mean, variance = self._ends(frame, silhouette, radius)
+        mean, variance = self._regions.ends(frame.bins, self._silhouette(frame, state), radius)
         flat = radius**2 / 3.0  # variance of lines along which colours say nothing
         information = (1.0 / (variance + REGION_VARIANCE) - 1.0 / flat).clamp(min=0.0)
-        weight = REGION_WEIGHT * information
-        return Measurements(J, mean[None, :, None], weight[None, :, None])
+        return Measurements(J, mean[None, :, None], REGION_WEIGHT * information[None, :, None])
 
-    def _silhouette(
-        self, frame: Frame, state: ContourState, uv: Tensor | None = None
-    ) -> _Silhouette:
-        """The contour points, at ``uv`` (1, P, 2) px, that have the background beside them."""
-        points = state.points
-        if uv is None:
-            uv = pixels(points.model, state.T, frame.K, self.centre)
-        here = uv[0, points.outline[0]]
+    def _silhouette(self, frame: Frame, state: ContourState) -> Silhouette:
+        """The contour points that have the background beside them."""
+        outline = state.points.outline[0]
+        uv = pixels(state.points.model, state.T, frame.K, self.centre)[0, outline]
         middle = frame.K[0] @ point_in_cameras(state.T, self.centre)[0]
-        x, y = (here - middle[:2] / middle[2]).unbind(-1)
-        return _Silhouette(here, points.normals[0, points.outline[0]], torch.atan2(y, x))
-
-    def _ends(self, frame: Frame, silhouette: _Silhouette, radius: int) -> tuple[Tensor, Tensor]:
-        """Mean and variance (Q,) of where the object's colours end along the normals of its
-        silhouette."""
-        lines = silhouette.lines(torch.arange(-radius, radius + 1, dtype=torch.float64))
-        ratio = self._regions.log_ratio(frame.bins, lines, silhouette.directions)
-        return line_posterior(ratio.double(), radius)
+        x, y = (uv - middle[:2] / middle[2]).unbind(-1)
+        return Silhouette(uv, state.points.normals[0, outline], torch.atan2(y, x))
 
     def _tracked(self, frame: Frame, state: ContourState, flows: list[PointMatches]) -> TrackedPose:
         """A pose with its ``flows`` from the last frame and, if that is another one, a keyframe."""
-        mean, variance = self._ends(frame, self._silhouette(frame, state), REGION_FEATURE_RADIUS)
+        silhouette = self._silhouette(frame, state)
+        mean, variance = self._regions.ends(frame.bins, silhouette, REGION_FEATURE_RADIUS)
         clear = torch.exp(-0.125 * mean.square()) * (
             1.0 - 3.0 * variance / REGION_FEATURE_RADIUS**2
         ).clamp(min=0.0)
@@ -299,7 +271,7 @@ class Tracker:
     def _learn(self, frame: Frame, state: ContourState, depth: Tensor) -> None:
         """Learn the colours beside the outline; where the mesh hides the background again, they are
         the object's."""
-        distance = torch.arange(LEARNED_BAND[0], LEARNED_BAND[1] + 1, dtype=torch.float64)
+        distance = torch.tensor(LEARNED_BAND, dtype=torch.float64)
         silhouette = self._silhouette(frame, state)
         lines = silhouette.lines(torch.cat([-distance, distance]))
         x, y = lines.round().long().clamp(0, CROP_SIZE - 1).unbind(-1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from curvireg_torch.fitting.edges import CROP_SIZE
-from curvireg_torch.fitting.regions import RegionModel
+from curvireg_torch.fitting.regions import RegionModel, Silhouette
 from curvireg_torch.registration import tracker
 from curvireg_torch.registration.tracker import Tracker, boxes_at
 from tests.fitting.cube import pose
@@ -141,10 +141,12 @@ def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(mo
 def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
     ends = torch.tensor(mean).double(), torch.tensor(variance).double()
     follow: Any = SimpleNamespace(
-        _ends=lambda *_: ends, _silhouette=lambda *_: None, centre=torch.zeros(3)
+        _regions=SimpleNamespace(ends=lambda *_: ends),
+        _silhouette=lambda *_: None,
+        centre=torch.zeros(3),
     )
     problem = SimpleNamespace(edge_support=lambda _: torch.tensor(0.4))
-    frame: Any = SimpleNamespace(problem=problem, K=K)
+    frame: Any = SimpleNamespace(problem=problem, K=K, bins=None)
     state: Any = State(at())
     given: Any = flows
     return dict(Tracker._tracked(follow, frame, state, given).features)
@@ -238,7 +240,7 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     depth[..., 128:] = 5.0
     learned: list[Tensor] = []
 
-    outline = tracker._Silhouette(
+    outline = Silhouette(
         torch.tensor([[128.0, 90.0]]).expand(3, 2),
         torch.tensor([[-1.0, 0.0]]).expand(3, 2),
         torch.zeros(3),
@@ -254,13 +256,13 @@ def test_colours_are_learned_on_both_sides_of_the_outline():
     state: Any = None
     Tracker._learn(follow, frame, state, depth)
     x, inside = learned
-    first, last = tracker.LEARNED_BAND
-    count = last - first + 1
+    band = tracker.LEARNED_BAND
+    count = len(band)
     assert len(x) == 3 * 2 * count
     assert int(inside.sum()) == 3 * count
     assert bool((inside == (x > 128)).all())
-    assert float((x - 128.0).abs().min()) == first
-    assert float((x - 128.0).abs().max()) == last
+    assert float((x - 128.0).abs().min()) == min(band)
+    assert float((x - 128.0).abs().max()) == max(band)
 
 
 def test_lines_along_which_colours_say_nothing_do_not_count():
@@ -270,9 +272,12 @@ def test_lines_along_which_colours_say_nothing_do_not_count():
     mean = torch.tensor([1.0, 2.0, -1.0]).double()
     variance = torch.tensor([0.0, flat, 2.0 * flat]).double()
     J = torch.ones(1, 3, 6).double()
-    follow: Any = SimpleNamespace(_ends=lambda *_: (mean, variance))
+    follow: Any = SimpleNamespace(
+        _regions=SimpleNamespace(ends=lambda *_: (mean, variance)), _silhouette=lambda *_: None
+    )
+    frame: Any = SimpleNamespace(bins=None)
     nothing: Any = None
-    colours = Tracker._colours(follow, nothing, nothing, J, radius)
+    colours = Tracker._colours(follow, frame, nothing, J, radius)
     information = 1.0 / tracker.REGION_VARIANCE - 3.0 / radius**2
     expected = [tracker.REGION_WEIGHT * information, 0.0, 0.0]
     assert colours.weight.flatten().tolist() == pytest.approx(expected)
