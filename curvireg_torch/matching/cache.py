@@ -107,7 +107,8 @@ def cached_bank(
         folder: default :func:`cache_folder`.
 
     Example:
-        >>>         >>> folder = Path(tempfile.mkdtemp())
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
         >>> bank = cached_bank(trimesh.creation.box(), Pipeline().views.sphere()[:2],
         ...     folder=folder, progress=False)
         >>> len(list_cache(folder)), clear_cache(folder)

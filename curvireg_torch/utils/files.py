@@ -129,7 +129,7 @@ def cache_folder() -> Path:
     """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else
     ``~/.cache/curvireg_torch``. Of banks, only files named ``bank-<32 digits>.safetensors`` or
     ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder ``banks`` are ever
-    listed, overwritten or removed; its folder ``weights`` holds one file of 4 MB.
+    listed, overwritten or removed; its folder ``weights`` holds one file of 3 MB.
 
     Example:
         >>> cache_folder().is_absolute()
