@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import tempfile
 import time
 import warnings
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from ..geometry.viewpoint import ViewSphere
 from ..mesh.mesh import as_mesh, mesh_up, mesh_warnings
 from ..pipeline import Pipeline
 from ..rendering import DepthRenderer
-from ..utils.files import tensor_digest, text_digest
+from ..utils.files import cache_folder, tensor_digest, text_digest
 from ..utils.likes import MeshLike
 from ..utils.sources import import_digest
 from .bank import FORMAT_VERSION, ViewBank, colour_arrays, views_of
@@ -47,26 +46,6 @@ class CachedBank(NamedTuple):
     path: Path
     size: int
     used: float
-
-
-def cache_folder() -> Path:
-    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else
-    ``~/.cache/curvireg_torch``. Only files named ``bank-<32 digits>.safetensors`` or
-    ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder ``banks`` are ever
-    listed, overwritten or removed.
-
-    Example:
-        >>> cache_folder().is_absolute()
-        True
-    """
-    if folder := os.environ.get("CURVIREG_CACHE"):
-        return Path(folder)
-    if folder := os.environ.get("XDG_CACHE_HOME"):
-        return Path(folder) / "curvireg_torch"
-    try:
-        return Path.home() / ".cache" / "curvireg_torch"
-    except RuntimeError:  # a user without a home
-        return Path(tempfile.gettempdir()) / "curvireg_torch"
 
 
 def bank_key(

@@ -11,6 +11,7 @@ import os
 import secrets
 import signal
 import sys
+import tempfile
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -122,6 +123,26 @@ def check_writable(folder: Path) -> None:
         raise OutputError(
             f"cannot be written to ({reason}); choose another folder", subject=folder, kind="out"
         ) from error
+
+
+def cache_folder() -> Path:
+    """``$CURVIREG_CACHE``, else ``$XDG_CACHE_HOME/curvireg_torch``, else
+    ``~/.cache/curvireg_torch``. Of banks, only files named ``bank-<32 digits>.safetensors`` or
+    ``views-<32 digits>.safetensors`` (features of a bank's views) in its folder ``banks`` are ever
+    listed, overwritten or removed; its folder ``weights`` holds one file of 3 MB.
+
+    Example:
+        >>> cache_folder().is_absolute()
+        True
+    """
+    if folder := os.environ.get("CURVIREG_CACHE"):
+        return Path(folder)
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder) / "curvireg_torch"
+    try:
+        return Path.home() / ".cache" / "curvireg_torch"
+    except RuntimeError:  # a user without a home
+        return Path(tempfile.gettempdir()) / "curvireg_torch"
 
 
 def write_tensors(

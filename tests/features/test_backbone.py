@@ -32,6 +32,8 @@ COARSE = [
     -5.292,
 ]
 
+WEIGHTS = backbone._weights_path()
+
 
 class TestBackbone(LayerContract):
     network = Backbone()
@@ -82,6 +84,53 @@ def test_backbone_rejects_a_missing_package_and_a_missing_or_damaged_file(monkey
     (tmp_path / "models" / path.name).write_bytes(content)
     with pytest.raises(InvalidInputError, match="damaged"):
         Backbone()
+
+
+@pytest.fixture
+def kept(monkeypatch, tmp_path):
+    """The file that keeps the weights in an empty cache."""
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path))
+    backbone._read_weights.cache_clear()
+    yield tmp_path / "weights" / f"{backbone.SHA256[:32]}.safetensors"
+    backbone._read_weights.cache_clear()
+
+
+def test_weights_are_kept_in_the_cache(network, kept, monkeypatch):
+    Backbone()
+    backbone._read_weights.cache_clear()
+    monkeypatch.setattr(torch, "load", None)  # would fail
+    again = Backbone()
+    assert again.state_dict().keys() == network.state_dict().keys()
+    for name, weight in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], weight)
+    for mine, other in zip(again.spreads, network.spreads, strict=True):
+        assert torch.equal(mine, other)
+    assert kept.stat().st_size < 6e6
+
+
+@pytest.mark.parametrize("harm", ["a bit", "cut", "another package"])
+def test_kept_weights_that_are_damaged_or_of_another_file_are_written_again(
+    harm, kept, monkeypatch
+):
+    Backbone()
+    content = kept.read_bytes()
+    if harm == "another package":
+        before = kept.stat().st_ino
+        monkeypatch.setattr(backbone, "_weights_path", lambda: package)
+        package = kept.parent / "package.pth"
+        package.write_bytes(WEIGHTS.read_bytes())
+    else:
+        kept.write_bytes(content[:-1] + (b"" if harm == "cut" else bytes([content[-1] ^ 1])))
+        before = kept.stat().st_ino
+    backbone._read_weights.cache_clear()
+    Backbone()
+    assert kept.stat().st_ino != before
+    assert (kept.read_bytes() == content) is (harm != "another package")
+
+
+def test_weights_are_read_where_the_cache_cannot_be_written(kept):
+    kept.parent.write_text("a file where a folder is wanted")
+    Backbone()
 
 
 def test_similarity_is_the_mean_cosine_of_the_cells(network):
