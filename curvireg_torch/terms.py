@@ -394,7 +394,7 @@ class Correlation(Term):
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
             queries = described(query.descriptors.flatten(0, 1)).to(known.dtype)
-            products = (queries @ known.T) / lengths
+            products: Tensor = (queries @ known.T) / lengths
             return products.float().view(B, K, len(known)).amax(dim=1)
 
         return compare
