@@ -42,7 +42,7 @@ DEPTH_SIZE = 128
 # Message of a LostObjectError
 OUTSIDE = "at the start the mesh lies outside the photograph; check pose, unit and camera matrix"
 # Search radius in px of edges and of the end of the object's colours, one a round
-SEARCH_RADII = (6.0, 2.5)
+SEARCH_RADII = (6.0, 4.0, 2.5)
 STEPS_PER_ROUND = 2  # Least-squares steps per round
 # Weights, relative to edges, of colours and of points from the last frame and from a keyframe
 REGION_WEIGHT = 2.0
@@ -214,10 +214,15 @@ class Tracker:
             [flow.scaled(weight) for flow, weight in zip(flows, weights, strict=False)]
         )
         state = frame.problem.state(T)
+        is_near = False  # the contours were hardly moved by the round before
         for radius in SEARCH_RADII:
+            if is_near and radius > SEARCH_RADII[-1]:
+                continue
             for _ in range(STEPS_PER_ROUND):
                 state = replace(state, T=self._step(frame, state, corners, radius))
-            state = frame.problem.with_current_contours(state)
+            current = frame.problem.with_current_contours(state)
+            is_near = current is state
+            state = current
         state = replace(state, T=nearest_rigid(state.T))
         return self._tracked(frame, state, flows)
 

@@ -90,6 +90,28 @@ def test_inlier_ratio_counts_all_points():
     assert ratio == pytest.approx((5 + 0.25) / 10, abs=1e-4)
 
 
+def test_matches_are_measured_along_x_and_y_of_the_image():
+    """Of three points, one 0.5 px too far to the right in the image, and one 1 px too low."""
+    T = pose([0.1, 0.2, 0.0], [0.0, 0.0, 6.0])[None]
+    points = torch.rand(1, 3, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    uv = ls.pixels(points, T, K[None], ZERO)
+    uv[0, 0, 0] += 0.5
+    uv[0, 2, 1] += 1.0
+    weight = torch.tensor([[1.0, 0.5, 1.0]]).double()
+    matches = ls.PointMatches(points, uv, weight)
+    found = matches.measurements(T, K[None], ZERO, 2.0)
+    expected = torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 1.0]).double()
+    torch.testing.assert_close(found.distance.flatten(), expected)
+    robust = torch.tensor([(1 + 1 / 16) ** -2, 0.5, (1 + 1 / 4) ** -2]).double()
+    torch.testing.assert_close(found.weight.flatten(), robust.repeat_interleave(2))
+    scaled = matches.scaled(0.3).measurements(T, K[None], ZERO, 2.0)
+    torch.testing.assert_close(scaled.weight, 0.3 * found.weight)
+    for row, axis in ((2, (1.0, 0.0)), (3, (0.0, 1.0))):
+        normal = torch.tensor(axis).double().expand(1, 1, 2)
+        _, J = ls.project(points[:, 1:2], normal, T, K[None], ZERO)
+        torch.testing.assert_close(found.J[:, row], J[:, 0])
+
+
 def test_nearest_rigid_pose_is_orthogonal():
     T = pose([0.3, -0.2, 0.5], [1.0, 2.0, 3.0])[None]
     drifted = T.clone()

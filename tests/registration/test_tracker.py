@@ -2,6 +2,7 @@
 generated sequences."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,9 +14,10 @@ import trimesh
 from curvireg_torch import camera_matrix
 from curvireg_torch.errors import ImageError, LostObjectError
 from curvireg_torch.fitting import regions
+from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import CROP_SIZE
 from curvireg_torch.fitting.flow import Frame, Keyframe, track_points
-from curvireg_torch.fitting.least_squares import fit_points, pixels
+from curvireg_torch.fitting.least_squares import INLIER_SCALE, PointMatches, fit_points, pixels
 from curvireg_torch.fitting.regions import (
     HALF_RATE_COUNT,
     SECTORS,
@@ -110,6 +112,14 @@ def test_flow_finds_the_corners_of_a_moved_plate_and_their_pose():
     assert flow.inlier_ratio(T, WINDOW_K, ZERO) < 0.05  # 14 px beside
 
 
+def test_flow_back_starts_at_the_corner():
+    """After a motion of 60 px that is predicted, it finds it without a high pyramid."""
+    window, T, depth = plate(-0.3)
+    other, truth, _ = plate(0.45)
+    flow = track_points(keyframe_of(window, T, depth), other, truth, ZERO, levels=1)
+    assert float((flow.weight[0] > 0).double().mean()) > 0.8
+
+
 def test_flow_that_does_not_lead_back_is_left_out_and_a_uniform_surface_has_none():
     """The right half of the plate is covered by another print."""
     window, T, depth = plate()
@@ -135,6 +145,48 @@ def test_each_measurement_alone_moves_the_outline_onto_a_plain_cube(monkeypatch,
     follow.start(drawn(START), K, START)
     assert shift_in_pixels(START, truth) > 3.0
     assert shift_in_pixels(follow.track(drawn(truth), K).state.T[0], truth) < 0.5
+
+
+def test_a_step_follows_edges_the_end_of_the_colours_and_corners(monkeypatch):
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    found = follow.measure(drawn(START), K, moved(START, [0.0, 0.0, 0.01], [0.01, 0.0, 0.0]))
+    state = found.state
+    used: list[Any] = []
+
+    def selected_step(_problem, _points, _uv, J, _radius, equations):
+        used.extend([J, *equations])
+        return torch.zeros(1, 6).double()
+
+    monkeypatch.setattr(ContourProblem, "selected_step", selected_step)
+    model = torch.rand(1, 9, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    uv = pixels(model, START[None], found.frame.K, follow.centre)
+    corners = PointMatches(model, uv, torch.ones(1, 9).double())
+    T = follow._step(found.frame, state, corners, 4.0)
+    assert torch.allclose(T, state.T, atol=1e-12)
+    J, equations = used
+    colours = follow._colours(found.frame, state, J[:, state.points.outline[0]], 4)
+    matches = corners.measurements(state.T, found.frame.K, follow.centre, INLIER_SCALE)
+    for together, one, other in zip(
+        equations, colours.equations(), matches.equations(), strict=True
+    ):
+        assert torch.allclose(together, one + other)
+        assert bool((one != 0).any() and (other != 0).any())
+
+
+def test_directions_lead_from_the_centre_of_the_object():
+    """Which is not that of the crop: the camera's principal point is 20 px to the left."""
+    follow = make_tracker(cube())
+    follow.start(drawn(START), K, START)
+    found = follow.measure(drawn(START), K, START)
+    shifted = found.frame.K.clone()
+    shifted[0, 0, 2] += 20.0
+    silhouette = follow._silhouette(replace(found.frame, K=shifted), found.state)
+    middle = pixels(follow.centre[None, None], START[None], shifted, follow.centre)[0]
+    away = torch.stack([silhouette.directions.cos(), silhouette.directions.sin()], dim=1)
+    arms = silhouette.uv - middle
+    assert torch.allclose(away * arms.norm(dim=1, keepdim=True), arms)
+    assert float((silhouette.normals * arms).sum(dim=1).min()) > 0.0
 
 
 def test_prediction_goes_on_at_constant_velocity():
@@ -263,11 +315,18 @@ def test_log_ratio_changes_evenly_between_the_middles_of_two_sectors():
     model.learn(bins, uv, right, uv[..., 0] < 8)
     model.learn(bins, uv, right + sector, uv[..., 0] >= 8)
     first, between, second = (
-        float(model.log_ratio(bins, uv, right + part * sector)[0, 0]) for part in (0.0, 0.5, 1.0)
+        float(model.log_ratio(bins, uv, right + part * sector)[0, 0]) for part in (0.0, 1 / 3, 1.0)
     )
     assert first > 0.3 > -0.3 > second
-    assert between == pytest.approx(0.5 * (first + second), abs=1e-6)
+    assert between == pytest.approx((2.0 * first + second) / 3.0, abs=1e-6)
     assert float(model.log_ratio(bins, uv, right - 2.0 * math.pi)[0, 0]) == first
+
+
+def test_what_lies_outside_the_window_is_not_learned():
+    bins, uv = halves()
+    model = RegionModel()
+    model.learn(bins, uv - 100.0, torch.zeros(8), uv[..., 0] < 8)
+    assert float(model._histograms.sum()) == 0.0
 
 
 def test_histograms_are_smoothed_along_each_channel():

@@ -72,29 +72,47 @@ class State:
     points: Any = None
 
 
+@dataclass
 class Problem:
+    """One whose contours are always, or never, found again."""
+
+    stale: bool
+
     def state(self, T: Tensor) -> State:
         return State(T)
 
     def with_current_contours(self, state: State) -> State:
-        return state
+        return State(state.T) if self.stale else state
 
 
 def fitted(
-    monkeypatch: pytest.MonkeyPatch, keyframes: list[Any], last: Any, shift: float = 100.0
+    monkeypatch: pytest.MonkeyPatch,
+    keyframes: list[Any],
+    last: Any,
+    shift: float = 100.0,
+    *,
+    stale: bool = False,
+    searched: list[float] | None = None,
 ) -> list[Any]:
     """The weighted flows that a fit uses, of the keyframe that is nearest: the second. In the first
-    crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px."""
+    crop, with a focal length of 1 px, the flow moves the object by a ``shift`` in px. Steps leave a
+    pose that is not quite rigid; their radii in px are ``searched``."""
     cameras = [torch.tensor([zoom, zoom, 1.0]).double().diag()[None] for zoom in (1.0, 2.0)]
-    frames = [SimpleNamespace(K=camera, problem=Problem()) for camera in cameras]
+    frames = [SimpleNamespace(K=camera, problem=Problem(stale)) for camera in cameras]
     used: list[Any] = []
 
     def track(keyframe: Any, frame: Any, *_: Any, levels: int) -> Flow:
         return Flow(frame.K, f"{keyframe.name} {levels}")
 
-    def step(_: Any, state: State, corners: list[Flow], __: float) -> Tensor:
+    def step(_: Any, state: State, corners: list[Flow], radius: float) -> Tensor:
         used[:] = [(flow.weight, flow.start, float(flow.K[0, 0, 0])) for flow in corners]
-        return state.T
+        if searched is not None:
+            searched.append(radius)
+        return state.T * torch.tensor([1.01, 1.01, 1.01, 1.0])
+
+    def tracked(frame: Any, state: State, flows: list[Flow]) -> tuple[float, int]:
+        assert torch.allclose(state.T[:, :3, :3], torch.eye(3).double())
+        return float(frame.K[0, 0, 0]), len(flows)
 
     monkeypatch.setattr(tracker, "track_points", track)
     monkeypatch.setattr(tracker, "fit_points", lambda *_: at(x=5.0 * shift))
@@ -106,7 +124,7 @@ def fitted(
         _frame=lambda *_: frames.pop(0),
         _angles=lambda _: angles[: len(keyframes)],
         _step=step,
-        _tracked=lambda frame, _, flows: (float(frame.K[0, 0, 0]), len(flows)),
+        _tracked=tracked,
         centre=torch.zeros(3).double(),
         hull=HULL * torch.tensor([1.0, 1.0, 0.0]),
     )
@@ -133,9 +151,19 @@ def test_a_fit_uses_the_flow_from_the_last_frame_and_from_the_nearest_keyframe(m
 
 def test_the_crop_of_the_predicted_pose_serves_where_the_flow_moves_it_little(monkeypatch):
     limit = tracker.WINDOW_SHIFT
-    for shift, camera in ((0.99 * limit, 1.0), (-0.99 * limit, 1.0), (1.01 * limit, 2.0)):
-        used = fitted(monkeypatch, [named("a"), named("b")], named("last"), shift)
-        assert [flow[2] for flow in used] == [camera, camera], shift
+    for sign in (-1.0, 1.0):
+        for shift, camera in ((0.99 * limit, 1.0), (1.01 * limit, 2.0)):
+            used = fitted(monkeypatch, [named("a"), named("b")], named("last"), sign * shift)
+            assert [flow[2] for flow in used] == [camera, camera], sign * shift
+
+
+@pytest.mark.parametrize("stale", [False, True])
+def test_a_round_is_left_out_after_one_that_hardly_moved_the_contours(monkeypatch, stale):
+    first, *between, last = tracker.SEARCH_RADII
+    assert first > last
+    radii = [first, *between, last] if stale else [first, last]
+    fitted(monkeypatch, [named("a")], named("last"), stale=stale, searched=(searched := []))
+    assert searched == [radius for radius in radii for _ in range(tracker.STEPS_PER_ROUND)]
 
 
 def features(mean: list[float], variance: list[float], flows: list[Flow]) -> dict[str, float]:
