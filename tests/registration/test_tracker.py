@@ -313,11 +313,13 @@ def test_log_ratio_changes_evenly_between_the_middles_of_two_sectors():
     right = torch.zeros(8)
     sector = 2.0 * math.pi / SECTORS
     model.learn(bins, uv, right, uv[..., 0] < 8)
-    first, between, second = (
-        float(model.log_ratio(bins, uv, right + part * sector)[0, 0]) for part in (0.0, 1 / 3, 1.0)
+    before, first, between, second = (
+        float(model.log_ratio(bins, uv, right + part * sector)[0, 0])
+        for part in (-1 / 3, 0.0, 1 / 3, 1.0)
     )
     assert first > second + 0.1 > 0.2
     assert between == pytest.approx((2.0 * first + second) / 3.0, abs=1e-6)
+    assert before == pytest.approx(between, abs=1e-6)
     assert float(model.log_ratio(bins, uv, right - 2.0 * math.pi)[0, 0]) == first
 
 
