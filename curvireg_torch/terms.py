@@ -42,6 +42,7 @@ __all__ = [
 BORDER_DISTANCE = 0.01
 # whose points are counted, and in which they are compared
 VIEWS_AT_A_TIME = 64
+LEAST_LENGTH = 1e-12  # of a descriptor that is divided by its length
 CELLS_AT_A_TIME = 64
 # Shifts in x and y in units of the box jitter, and the exponent of the scale
 _JITTER = (
@@ -378,16 +379,23 @@ class Correlation(Term):
             return F.normalize(descriptors if whitening is None else whitening(descriptors), dim=1)
 
         described = views.precision if self.whitening == "paper" else normalized
-        known = (
-            views.descriptors - views.precision.mean
+        known = views.descriptors
+        if self.whitening == "paper":
+            known = known - views.precision.mean
+        elif whitening is not None:
+            known = whitening(known)
+        # A normalised copy takes as much memory as all descriptors.
+        lengths = (
+            known.new_ones(len(known))
             if self.whitening == "paper"
-            else normalized(views.descriptors)
+            else torch.linalg.vector_norm(known, dim=1).clamp(min=LEAST_LENGTH)
         )
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.descriptors.shape[:2]
             queries = described(query.descriptors.flatten(0, 1)).to(known.dtype)
-            return (queries @ known.T).float().view(B, K, len(known)).amax(dim=1)
+            products: Tensor = (queries @ known.T) / lengths
+            return products.float().view(B, K, len(known)).amax(dim=1)
 
         return compare
 
@@ -430,23 +438,20 @@ class Repeatability(Term):
         # Cells of at most eps px keep the matrix product small.
         cell = max(1, min(int(self.eps * S), S // 64))
 
-        def count(start: int) -> Tensor:
-            points = dilate_points(
-                views.points_at(slice(start, start + VIEWS_AT_A_TIME)), self.eps * S
-            )
-            return cell_counts(points, cell).flatten(1)
-
         # Pixels of each cell within eps of a view's points, (cells, N), and all of its pixels, (1,
         # cells)
-        near = torch.cat(
-            map_on_threads(
-                count, range(0, len(views), VIEWS_AT_A_TIME), device=views.descriptors.device
-            )
-        )
-        near = near.T.contiguous()
-        area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=near.device), cell).flatten(
-            1
-        )
+        cells = (-(-S // cell)) ** 2
+        device = views.descriptors.device
+        near = torch.empty(cells, len(views), dtype=count_dtype(cell), device=device)
+
+        def count(start: int) -> None:
+            some = slice(start, start + VIEWS_AT_A_TIME)
+            points = dilate_points(views.points_at(some), self.eps * S)
+            counted = cell_counts(points, cell).flatten(1)
+            near[:, some] = counted.T.contiguous()  # it is transposed faster by itself
+
+        map_on_threads(count, range(0, len(views), VIEWS_AT_A_TIME), device=device)
+        area = cell_counts(torch.ones(1, S, S, dtype=torch.bool, device=device), cell).flatten(1)
 
         def compare(query: QueryFeatures) -> Tensor:
             B, K = query.points.shape[:2]
@@ -488,12 +493,16 @@ def dilate_points(points: Tensor, eps: float) -> Tensor:
     return torch.from_numpy(dilated[:, :-radius].view(bool)).to(points.device)
 
 
+def count_dtype(cell: int) -> torch.dtype:
+    """The integers of :func:`cell_counts`: of 8 bits if that suffices for a cell, else of 16."""
+    return torch.uint8 if cell**2 < 256 else torch.int16
+
+
 def cell_counts(points: Tensor, cell: int) -> Tensor:
     """(N, C, C) number of set pixels of (N, S, S) bool in cells of ``cell`` px, the last of which
-    may be cut. The integers have 8 bits if that suffices for a cell, else 16."""
+    may be cut."""
     over = -points.shape[-1] % cell
-    count = F.pad(points.view(torch.uint8), (0, over, 0, over))
-    count = count if cell**2 < 256 else count.short()
+    count = F.pad(points.view(torch.uint8), (0, over, 0, over)).to(count_dtype(cell))
     for dim in (1, 2):  # rows first: they are contiguous
         count = functools.reduce(torch.add, count.unfold(dim, cell, cell).unbind(dim=3))
     return count
