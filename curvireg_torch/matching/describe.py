@@ -268,4 +268,4 @@ def quarter_turns(rotations: Tensor, distances: Tensor) -> tuple[Tensor, Tensor]
     close = (apart < EQUAL_VIEWS) & ((z[:, None] - z).abs() <= EQUAL_VIEWS * z)
     grouped = close.any(dim=0)
     first = (grouped * torch.arange(len(x), 0, -1)[:, None]).argmax(dim=0)
-    return first, close.int().argmax(dim=0).gather(0, first[None])[0]
+    return first, close[:, first, torch.arange(len(x))].int().argmax(dim=0)

@@ -195,6 +195,8 @@ def measured(
 ) -> dict[str, float]:
     """Seconds, processor seconds and MB of a step in a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "CURVIREG_CACHE": str(cache)}
+    # modules are compiled in the first round alone, as after an installation
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     if step not in ("cold", "warm"):
         words = [
             "-c",

@@ -307,18 +307,19 @@ def test_histograms_move_by_the_rate_towards_new_colours():
 
 
 def test_log_ratio_changes_evenly_between_the_middles_of_two_sectors():
-    """Red and green are learned to the right, and swapped in the next sector."""
+    """Red and green are learned to the right: in the next sector, only their mean is known."""
     bins, uv = halves()
     model = RegionModel()
     right = torch.zeros(8)
     sector = 2.0 * math.pi / SECTORS
     model.learn(bins, uv, right, uv[..., 0] < 8)
-    model.learn(bins, uv, right + sector, uv[..., 0] >= 8)
-    first, between, second = (
-        float(model.log_ratio(bins, uv, right + part * sector)[0, 0]) for part in (0.0, 1 / 3, 1.0)
+    before, first, between, second = (
+        float(model.log_ratio(bins, uv, right + part * sector)[0, 0])
+        for part in (-1 / 3, 0.0, 1 / 3, 1.0)
     )
-    assert first > 0.3 > -0.3 > second
+    assert first > second + 0.1 > 0.2
     assert between == pytest.approx((2.0 * first + second) / 3.0, abs=1e-6)
+    assert before == pytest.approx(between, abs=1e-5)
     assert float(model.log_ratio(bins, uv, right - 2.0 * math.pi)[0, 0]) == first
 
 

@@ -82,7 +82,7 @@ class Problem:
         return State(T)
 
     def with_current_contours(self, state: State) -> State:
-        return State(state.T) if self.stale else state
+        return State(state.T, points="again") if self.stale else state
 
 
 def fitted(
@@ -112,6 +112,7 @@ def fitted(
 
     def tracked(frame: Any, state: State, flows: list[Flow]) -> tuple[float, int]:
         assert torch.allclose(state.T[:, :3, :3], torch.eye(3).double())
+        assert state.points == ("again" if stale else None)
         return float(frame.K[0, 0, 0]), len(flows)
 
     monkeypatch.setattr(tracker, "track_points", track)
