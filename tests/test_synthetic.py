@@ -54,5 +54,5 @@ def test_demo_scenes_are_registered():
     for seed in range(5):
         scene = demo_scene(seed)
         result = registrar([scene.image], scene.box[None], scene.camera_matrix)[0]
-        assert float(rotation_error(result.rotation, scene.truth[:3, :3])) < 2, seed
+        assert float(rotation_error(result.rotation, scene.truth[:3, :3])) < 2.5, seed
         assert result.reliable, seed

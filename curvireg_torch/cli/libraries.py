@@ -7,7 +7,7 @@ import sys
 
 def load_libraries() -> None:
     """Import torch and trimesh without a search for cycles among the 400,000 objects that they make
-    and that stay: that takes 0.4 s."""
+    and that stay: that takes 0.5 s."""
     if "torch" in sys.modules:
         return
     # matrices of ours are small: a second thread takes more time to wait than it saves

@@ -23,7 +23,7 @@ LAYERS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(LAYERS))
 def test_layers_in_onnx_runtime(name: str, tmp_path: Path) -> None:
-    layer = LAYERS[name]
+    layer = LAYERS[name].eval()
     generator = torch.Generator().manual_seed(0)
     any_batch = {0: torch.export.Dim("batch", min=1, max=64)}
     example = torch.rand(2, 1, 64, 64, generator=generator)
