@@ -90,7 +90,7 @@ def _hog(
 
         turns = [mean_votes(position)]
         if with_quarter_turn:
-            across = torch.remainder(position + 0.5 * bins, bins)
+            across = _within(bins, position + 0.5 * bins)
             turns.append(mean_votes(across).rot90(-1, (2, 3)))
         if bin_weights is not None:
             factors = bin_weights.to(length.dtype).view(1, -1, 1, 1)
@@ -118,7 +118,12 @@ def _orientations(field: Tensor, bins: int) -> tuple[Tensor, Tensor]:
     # atan2 has no derivative at the origin: use (1, 0) there, by arithmetic, since torch.where
     # takes ten times as long.
     angle = torch.atan2(y, x + (length == 0).to(x.dtype))
-    return length, torch.remainder(angle * (bins / math.pi), bins)
+    return length, _within(bins, angle * (bins / math.pi))
+
+
+def _within(bins: int, position: Tensor) -> Tensor:
+    """``torch.remainder`` of positions that are at most ``bins`` outside, in half of its time."""
+    return position - bins * (position / bins).floor()
 
 
 def _votes(length: Tensor, position: Tensor, bins: int) -> Tensor:
