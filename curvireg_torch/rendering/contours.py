@@ -13,6 +13,7 @@ from ..mesh.edges import MeshEdges
 from ..mesh.mesh import mesh_centre, mesh_radius
 from ..utils.rows import Rows
 from .embree import RasterRenderer, RayScene, float32
+from .renderer import DepthRenderer
 
 MAX_OCCLUDING = 256  # Points per pose on occluding contours
 MAX_CREASES = 128  # Points per pose on creases
@@ -278,7 +279,7 @@ class MeshContours:
         limit = next((limit for limit, _ in LEVELS if size <= limit), LEVELS[-1][0])
         return limit, self._levels[limit]
 
-    def renderer(self, size: int) -> RasterRenderer:
+    def renderer(self, size: int) -> DepthRenderer:
         """Draws the mesh, simplified for crops of ``size`` px."""
         return RasterRenderer(self.level_of(size)[1].mesh())
 
