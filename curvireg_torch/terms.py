@@ -347,7 +347,7 @@ class Precision(nn.Module):
 
 @dataclass(frozen=True)
 class Correlation(Term):
-    r"""S_hog: how well descriptors D agree, the best over the jittered crops.
+    r"""S_hog: how well descriptors D agree, the best over the jittered fields.
 
     With the mean :math:`\mu` and the covariance :math:`\Sigma` of the bank's views, which is shrunk
     (Ledoit-Wolf) where a bank has fewer views than a descriptor has entries, the raw score is
@@ -403,7 +403,7 @@ class Correlation(Term):
 @dataclass(frozen=True)
 class Repeatability(Term):
     r"""S_rep: the photograph's feature points have points of the view nearby, the best over the
-    jittered crops.
+    jittered fields.
 
     The raw score Rep is the fraction of the photograph's points that have a view's point within eps
     (the paper's Rep, view -> query), 0 without points. With :math:`R = 1 - Rep`, S_rep is

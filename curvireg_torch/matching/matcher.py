@@ -113,7 +113,7 @@ class ViewMatcher(nn.Module):
 
     The box of each photograph is cropped as the views are, filtered and described; each ranking
     term compares it with all views, and :math:`S = \prod_t S_t^{w_t}`. Boxes are never exact: terms
-    take the best over a few jittered crops. The composition of a batch and the number of torch's
+    take the best over a few jittered fields. The composition of a batch and the number of torch's
     threads change scores by rounding, relatively by about 1e-5; :class:`curvireg_torch.Registrar`
     prevents that.
 
