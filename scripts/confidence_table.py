@@ -67,7 +67,7 @@ def main() -> None:
     options = parser.parse_args()
     page = REPOSITORY / "docs" / "accuracy.md"
     calibration = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
-    update_page(page, "generated", table_of_generated(calibration["held out"]["instance"]["sets"]))
+    update_page(page, "generated", generated_part(calibration))
     if options.run:
         rows = [measured(run) for run in options.run]
         record = {"date": today(), "commit": commit(), "sets": rows}
@@ -106,6 +106,19 @@ def measured(run: Path) -> dict[str, Any]:
         "ambiguous": ambiguous,
         "auc": float(roc_auc_score(right, confidences)) if len(set(right)) == 2 else None,
     }
+
+
+def generated_part(calibration: Mapping[str, Any]) -> str:
+    """Markdown, of what calibrate.py recorded: all photographs in a sentence, then the table of the
+    sets."""
+    quality = calibration["held out"]["instance"]
+    sentence = (
+        "Fitted on {n} generated photographs, commit {commit}. On folds of other kinds of objects, "
+        "mean confidence is {said:.2f}, right {right:.2f}; AUC {auc:.2f}; {reliable:.2f} are "
+        "called reliable, {trusted:.3f} of these right. By kind of input:"
+    )
+    values = quality | {"commit": calibration["commit"], "trusted": quality["right if reliable"]}
+    return f"{sentence.format(**values)}\n\n{table_of_generated(quality['sets'])}"
 
 
 def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:

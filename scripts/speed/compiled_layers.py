@@ -22,7 +22,6 @@ import curvireg_torch as cr
 from scripts import _shared
 from scripts.speed.timing import backward, forward, least_times
 
-PASSES = ("forward", "both")
 BATCH = 8
 SIZE = 128
 OUT = _shared.RESULTS / "compiled_layers.json"
