@@ -206,9 +206,10 @@ def read_model(record: Record) -> str | None:
 def _other_models(record: Record) -> list[str]:
     """What may be the names of models; librealsense's number as its name."""
     names = record.words(*OTHER_MODEL_NAMES)
-    number_of_model = record.values.get("model")
-    if record.has("coeffs") and number_of_model in range(len(REALSENSE_MODELS)):
-        names.append(REALSENSE_MODELS[number_of_model])
+    numbered = dict(enumerate(REALSENSE_MODELS))
+    index = record.values.get("model")
+    if record.has("coeffs") and isinstance(index, int) and index in numbered:
+        names.append(numbered[index])
     return names
 
 
