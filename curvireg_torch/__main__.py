@@ -34,8 +34,9 @@ def _end(codes: list[int]) -> None:
     """End the process with the code of its command, if that has returned one: Python would take
     2,000 modules apart before, and torch its libraries, which takes 0.2 s."""
     if codes:
-        sys.stdout.flush()
-        sys.stderr.flush()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:  # it may have been closed from the beginning
+                stream.flush()
         os._exit(codes[0])
 
 

@@ -43,9 +43,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             print(end="", flush=True)  # a closed pipe shows here and not at interpreter exit
     except BrokenPipeError:
-        # takes what is still buffered
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         return 128 + 13  # as shells report SIGPIPE
+    except OSError as error:  # those of files are in the messages of their commands
+        if not _discard_output():
+            raise
+        print(
+            f"curvireg: error: standard output: cannot be written ({error.strerror}); make room, "
+            f"or send it elsewhere",
+            file=sys.stderr,
+        )
+        return 2
+
+
+def _discard_output() -> bool:
+    """Send what standard output and error still hold, and cannot write, to nothing; whether there
+    is such."""
+    found = False
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            print(end="", file=stream, flush=True)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            found = True
+    return found
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:

@@ -312,7 +312,7 @@ def _box(
 
 def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
     """The given camera without its distortion, or that of the first frame by its EXIF or the field
-    of view; None if it is not known."""
+    of view, which frames of other sizes scale; None if it is not known."""
     from ..data import Photo, read_photo
     from ..geometry import Camera
     from ..jobs.entry import camera_of, entry_of
@@ -328,8 +328,9 @@ def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
     camera, _ = camera_of(entry_of(source, without_box), photo)
     if camera is None:
         return None
-    known = camera.at((image.shape[-2], image.shape[-1]))
-    return Camera(known.matrix, focal_deviation=known.focal_deviation, source=known.source)
+    if not isinstance(options.camera, Camera):  # a guess is one for frames of this size
+        camera = camera.at((photo.image.shape[-2], photo.image.shape[-1]))
+    return replace(camera, distortion=(), model="radial-tangential")
 
 
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:

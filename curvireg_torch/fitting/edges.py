@@ -198,8 +198,10 @@ class EdgeCrops:
     def cut(
         cls, images: Sequence[Tensor], boxes: Tensor, margin: float, mask: Tensor | None = None
     ) -> "EdgeCrops":
-        """Cut the boxes (B, 4) with their ``margin`` out of photographs."""
-        crops = fill_missing(crop_photographs(images, boxes, size=CROP_SIZE, margin=margin).float())
+        """Cut the boxes (B, 4) with their ``margin`` out of photographs; grey ones get three equal
+        channels, as :func:`.read_photo` gives them: the level of edges is a sum over channels."""
+        cut = crop_photographs(images, boxes, size=CROP_SIZE, margin=margin).float()
+        crops = fill_missing(cut.expand(-1, 3, -1, -1))
         check_pixels(crops, "of the box")
         transforms = crop_transforms(square_boxes(boxes, margin), CROP_SIZE)
         mask = None if mask is None else mask.cpu()

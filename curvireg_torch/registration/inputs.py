@@ -424,7 +424,8 @@ def _pixels(image: ImageLike) -> tuple[Tensor, Camera | None]:
 def check_crop(crop: Tensor) -> None:
     """Raise :class:`ImageError` for a (C, S, S) crop that shows nothing to register."""
     check_pixels(crop, "of the box")
-    if float(crop.amax() - crop.amin()) < 1.0 / 255.0:
+    channels = crop.flatten(1)
+    if float((channels.amax(dim=1) - channels.amin(dim=1)).max()) < 1.0 / 255.0:
         raise ImageError("the box shows one colour, nothing to register; check image and box")
 
 

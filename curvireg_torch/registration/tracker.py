@@ -306,6 +306,6 @@ class Tracker:
         )
         if not bool(visible):
             raise LostObjectError(OUTSIDE)
-        crops = EdgeCrops.cut([image.expand(3, -1, -1)], boxes.float(), WINDOW_MARGIN)
+        crops = EdgeCrops.cut([image], boxes.float(), WINDOW_MARGIN)
         grey = (255.0 * crops.crops[0].mean(dim=0)).round().clamp(0, 255).to(torch.uint8).numpy()
         return Frame(crops, grey, crops.transforms @ K, self.contours)

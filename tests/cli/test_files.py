@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 from unittest.mock import Mock
 
 import cv2
@@ -96,6 +97,33 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     )
     os.close(writer)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+@pytest.mark.parametrize("words", [["cache"], ["--version"], ["register", "--help"]])
+def test_output_that_cannot_be_written_is_a_line_and_a_code(words):
+    """The disk is full."""
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    command = [sys.executable, "-m", "curvireg_torch", *words]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120
+        )
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith("curvireg: error: standard output: cannot be written (No space left")
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell closes the outputs")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_command_runs_without_standard_output_and_error(closed):
+    """As under some services."""
+    command = f'"$0" -m curvireg_torch cache {closed}'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable], capture_output=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 @pytest.mark.parametrize("n", [1, 2], ids=["one thread", "two threads"])

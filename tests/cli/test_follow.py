@@ -1,6 +1,7 @@
 import json
 import pickle
 import re
+import shutil
 
 import cv2
 import pytest
@@ -151,6 +152,30 @@ def test_follow_guesses_the_camera_from_the_first_frame(frames, follow, tmp_path
     assert follow(*words, "--out", tmp_path) == 0
     for row, (_, _, T) in zip(table(tmp_path), frames[1], strict=False):
         check_pose(row, T, 4.0, 0.04)
+
+
+@pytest.mark.parametrize("kind", ["file", "exif"])
+def test_frames_of_another_size_scale_the_camera(frames, follow, tmp_path, kind):
+    """As photographs of a list do; a turned frame fails, and the others are followed."""
+    folder, scenes = frames
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    first, second = (cv2.imread(str(folder / "shots" / f"{k}.png")) for k in (0, 1))
+    shutil.copy(folder / "shots" / "0.png", shots)  # has EXIF data
+    cv2.imwrite(str(shots / "1.png"), cv2.resize(second, None, fx=2.0, fy=2.0))
+    cv2.imwrite(str(shots / "2.png"), cv2.rotate(first, cv2.ROTATE_90_CLOCKWISE))
+    fx, fy, cx, cy = map(float, CAMERA)
+    matrix = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    calibration = tmp_path / "camera.json"
+    calibration.write_text(
+        json.dumps({"camera_matrix": matrix, "image_width": 240, "image_height": 180})
+    )
+    words = ("--camera", calibration if kind == "file" else "exif")
+    assert follow(*words, "--out", tmp_path / "out", source=str(shots)) == 0
+    rows = table(tmp_path / "out")
+    for row, (_, _, T) in zip(rows[:2], scenes, strict=False):
+        check_pose(row, T, 4.0, 0.04)
+    assert "turn the photograph by 90 degrees" in rows[2]["message"]
 
 
 def test_follow_takes_the_exif_data_unasked_and_else_estimates_the_camera(

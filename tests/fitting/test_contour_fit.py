@@ -286,6 +286,16 @@ def test_fit_without_edges_returns_the_start():
         assert bool(fit.covariance.isnan().all())
 
 
+def test_a_grey_photograph_counts_as_three_equal_channels():
+    """As a file of it is read: the level of edges is a sum over channels."""
+    image = silhouette(cube(), CUBE_POSE).mean(dim=0, keepdim=True)
+    start = pose([0.42, 0.5, 0.1], [0.0, 0.0, 8.0])[None]
+    grey, colour = (fitted(picture, start) for picture in (image, image.expand(3, -1, -1)))
+    assert float(colour.edge_support) > 0.1
+    assert grey.edge_support.equal(colour.edge_support)
+    assert grey.transform.equal(colour.transform)
+
+
 def several() -> tuple[list[Tensor], Tensor, Tensor, Tensor, Tensor]:
     """Three photographs of the cube with their own sizes and cameras, and five starts: two, two and
     one, shuffled."""

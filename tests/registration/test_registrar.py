@@ -427,6 +427,12 @@ def test_check_crop_allows_two_grey_levels_and_what_resampling_may_produce():
             check_crop(crop)
 
 
+def test_check_crop_refuses_any_single_colour():
+    """Its channels differ from each other, and none shows anything."""
+    with pytest.raises(ImageError, match="one colour"):
+        check_crop(torch.tensor([0.8, 0.2, 0.1])[:, None, None].expand(3, 8, 8))
+
+
 def test_boxes_are_compared_inside_the_photograph():
     for size, given, box, expected in (
         # cut off by the right border

@@ -17,9 +17,12 @@ from .record import Record, Used, distortion_keys, distortion_keys_inside, flatt
 __all__ = ["Calibrations", "load_camera"]
 
 _STEREO = re.compile(
-    r"(left|right)?(cameramatrix|mtx|m|k|d|dist|distcoeffs|distortioncoefficients)(left|right|\d|l|r)?"
+    r"(left|right)?(cameramatrix|mtx|m|k|d|dist|distcoeffs|distortion|distortioncoefficients)"
+    r"(left|right|\d\d?|l|r)?"
 )
 _MATRICES = ("cameramatrix", "mtx", "m", "k")
+_DOTTED = re.compile(r"(Camera\d?)\.(\w+)")  # of ORB-SLAM
+_KITTI = re.compile(r"P(_rect_)?\d\d?")
 _ITEM_NAMES = ("name", "id", "file_path")  # of a camera in a list
 _PAIR = {"l": "left", "r": "right"}
 
@@ -32,10 +35,11 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
     the camera of the rectified picture); camchains of Kalibr and ``sensor.yaml`` of EuRoC;
     camodocal's files; ``cameras.txt`` of COLMAP; ``camera.json`` and ``scene_camera.json``
     (``FILE:IMAGE_ID``) of BOP; ``cam_K.txt`` of 3 x 3 numbers; ``camera_data.json`` of MegaPose;
-    ``transforms.json`` of nerfstudio; XML of Metashape; ppx, ppy of RealSense; matrices that Open3D
-    and ARKit write column by column; ``result.json``. Principal points that count from the corner
-    of the picture (COLMAP, nerfstudio) are converted. Four coefficients without a model's name are
-    read as k1, k2, p1, p2, with a warning.
+    ``transforms.json`` of nerfstudio; ORB-SLAM's files; ``camera_models.json`` of OpenSfM;
+    ``calib.txt`` of KITTI (``FILE:P2``); TOML of aniposelib; XML of Metashape; ppx, ppy of
+    RealSense; matrices that Open3D and ARKit write column by column; ``result.json``. Principal
+    points that count from the corner of the picture (COLMAP, nerfstudio) are converted. Four
+    coefficients without a model's name are read as k1, k2, p1, p2, with a warning.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -88,7 +92,7 @@ def _document(file: Path) -> Any:
         raise InvalidInputError(
             f"larger than {MAX_CAMERA_BYTES:,} bytes; leave images and points out"
         )
-    return _with_stereo_pair(read_document(file))
+    return _with_stereo_pair(_with_nested_cameras(read_document(file)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +134,8 @@ class _Cameras:
         """The camera with a name; without one, the only camera. Its distortion is all read, or the
         file refused."""
         chosen, parse = self._chosen(name)
-        around = [values for values in chosen.around if self.inside[id(values)] == 1]
+        inherits = chosen.format.inherits
+        around = [values for values in chosen.around if inherits or self.inside[id(values)] == 1]
         used: Used = set()
         camera: Camera = parse(Record(chosen.values, used, around))
         inside = distortion_keys_inside(chosen.values, self.identities)
@@ -154,6 +159,7 @@ class _Cameras:
         last = [camera.path[-1] if camera.path else "" for camera in self.found]
         unique = len(set(last)) == len(last)
         names = last if unique else ["/".join(camera.path) for camera in self.found]
+        names = [text for text in names if text]
         listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
         advice = (
             f"choose one as FILE:NAME from {listed}" if listed.strip(", ") else "leave the name out"
@@ -179,6 +185,26 @@ def _found(
         yield _Found(path, value, around, kind)
     for key, inside in value.items():
         yield from _found(inside, (*path, key), (value, *around))
+
+
+def _with_nested_cameras(document: Any) -> Any:
+    """The keys ``Camera.fx`` of ORB-SLAM and the lines ``P2`` of KITTI as cameras with these names;
+    other documents as they are. What ORB-SLAM says of ``Camera`` counts for ``Camera1`` too."""
+    if not isinstance(document, dict):
+        return document
+    cameras: dict[str, dict[str, Any]] = {}
+    rest = {}
+    for key, value in document.items():
+        if match := _DOTTED.fullmatch(key):
+            cameras.setdefault(match[1], {})[match[2]] = value
+        elif _KITTI.fullmatch(key) and isinstance(value, str) and len(flattened(value)) == 12:
+            cameras[key] = {"kitti": value}
+        else:
+            rest[key] = value
+    if any(name[6:].isdecimal() for name in cameras if name.startswith("Camera")):
+        common = cameras.pop("Camera", {})
+        cameras = {name: {**common, **camera} for name, camera in cameras.items()}
+    return {**rest, **cameras}
 
 
 def _with_stereo_pair(document: Any) -> Any:

@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+import tomllib
 import zipfile
 import zlib
 from io import BytesIO
@@ -24,6 +25,10 @@ MAX_DEPTH = 50  # of nested lists and keys
 # of an array in an .npz file; larger ones are points of the calibration, and left out
 MAX_ARRAY_BYTES = 1 << 16
 MAX_ARRAYS = 1000  # of an .npz file
+# bounds on TOML, whose time grows with the square of the parts of a key
+MAX_TOML_BYTES = 1 << 15
+MAX_TOML_PARTS = 100
+_TOML = re.compile(r"(?:\s|#[^\n]*+\n)*+(?:\[[A-Za-z_][^\]\n]*+\]|\w++[ \t]*+=)")
 _COLMAP_LINE = re.compile(r"^\d+[ \t]+[A-Z][A-Z_]+[ \t]", re.MULTILINE)
 _YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _COUNTS = (4, 9, 12, 16)  # numbers of fx, fy, cx, cy; of a matrix of 3 x 3, 3 x 4 and 4 x 4
@@ -42,10 +47,16 @@ def read_document(file: Path, expected: str = EXPECTED) -> Any:
     data = file.read_bytes()
     if data.startswith((b"PK\3\4", b"\x93NUMPY")):
         return _arrays(data)
+    if file.name == "cameras.bin":
+        raise InvalidInputError(
+            "a binary file of COLMAP; write it as text: colmap model_converter --output_type TXT"
+        )
     text = _text(data, expected)
     if numbers := _numbers_alone(text):
         return {"K": numbers}
     try:
+        if _TOML.match(text):
+            return _toml(text, expected)
         if text.lstrip().startswith(("{", "[")) and file.suffix.lower() not in (".yaml", ".yml"):
             return json.loads(text)
         if text.lstrip().startswith("<"):
@@ -147,6 +158,16 @@ def _colmap(text: str) -> dict[str, Any]:
     """The words of each line of ``cameras.txt``, by the camera's number."""
     lines = enumerate((line.partition("#")[0].split() for line in text.splitlines()), start=1)
     return {words[0]: {"colmap": words, "line": count} for count, words in lines if words}
+
+
+def _toml(text: str, expected: str) -> Any:
+    parts = max(piece.count(".") for piece in re.split(r"[=,\n]", text))
+    if len(text) > MAX_TOML_BYTES or parts > MAX_TOML_PARTS:
+        raise InvalidInputError("TOML that is too large for a calibration; write it as JSON")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:  # whose words quote the file
+        raise InvalidInputError(f"neither TOML nor {expected}; write it again") from error
 
 
 def _xml(text: str) -> Any:

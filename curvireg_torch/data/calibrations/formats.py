@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ...errors import CurviregWarning, InvalidInputError
+from ...geometry.calibration import MODELS as CAMERA_MODELS
 from ...geometry.calibration import Camera
 from .documents import number
 from .record import Record, flattened, plain
@@ -35,10 +36,13 @@ CENTRE = (("cx", "ppx", "u0", "cu"), ("cy", "ppy", "v0", "cv"))
 PAIRS = (("fc", "focal_length", "focal_lengths", "focal"), ("cc", "principal_point"))
 """Keys of single numbers of a camera matrix, and of pairs of them."""
 
+ONE_FOCAL = "f"
+"""Key of the focal length of square pixels."""
+
 DISTORTION = _names("""
     distortion_coefficients distortion_coeffs distortion_coefs distortion_coefficient distortion_coeff
     distortion_coef dist_coeffs dist_coefs dist_coeff dist_coef distortion_parameters distortion_params
-    distortion_vector dist_params distortion dist D coeffs coefs coefficients lens_distortion dist_vector kc
+    distortion_vector dist_params distortion distortions dist D coeffs coefs coefficients lens_distortion dist_vector kc
 """)  # noqa: E501
 """Keys of coefficients in OpenCV's order, or of a dict with single ones."""
 
@@ -50,7 +54,9 @@ TANGENTIAL = _names(
 ORDER = _names("k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y")
 """Single coefficients, in OpenCV's order."""
 
-SIZES = _names("resolution image_size img_size image_resolution size")
+SIZES = _names("""
+    resolution image_size img_size image_resolution size image_shape img_shape image_dimensions imsize frame_size
+""")  # noqa: E501
 WIDTH = _names("image_width width w img_width")
 HEIGHT = _names("image_height height h img_height")
 
@@ -66,7 +72,9 @@ PERSPECTIVE_MODELS = _names("""
     none pinhole simplepinhole perspective frame plumbbob radtan radialtangential brown brownconrady
     rationalpolynomial opencv fullopencv simpleradial radial
 """)
-FISHEYE_MODELS = _names("equidistant fisheye opencvfisheye kannalabrandt kannalabrandt4")
+FISHEYE_MODELS = _names(
+    "equidistant fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8"
+)
 MODELS = dict.fromkeys(PERSPECTIVE_MODELS, RADIAL_TANGENTIAL) | dict.fromkeys(
     FISHEYE_MODELS, FISHEYE
 )
@@ -82,6 +90,15 @@ UNSUPPORTED = _names("""
 """)  # noqa: E501
 """Starts of models that are not OpenCV's."""
 
+PINHOLE_OF_ZEROS = _names("inversebrown modifiedbrown")
+"""Starts of models of which a camera without distortion is a pinhole, as RealSense writes it."""
+
+REALSENSE_MODELS = _names("none modifiedbrown inversebrown ftheta brown kannalabrandt4")
+"""Models of librealsense by their numbers."""
+
+
+MAX_FRACTION = 4.0  # of focal lengths and principal points in fractions of the picture
+
 
 @dataclass(frozen=True)
 class Format:
@@ -92,12 +109,14 @@ class Format:
         detect: whether a dict of a file is a camera of this format.
         parse: its camera.
         others: further cameras that it describes, by names that ``FILE:NAME`` may give.
+        inherits: whether what the dicts around it say counts for each of several cameras in them.
     """
 
     name: str
     detect: Callable[[Record], bool]
     parse: Callable[[Record], Camera]
     others: Mapping[str, Callable[[Record], Camera]] = field(default_factory=dict)
+    inherits: bool = False
 
 
 def camera_from(
@@ -109,6 +128,11 @@ def camera_from(
     """The camera with fx, fy, cx, cy or a matrix row by row, or column by column, and a size of (H,
     W)."""
     rows = matrix_rows(matrix)
+    if 0.0 < rows[0][0] < MAX_FRACTION and max(rows[0][2], rows[1][2]) < MAX_FRACTION:
+        raise InvalidInputError(
+            "camera matrix: in fractions of the picture, not in px; multiply fx and cx by its "
+            "width, fy and cy by its height"
+        )
     return Camera(torch.tensor(rows, dtype=torch.float64), tuple(distortion), model, size)
 
 
@@ -117,6 +141,10 @@ def matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
     row, or, as Open3D and ARKit write it, column by column: there cx and cy stand in the last
     row."""
     count = len(numbers)
+    if count and not any(numbers):
+        raise InvalidInputError(
+            "camera matrix: zeros, as ROS writes for a camera that is not calibrated; calibrate it"
+        )
     if count == 4:
         fx, fy, cx, cy = numbers
         return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
@@ -141,10 +169,18 @@ def read_matrix(record: Record) -> list[float]:
     """The numbers of the camera matrix, as :func:`matrix_rows` takes them."""
     if numbers := record.numbers(*MATRIX):
         return numbers
-    singles = [record.numbers(*names) for names in (*FOCAL, *CENTRE)]
-    if not any(singles):
-        singles = [record.numbers(*names) for names in PAIRS]
-    return [value for numbers in singles for value in numbers]
+    singles = {names[0]: record.numbers(*names) for names in (*FOCAL, *CENTRE)}
+    if not any(singles.values()):
+        return [value for names in PAIRS for value in record.numbers(*names)]
+    for names in FOCAL:
+        singles[names[0]] = singles[names[0]] or record.numbers(ONE_FOCAL)
+    missing = [name for name, numbers in singles.items() if not numbers]
+    if missing:
+        raise InvalidInputError(
+            f"camera matrix: expected 9 numbers, or fx, fy, cx, cy, got {4 - len(missing)} of "
+            f"these; add {', '.join(missing)}, in px"
+        )
+    return [value for numbers in singles.values() for value in numbers]
 
 
 def read_model(record: Record) -> str | None:
@@ -153,18 +189,38 @@ def read_model(record: Record) -> str | None:
     if flags is not None and flags not in (0, False):
         return FISHEYE
     named = [model_of(text) for text in record.words(*MODEL_NAMES) if text]
-    for text in record.words(*OTHER_MODEL_NAMES):
-        name = plain(text).removeprefix("distortion")
-        if name in MODELS or name.startswith(UNSUPPORTED):
+    for text in _other_models(record):
+        name = _plain_model(text)
+        is_pinhole = name.startswith(PINHOLE_OF_ZEROS) and not any(
+            flattened(record.get(*DISTORTION))
+        )
+        if is_pinhole:
+            named.append(RADIAL_TANGENTIAL)
+        elif name in MODELS or name.startswith(UNSUPPORTED):
             named.append(model_of(text))
     if not named:
         return None if flags is None else RADIAL_TANGENTIAL
     return FISHEYE if FISHEYE in named else RADIAL_TANGENTIAL
 
 
+def _other_models(record: Record) -> list[str]:
+    """What may be the names of models; librealsense's number as its name."""
+    names = record.words(*OTHER_MODEL_NAMES)
+    numbered = dict(enumerate(REALSENSE_MODELS))
+    index = record.values.get("model")
+    if record.has("coeffs") and isinstance(index, int) and index in numbered:
+        names.append(numbered[index])
+    return names
+
+
+def _plain_model(text: str) -> str:
+    """A model's name without case, punctuation, and what librealsense writes in front."""
+    return plain(text).removeprefix("rs2").removeprefix("distortion")
+
+
 def model_of(text: str) -> str:
     """OpenCV's model of another tool's name."""
-    name = plain(text).removeprefix("distortion")
+    name = _plain_model(text)
     if name not in MODELS:
         raise InvalidInputError(
             f"camera model {text!r:.40} is not supported; choose from {KNOWN_MODELS}"
@@ -177,6 +233,8 @@ def read_distortion(record: Record, model: str | None) -> list[float]:
     if (inside := record.inside(*DISTORTION)) is not None and inside.get("data") is None:
         return single_coefficients(inside, model)
     if numbers := record.numbers(*DISTORTION):
+        if model == FISHEYE and len(numbers) == 5 and numbers[4] == 0.0:
+            return numbers[:4]  # librealsense has room for five
         return padded(numbers) if len(numbers) < 3 else numbers
     return single_coefficients(record, model)
 
@@ -218,9 +276,13 @@ def padded(coefficients: Sequence[float]) -> list[float]:
 
 def read_size(record: Record) -> list[float]:
     """The numbers of the picture's size: width, height, or in the order of the file."""
-    if (inside := record.inside(*SIZES)) is not None and inside.get("data") is None:
+    inside = record.inside(*SIZES)
+    if inside is not None and inside.has(*WIDTH):
         return inside.numbers(*WIDTH) + inside.numbers(*HEIGHT)
-    return record.numbers(*SIZES) or record.numbers(*WIDTH) + record.numbers(*HEIGHT)
+    sides = record.numbers(*SIZES)
+    if len(sides) == 3 and sides[2] in (1.0, 3.0, 4.0):
+        return sides[:2]  # the shape of an array with its channels
+    return sides or record.numbers(*WIDTH) + record.numbers(*HEIGHT)
 
 
 def checked_size(size: Sequence[float]) -> tuple[int, int] | None:
@@ -258,7 +320,8 @@ def is_plain(record: Record) -> bool:
         for key, value in record.values.items()
         if plain(key) in _PLAIN_PAIRS
     ]
-    return any(counts) or record.has(*FOCAL[0]) or sum(pairs) == 2
+    has_one_focal = record.has(ONE_FOCAL) and record.has(*CENTRE[0])
+    return any(counts) or record.has(*FOCAL[0]) or has_one_focal or sum(pairs) == 2
 
 
 _PLAIN_MATRIX = {plain(name) for name in MATRIX}
@@ -286,7 +349,8 @@ def _has_pair_of_sides(record: Record) -> bool:
     matrices = [
         len(flattened(value)) for key, value in record.values.items() if plain(key) in _PLAIN_MATRIX
     ]
-    return 9 in matrices and any(isinstance(side, list) for side in sides)
+    has_matrix = 9 in matrices or record.has(*FOCAL[0])
+    return has_matrix and any(isinstance(side, list) for side in sides)
 
 
 _PLAIN_SIZES = {plain(name) for name in SIZES}
@@ -360,6 +424,42 @@ def _nerfstudio(record: Record) -> Camera:
     distortion = single_coefficients(record, model)
     size = checked_size([side for side in (width, height) if side is not None])
     return camera_from([fx, fy, cx - 0.5, cy - 0.5], distortion, model or RADIAL_TANGENTIAL, size)
+
+
+OPENSFM = dict.fromkeys(
+    _names("perspective brown radial simple_radial"), RADIAL_TANGENTIAL
+) | dict.fromkeys(_names("fisheye fisheye_opencv"), FISHEYE)
+"""Models of OpenSfM, and OpenCV's."""
+
+
+def _opensfm(record: Record) -> Camera:
+    """Of OpenSfM and OpenDroneMap: lengths are fractions of the longer side, and count from the
+    picture's centre."""
+    name = record.get("projection_type")
+    if name not in OPENSFM:
+        raise InvalidInputError(
+            f"camera model {name!r:.40} is not supported; choose from {', '.join(OPENSFM)}"
+        )
+    size = checked_size(record.numbers(*WIDTH) + record.numbers(*HEIGHT))
+    fx = record.number("focal_x", "focal")
+    if size is None or fx is None:
+        raise InvalidInputError("no width, height and focal length; export the cameras again")
+    fy = record.number("focal_y") or fx
+    H, W = size
+    longer = max(size)
+    cx = longer * (record.number("c_x") or 0.0) + (W - 1) / 2
+    cy = longer * (record.number("c_y") or 0.0) + (H - 1) / 2
+    model = OPENSFM[name]
+    return camera_from(
+        [longer * fx, longer * fy, cx, cy], single_coefficients(record, model), model, size
+    )
+
+
+def _kitti(record: Record) -> Camera:
+    """The left 3 x 3 of a projection matrix of KITTI, whose last column is the place of the camera
+    beside the first one."""
+    numbers = record.numbers("kitti")
+    return camera_from([value for start in (0, 4, 8) for value in numbers[start : start + 3]])
 
 
 # numbers of focal lengths and of coefficients, which are the first ones of OpenCV, and the model
@@ -441,8 +541,17 @@ def _mei(record: Record) -> Camera:
 
 FORMATS = (
     Format("COLMAP", lambda record: "colmap" in record.values, _colmap),
+    Format("KITTI", lambda record: "kitti" in record.values, _kitti),
     Format(
-        "nerfstudio", lambda record: record.has("fl_x") or record.has("camera_angle_x"), _nerfstudio
+        "nerfstudio",
+        lambda record: record.has("fl_x") or record.has("camera_angle_x"),
+        _nerfstudio,
+        inherits=True,
+    ),
+    Format(
+        "OpenSfM",
+        lambda record: record.has("projection_type") and record.has("focal", "focal_x"),
+        _opensfm,
     ),
     Format(
         "camodocal, Kannala-Brandt",
@@ -450,7 +559,15 @@ FORMATS = (
         _kannala_brandt,
     ),
     Format("camodocal, MEI", lambda record: record.has("gamma1"), _mei),
-    Format("Metashape", lambda record: record.has("f") and not record.has("fx"), _metashape),
+    Format(
+        "Metashape",
+        lambda record: (
+            record.has(ONE_FOCAL)
+            and not record.has("fx")
+            and record.has("projection", "class", "type", "b1", "date")
+        ),
+        _metashape,
+    ),
     Format(
         "ROS",
         lambda record: (
@@ -461,7 +578,7 @@ FORMATS = (
     ),
     Format(
         "result.json",
-        lambda record: record.has("matrix") and record.has("distortion", "size"),
+        lambda record: record.has("matrix") and record.get("model") in CAMERA_MODELS,
         _own_result,
     ),
     Format("MegaPose", _has_pair_of_sides, _unknown_order),

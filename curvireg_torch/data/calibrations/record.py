@@ -14,7 +14,7 @@ Used = set[tuple[int, str]]
 _DISTORTION_KEY = re.compile(
     r"([kp]\d|[bs][1-4]|d|kc|tau[xy])$"  # coefficients and vectors of them
     r"|dist(?!ance|r)|radial|tangential|thinprism|affin"
-    r"|(?!undist).*(distort|coef|skew)"
+    r"|(?!undist|perframeintrinsic).*(distort|coef|skew)"
 )
 """Keys, without case and punctuation, whose numbers describe a lens."""
 
@@ -81,10 +81,10 @@ class Record:
 
 
 def flattened(value: Any) -> list[Any]:
-    """The scalars of nested lists, and of the ``data`` of a dict; texts that are numbers are
-    these."""
+    """The scalars of nested lists, and of the ``data``, or the x and y, of a dict; texts that are
+    numbers are these."""
     while isinstance(value, dict):
-        value = value.get("data")
+        value = [value["x"], value["y"]] if value.keys() == {"x", "y"} else value.get("data")
     if isinstance(value, list):
         return [scalar for item in value for scalar in flattened(item)]
     if isinstance(value, str):
@@ -114,7 +114,8 @@ def distortion_keys_inside(
 ) -> Iterator[tuple[int, str]]:
     """:func:`distortion_keys` of a dict that counts, whoever else it belongs to."""
     for key, value in values.items():
-        if _DISTORTION_KEY.match(plain(key)) and _has_number(value):
+        is_camera = id(value) in others
+        if not is_camera and _DISTORTION_KEY.match(plain(key)) and _has_number(value):
             yield id(values), key
         yield from distortion_keys(value, others)
 

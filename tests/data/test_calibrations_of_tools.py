@@ -1,0 +1,268 @@
+"""Calibration files of further tools, each in the form in which the tool writes it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from curvireg_torch import load_camera
+from curvireg_torch.errors import InvalidInputError
+
+K = np.array([[520.5, 0.0, 321.25], [0.0, 522.0, 238.5], [0.0, 0.0, 1.0]])
+LENS = (-0.31, 0.12, 0.001, -0.002)
+VGA = (480, 640)
+FLAT = {"fx": 520.5, "fy": 522.0, "cx": 321.25, "cy": 238.5}
+SIZE = {"width": 640, "height": 480}
+REALSENSE = {"ppx": 321.25, "ppy": 238.5, "fx": 520.5, "fy": 522.0, **SIZE}
+BENT = [*LENS, 0.03]
+CORNER = {"fl_x": 520.5, "fl_y": 522.0, "cx": 321.75, "cy": 239.0}
+ORB_SLAM = """%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: 520.5
+Camera.fy: 522.0
+Camera.cx: 321.25
+Camera.cy: 238.5
+Camera.k1: -0.31
+Camera.k2: 0.12
+Camera.p1: 0.001
+Camera.p2: -0.002
+Camera.width: 640
+Camera.height: 480
+ORBextractor.nFeatures: 1000
+"""
+ORB_SLAM_3 = (
+    ORB_SLAM.replace("Camera.", "Camera1.")
+    .replace("Camera1.type", "Camera.type")
+    .replace("Camera1.width", "Camera.width")
+    .replace("Camera1.height", "Camera.height")
+)
+ANIPOSE = """# of aniposelib
+[cam_0]
+name = "A"
+size = [ 640, 480,]
+matrix = [ [ 520.5, 0.0, 321.25,], [ 0.0, 522.0, 238.5,], [ 0.0, 0.0, 1.0,],]
+distortions = [ -0.31, 0.12, 0.001, -0.002, 0.0,]
+rotation = [ 0.1, 0.2, 0.3,]
+
+[metadata]
+adjusted = false
+"""
+ZED = """[LEFT_CAM_HD]
+fx=520.5
+fy=522.0
+cx=321.25
+cy=238.5
+k1=-0.31
+k2=0.12
+p1=0.001
+p2=-0.002
+
+[STEREO]
+Baseline=120
+"""
+
+
+def check(camera, distortion, size, *, matrix=K, model="radial-tangential"):
+    torch.testing.assert_close(camera.matrix, torch.from_numpy(matrix))
+    assert (camera.distortion, camera.size, camera.model) == (distortion, size, model)
+
+
+JSON = {
+    "unity": (
+        {
+            "focalLength": {"x": 520.5, "y": 522.0},
+            "principalPoint": {"x": 321.25, "y": 238.5},
+            "resolution": {"x": 640, "y": 480},
+        },
+        (),
+        VGA,
+    ),
+    "arcore": (
+        {
+            "focalLength": [520.5, 522.0],
+            "principalPoint": [321.25, 238.5],
+            "imageDimensions": [640, 480],
+        },
+        (),
+        VGA,
+    ),
+    "shape of an array": ({"K": K.tolist(), "image_shape": [480, 640, 3]}, (), VGA),
+    "height first": ({**FLAT, "image_shape": [480, 640]}, (), VGA),
+    "not our matrix": ({"matrix": K.tolist(), "size": [640, 480]}, (), VGA),
+    "record3d": (
+        {
+            "K": K.T.flatten().tolist(),
+            "w": 640,
+            "h": 480,
+            "perFrameIntrinsicCoeffs": [[520.5, 522.0, 321.25, 238.5]],
+        },
+        (),
+        VGA,
+    ),
+    "inverse model without coefficients": (
+        {**REALSENSE, "coeffs": [0.0] * 5, "model": "distortion.inverse_brown_conrady"},
+        (0.0,) * 5,
+        VGA,
+    ),
+    "realsense by number": ({**REALSENSE, "coeffs": BENT, "model": 4}, tuple(BENT), VGA),
+}
+
+
+@pytest.mark.parametrize(("content", "distortion", "size"), JSON.values(), ids=JSON)
+def test_json_of_further_tools(tmp_path, content, distortion, size):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(content))
+    check(load_camera(file), distortion, size)
+
+
+REFUSED = {
+    "inverse model by its constant": (
+        {**REALSENSE, "coeffs": BENT, "model": "RS2_DISTORTION_INVERSE_BROWN_CONRADY"},
+        "INVERSE_BROWN_CONRADY' is not supported",
+    ),
+    "inverse model by its number": (
+        {**REALSENSE, "coeffs": BENT, "model": 2},
+        "'inversebrown' is not supported",
+    ),
+    "fractions": (
+        {"K": [[0.8, 0, 0.5], [0, 1.1, 0.49], [0, 0, 1]], **SIZE},
+        "in fractions of the picture, not in px",
+    ),
+    "not calibrated": ({"k": [0.0] * 9, "d": [], **SIZE}, "a camera that is not calibrated"),
+    "no centre": ({"fx": 520.5, "fy": 522.0}, "got 2 of these; add cx, cy, in px"),
+    "spherical": (
+        {"projection_type": "spherical", "focal": 0.8, **SIZE},
+        "'spherical' is not supported; choose from perspective, brown",
+    ),
+    "OpenSfM without size": ({"projection_type": "brown", "focal_x": 0.8}, "no width, height"),
+}
+
+
+@pytest.mark.parametrize(("content", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_read_is_named(tmp_path, content, words):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(InvalidInputError, match=words):
+        load_camera(file)
+
+
+def test_realsense_fisheye_has_room_for_five_coefficients(tmp_path):
+    file = tmp_path / "t265.json"
+    coefficients = [0.02, -0.01, 0.003, -0.001, 0.0]
+    content = {**REALSENSE, "coeffs": coefficients, "model": "Kannala Brandt4"}
+    file.write_text(json.dumps(content))
+    check(load_camera(file), tuple(coefficients[:4]), VGA, model="fisheye")
+    file.write_text(json.dumps({**content, "coeffs": [*coefficients[:4], 0.5]}))
+    with pytest.raises(InvalidInputError, match="expected 4 finite coefficients"):
+        load_camera(file)
+
+
+OPENSFM = {
+    "perspective": ({"focal": 0.8, "k1": -0.31, "k2": 0.12}, (0.8, 0.0, 0.0)),
+    "brown": (
+        {"focal_x": 0.8, "focal_y": 0.9, "c_x": 0.01, "c_y": -0.02, "k1": -0.31, "k2": 0.12},
+        (0.9, 0.01, -0.02),
+    ),
+    "fisheye": ({"focal": 0.8, "k1": -0.31, "k2": 0.12}, (0.8, 0.0, 0.0)),
+}
+
+
+@pytest.mark.parametrize(("name", "values"), OPENSFM.items(), ids=OPENSFM)
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (480, 640)])
+def test_opensfm_counts_in_longer_sides_from_the_centre(tmp_path, name, values, width, height):
+    content, (fy, cx, cy) = values
+    file = tmp_path / "camera_models.json"
+    camera = {"projection_type": name, "width": width, "height": height, **content}
+    file.write_text(json.dumps({"v2 unknown 640 480": camera}))
+    place = [width / 2 - 0.5 + 640 * cx, height / 2 - 0.5 + 640 * cy]
+    expected = np.array([[512.0, 0.0, place[0]], [0.0, 640 * fy, place[1]], [0.0, 0.0, 1.0]])
+    model = "fisheye" if name == "fisheye" else "radial-tangential"
+    check(load_camera(file), (-0.31, 0.12, 0.0, 0.0), (height, width), matrix=expected, model=model)
+
+
+def test_one_focal_length_counts_from_the_corner_unless_metashape_wrote_it(tmp_path):
+    file = tmp_path / "camera.json"
+    content = {"f": 520.5, "cx": 321.25, "cy": 238.5, **SIZE}
+    square = np.diag([1.0, 520.5 / 522.0, 1.0]) @ K
+    square[1, 2] = 238.5
+    file.write_text(json.dumps(content))
+    check(load_camera(file), (), VGA, matrix=square)
+    of_metashape = {**content, "cx": 1.75, "cy": -1.0, "projection": "frame"}
+    file.write_text(json.dumps(of_metashape))
+    check(load_camera(file), (), VGA, matrix=square)
+
+
+def test_what_nerfstudio_says_above_its_frames_counts_for_all(tmp_path):
+    file = tmp_path / "transforms.json"
+    lens = dict(zip(("k1", "k2", "p1", "p2"), LENS, strict=True))
+    frames = [
+        {**CORNER, "file_path": "a.jpg"},
+        {**CORNER, "fl_x": 400.0, "file_path": "b.jpg"},
+    ]
+    content = {"camera_model": "OPENCV", **lens, "w": 640, "h": 480, "frames": frames}
+    file.write_text(json.dumps(content))
+    check(load_camera(f"{file}:a.jpg"), LENS, VGA)
+    assert float(load_camera(f"{file}:b.jpg").matrix[0, 0]) == 400.0
+
+
+@pytest.mark.parametrize("text", [ORB_SLAM, ORB_SLAM_3], ids=["2", "3"])
+def test_orb_slam(tmp_path, text):
+    file = tmp_path / "TUM1.yaml"
+    file.write_text(text)
+    check(load_camera(file), LENS, VGA)
+    fisheye = text.replace("PinHole", "KannalaBrandt8").replace("p1:", "k3:").replace("p2:", "k4:")
+    file.write_text(fisheye)
+    check(load_camera(file), LENS, VGA, model="fisheye")
+
+
+def test_toml(tmp_path):
+    file = tmp_path / "calibration.toml"
+    file.write_text(ANIPOSE)
+    check(load_camera(f"{file}:cam_0"), (*LENS, 0.0), VGA)
+    file = tmp_path / "SN1234.conf"
+    file.write_text(ZED)
+    check(load_camera(f"{file}:LEFT_CAM_HD"), LENS, None)
+
+
+def test_toml_that_takes_long_or_is_none_is_refused(tmp_path):
+    file = tmp_path / "calibration.toml"
+    deep = ".".join("a" * 200)
+    for text, words in (
+        (f"[a]\n{deep} = 1", "too large"),
+        ("[a]\n" + "x = 1\n" * 10_000, "too large"),
+        ("[image]\n\nwidth\n640\n", "neither TOML nor YAML"),
+        ("[secret]\nsecret = 1\n[secret]\n", "neither TOML nor YAML"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InvalidInputError, match=words) as caught:
+            load_camera(file)
+        assert "secret" not in str(caught.value)
+
+
+def test_kitti_names_its_projection_matrices(tmp_path):
+    file = tmp_path / "calib.txt"
+    row = "{} 0 321.25 {} 0 522 238.5 0 0 0 1 0"
+    lines = [f"P{k}: {row.format(520.5 + k, offset)}" for k, offset in ((0, 0), (2, 44.9))]
+    file.write_text("\n".join([*lines, "R0_rect: 1 0 0 0 1 0 0 0 1"]))
+    expected = K.copy()
+    expected[0, 0] = 522.5
+    check(load_camera(f"{file}:P2"), (), None, matrix=expected)
+    with pytest.raises(InvalidInputError, match="choose one as FILE:NAME from P0, P2"):
+        load_camera(file)
+
+
+def test_a_binary_model_of_colmap_is_named(tmp_path):
+    file = tmp_path / "cameras.bin"
+    file.write_bytes(b"\1" + b"\0" * 60)
+    with pytest.raises(InvalidInputError, match="colmap model_converter --output_type TXT"):
+        load_camera(file)
+
+
+def test_cameras_without_a_name_are_not_listed(tmp_path):
+    file = tmp_path / "intrinsic.json"
+    inner = {"width": 640, "height": 480, "intrinsic_matrix": K.T.flatten().tolist()}
+    file.write_text(json.dumps({**inner, "color": {**inner, "color_mode": "MJPG"}}))
+    with pytest.raises(InvalidInputError, match=r"choose one as FILE:NAME from color$"):
+        load_camera(file)
+    check(load_camera(f"{file}:color"), (), VGA)

@@ -1,0 +1,307 @@
+"""Files that people have, and what is right for each: the cases of ../shared/cases, whose README
+states it. Registrations are left to the tests of the modules, which generate such files."""
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import curvireg_torch as cr
+from curvireg_torch.cli import main
+from curvireg_torch.data.images import read_photo
+from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, MeshError
+from curvireg_torch.jobs.lists import find_photographs
+from curvireg_torch.mesh import has_colours, mesh_symmetries, mesh_warnings
+from curvireg_torch.registration.inputs import FRACTIONS, image_items
+from curvireg_torch.registration.starts import why_outside
+from curvireg_torch.utils.extras import is_installed
+
+from ._support.cans import can
+from ._support.real_data import real_case, real_data
+
+FOCAL = (520.5, 522.0)
+CENTRE = (321.25, 238.5)
+VGA = (480, 640)
+LENS = (-0.31, 0.12, 0.001, -0.002)
+K3 = 0.03
+DINO_CAMERA = cr.camera_matrix(3310.4, 3325.5, 316.73, 200.55)
+
+CAMERAS = {
+    "c01-megapose-camera-data/camera_data.json": ((), VGA),
+    "c02-cam-K-txt/cam_K.txt": ((), None),
+    "c04-dist-coeff-json/calibration.json": ((*LENS, K3), None),
+    "c05-camodocal/cam0_pinhole.yaml": (LENS, VGA),
+    "c06-euroc-radial-tangential/sensor.yaml": (LENS, VGA),
+    "c07-open3d-column-major/intrinsic.json": ((), VGA),
+    "c08-nerfstudio-transforms/transforms.json": (LENS, VGA),
+    "c09-flat-k1-k2/camera.json": ((*LENS, K3), VGA),
+    "c11-npz/B.npz": ((*LENS, K3), None),
+    "c14-colmap-full-opencv/cameras.txt:1": ((*LENS, K3, 0.0, 0.0, 0.0), VGA),
+    "c16-own-result-as-camera/camera.json": (LENS, VGA),
+    "c16-own-result-as-camera/result.json": (LENS, VGA),
+    "c18-ros-rectified/info.yaml": ((*LENS, K3), VGA),
+}
+
+
+@pytest.mark.parametrize(("name", "expected"), CAMERAS.items(), ids=CAMERAS)
+def test_calibrations_are_read_with_their_distortion(name, expected):
+    folder, _, file = name.partition("/")
+    camera = cr.load_camera(f"{real_case(folder)}/{file}")
+    torch.testing.assert_close(camera.matrix, cr.camera_matrix(*FOCAL, *CENTRE).double())
+    assert (camera.distortion, camera.size, camera.model) == (*expected, "radial-tangential")
+
+
+def test_calibrations_that_need_a_choice():
+    bop = real_case("c12-bop-scene-camera") / "scene_camera.json"
+    for name in (str(bop), f"{bop}:6", f"{bop}:000006"):
+        torch.testing.assert_close(cr.load_camera(name).matrix, DINO_CAMERA.double())
+    with pytest.raises(InvalidInputError, match="no camera '5'; choose one as FILE:NAME from 2, 6"):
+        cr.load_camera(f"{bop}:5")
+    with pytest.warns(CurviregWarning, match="read as k1, k2, p1, p2; write distortion_model"):
+        camera = cr.load_camera(real_case("c17-fisheye-without-flag") / "fisheye.json")
+    assert camera.distortion == (0.02, -0.01, 0.003, -0.001)
+    rectified = cr.load_camera(f"{real_case('c18-ros-rectified')}/info.yaml:P")
+    torch.testing.assert_close(rectified.matrix, cr.camera_matrix(480, 500, 322, 239).double())
+    assert not rectified.distorts
+    square = cr.load_camera(real_case("c19-crop-as-scale") / "quest.json")
+    with pytest.raises(InvalidInputError, match="another aspect ratio; give one of uncropped"):
+        square.at((960, 1280))
+
+
+def test_boxes_in_fractions_are_named():
+    photo = real_case("b01-yolo-normalised") / "photo.jpg"
+    item = image_items([photo], [[0.3, 0.2, 0.7, 0.9]], DINO_CAMERA)[0]
+    assert isinstance(item, InvalidInputError)
+    assert item.message == FRACTIONS
+
+
+def dino() -> trimesh.Trimesh:
+    folder = real_data("bop/dino")
+    return trimesh.load_mesh(folder / "models" / "obj_000001.ply", process=False)
+
+
+def start(name: str) -> torch.Tensor:
+    (file,) = real_case(name).glob("*.json")
+    values = json.loads(file.read_text())
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, :3] = torch.tensor(values["rotation"])
+    T[:3, 3] = torch.tensor(values["translation"])
+    return T
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("s02-start-opengl", "lies behind the camera: a pose of OpenGL's camera"),
+        ("s03-start-metres", "1000 times too small, as metres beside a mesh in mm"),
+    ],
+)
+def test_starts_of_another_convention_or_unit_are_named(name, words):
+    hull = torch.from_numpy(dino().convex_hull.vertices.copy())
+    error = why_outside(hull, start(name), DINO_CAMERA.double(), VGA)
+    assert error is not None
+    assert words in error.message
+
+
+def test_the_used_bits_of_16_are_stretched():
+    folder = real_case("p01-12-bit-in-16")
+    expected = read_photo(folder / "mono8.png").image
+    for bits in (10, 12):
+        photo = read_photo(folder / f"mono{bits}.png")
+        torch.testing.assert_close(photo.image, expected, atol=1, rtol=0)
+        assert f"16 bits, of which the lower {bits} are used: stretched" in photo.notes
+
+
+def test_photographs_of_phones_are_listed_and_named():
+    folder = real_case("p02-folder-of-heic")
+    shots = find_photographs(folder / "shots")
+    assert [path.name for path in shots] == ["IMG_1.JPG", "IMG_2.HEIC", "IMG_3.heic"]
+    # the two .HEIC are no more than the start of one
+    for path in [*shots[1:], *find_photographs(folder / "only")]:
+        with pytest.raises(CurviregError, match=path.name):
+            read_photo(path)
+
+
+def loaded(path: Path, **options) -> tuple[trimesh.Trimesh, str]:
+    """A mesh, and its warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CurviregWarning)
+        mesh = cr.load_mesh(path, **options)
+    return mesh, "; ".join(warning.text for warning in mesh_warnings(mesh))
+
+
+def colours_of(mesh: trimesh.Trimesh) -> set[tuple[int, ...]]:
+    colours = mesh.metadata.get("colours")
+    return set() if colours is None else set(map(tuple, colours.corners.reshape(-1, 3).tolist()))
+
+
+RED = (255, 0, 0)
+BLUE = (0, 0, 255)
+BOXES = {
+    "m01-obj-bom/plain.obj": set(),
+    "m01-obj-bom/bom-v.obj": set(),
+    "m01-obj-bom/bom-mtllib.obj": {(204, 26, 26)},
+    "m01-obj-bom/bom-comment.obj": set(),
+    "m03-obj-empty-usemtl/a.obj": set(),
+    "m05-stl-solid-header/sw.stl": set(),
+    "m06-stl-length/tail.stl": set(),
+    "m07-stl-ascii-variants/latin1.stl": set(),
+    "m07-stl-ascii-variants/named.stl": set(),
+    "m07-stl-ascii-variants/tabs.stl": set(),
+    "m07-stl-ascii-variants/upper.stl": set(),
+    "m12-two-mtllib/lines.obj": {RED, BLUE},
+    "m12-two-mtllib/words.obj": {RED, BLUE},
+    "m13-glb-vertex-colours-and-material/with.gltf": {RED, BLUE},
+    "m13-glb-vertex-colours-and-material/without.gltf": {RED, BLUE},
+}
+
+
+@pytest.mark.parametrize(("name", "colours"), BOXES.items(), ids=BOXES)
+def test_meshes_have_all_their_faces_and_colours(name, colours):
+    folder, _, file = name.partition("/")
+    mesh, texts = loaded(real_case(folder) / file)
+    assert (sorted(mesh.extents.tolist()), len(mesh.faces)) == ([1.0, 2.0, 3.0], 12)
+    assert abs(mesh.volume) == pytest.approx(6.0)
+    assert colours_of(mesh) == colours
+    assert texts == ""
+
+
+# of a box of 1 x 2 x 3 beside a polygon of 16 sides in 16 triangles, and beside a square in two
+FANS = {"fan": (12 + 16, 22 + 8 * np.sin(np.pi / 8)), "strip": (12 + 2, 22 + 1)}
+
+
+@pytest.mark.parametrize(("name", "expected"), FANS.items(), ids=FANS)
+def test_fans_and_strips_have_all_their_faces(name, expected):
+    mesh, texts = loaded(real_case("m08-gltf-triangle-fan") / f"{name}.gltf")
+    count, area = expected
+    assert (len(mesh.faces), texts) == (count, "")
+    assert mesh.area == pytest.approx(area)
+
+
+def test_three_boxes_in_one_obj():
+    mesh, texts = loaded(real_case("m02-obj-interleaved-negative") / "a.obj")
+    assert (len(mesh.vertices), len(mesh.faces), texts) == (24, 36, "")
+    assert len(mesh.split(only_watertight=True)) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("m06-stl-length/cut.stl", "it says 12 faces and holds 9: it was cut"),
+        ("m06-stl-length/zero.stl", "it says 0 faces and holds 12"),
+        ("m07-stl-ascii-variants/comma.stl", "decimal commas; export it with decimal points"),
+    ],
+)
+def test_meshes_that_are_cut_or_in_another_notation_are_refused(name, words):
+    folder, _, file = name.partition("/")
+    with pytest.raises(MeshError, match=words):
+        cr.load_mesh(real_case(folder) / file)
+
+
+def write_can(folder: Path, library: str) -> Path:
+    """An OBJ of a can with texture coordinates and a material of a library."""
+    mesh = can()
+    lines = [f"mtllib {library}", "usemtl label"]
+    lines += [f"v {x} {y} {z}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u} {v}" for u, v in np.asarray(mesh.visual.uv).tolist()]
+    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
+    path = folder / "can.obj"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_textures_behind_options_and_in_other_folders(tmp_path):
+    behind = shutil.copytree(real_case("m09-mtl-options"), tmp_path / "options")
+    mesh, texts = loaded(write_can(behind, "can.mtl"))
+    assert (has_colours(mesh), texts) == (True, "")
+    beside = shutil.copytree(real_case("m11-mtl-parent-folder"), tmp_path / "parent")
+    mesh, texts = loaded(write_can(beside / "models", "image.mtl"))
+    assert not has_colours(mesh)
+    assert (
+        "../images/label.png lies outside of its folder and is left out; name its folder" in texts
+    )
+    mesh, texts = loaded(beside / "models" / "can.obj", textures=beside / "images")
+    assert (has_colours(mesh), texts) == (True, "")
+    for library, lost in (("../can.mtl", "can.mtl lies outside"), ("image.mtl", "label.png")):
+        assert lost in loaded(write_can(beside / "models", library))[1]
+
+
+def test_plain_materials_and_coordinates_without_a_texture_are_no_print():
+    folder = real_case("m18-plain-material-symmetry")
+    bare, plain = (loaded(folder / name, unit="mm")[0] for name in ("bare.stl", "plain.gltf"))
+    assert len(mesh_symmetries(plain)) == len(mesh_symmetries(bare)) == 72
+    for name, is_lost in (("kd", False), ("lost", True), ("uv", False)):
+        mesh, texts = loaded(real_case("m23-uv-without-material") / f"{name}.obj", unit="mm")
+        assert not has_colours(mesh)
+        assert ("missing beside it" in texts) == is_lost
+    assert not has_colours(plain)
+
+
+def test_meshes_far_away_and_with_stray_geometry_warn(tmp_path):
+    mesh = dino()
+    mesh.apply_translation([4.4e6, 5.1e5, 4.6e6])
+    mesh.export(tmp_path / "utm.ply")
+    texts = loaded(tmp_path / "utm.ply", unit="mm")[1]
+    assert "its coordinates are rounded to steps of 0.5: move the object near the origin" in texts
+    stray = dino()
+    corners = stray.bounds[1] + [300.0, 0.0, 0.0] + [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    extra = trimesh.Trimesh(corners, [[0, 1, 2]], process=False)
+    trimesh.util.concatenate([stray, extra]).export(tmp_path / "stray.ply")
+    found, texts = loaded(tmp_path / "stray.ply", unit="mm")
+    assert "of 19,995 faces 1 near (336.7, 36.82, 43.37)" in texts
+    assert "apart from the rest: left out" in texts
+    np.testing.assert_allclose(found.extents, stray.extents, atol=1e-3)
+
+
+def bop_set(tmp_path: Path, name: str, scale: float = 1.0) -> Path:
+    """The set of a case, with the model that was left out of it."""
+    root = shutil.copytree(real_case(name) / "set", tmp_path / "set")
+    mesh = dino()
+    mesh.apply_scale(scale)
+    (root / "models").mkdir(exist_ok=True)
+    mesh.export(root / "models" / "obj_000001.ply")
+    return root
+
+
+def test_sets_without_models_info_or_boxes_are_measured(tmp_path):
+    bare = cr.BOPDataset(bop_set(tmp_path / "a", "d01-no-models-info"))
+    assert bare.models_info[1]["diameter"] == pytest.approx(101.7, abs=0.5)
+    boxless = cr.BOPDataset(bop_set(tmp_path / "b", "d02-no-gt-info"))
+    assert len(bare) == len(boxless) > 0
+    expected = bare[0]["box"]
+    torch.testing.assert_close(boxless[0]["box"], expected, atol=3.0, rtol=0)
+
+
+def test_sets_in_another_unit_and_without_objects_are_refused(tmp_path, capsys):
+    root = bop_set(tmp_path / "a", "d05-models-in-metres", 0.001)
+    with pytest.raises(InvalidInputError, match="scale the models to mm"):
+        cr.BOPDataset(root)
+    empty = bop_set(tmp_path / "b", "d06-empty-ground-truth")
+    assert len(cr.BOPDataset(empty)) == 0
+    assert main(["evaluate", "bop", str(empty), "--out", str(tmp_path / "out"), "--quiet"]) != 0
+    assert "nothing was scored (no object is annotated)" in capsys.readouterr().err
+
+
+def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
+    folder = real_case("step-heic")
+    if not is_installed("cascadio") or not is_installed("pi_heif"):
+        pytest.skip("cascadio or pi-heif is not installed")
+    mesh, _ = loaded(folder / "flange.step")
+    assert mesh.units == "mm"
+    photo = read_photo(folder / "photo.heic")
+    camera = photo.camera()
+    assert camera is not None
+    assert camera.source == "exif"
+    truth = json.loads((folder / "truth.json").read_text())
+    T = torch.tensor(truth["T"], dtype=torch.float64)
+    points = torch.from_numpy(mesh.vertices.copy()) @ T[:3, :3].T + T[:3, 3]
+    seen = points @ camera.matrix.T
+    pixels = seen[:, :2] / seen[:, 2:]
+    box = torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
+    # EXIF rounds the focal length to mm: to 1.3 % here
+    torch.testing.assert_close(box, torch.tensor(truth["box"]).double(), atol=10.0, rtol=0)
