@@ -88,7 +88,7 @@ class _Place:
     request: Any
     is_done: bool = False
     result: Any = None
-    error: BaseException | None = None
+    error: Exception | None = None
 
 
 class _Company:
@@ -138,7 +138,7 @@ def _compute(places: Sequence[_Place]) -> Sequence[_Place]:
     that of its own job."""
     try:
         results = places[0].function([place.request for place in places])
-    except BaseException as error:
+    except Exception as error:  # an interrupt is for the caller
         if len(places) == 1:
             places[0].error = error
             places[0].is_done = True

@@ -126,6 +126,22 @@ def test_the_caller_computes_for_all():
     assert threads == {threading.current_thread()}
 
 
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_an_interrupt_while_several_are_computed_is_no_error_of_one_of_them(jobs):
+    """Ctrl-C comes once, wherever the caller is."""
+    calls = []
+
+    def interrupted(requests):
+        calls.append(len(requests))
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return requests
+
+    with pytest.raises(KeyboardInterrupt):
+        map_in_company(lambda x: compute_together(interrupted, x), range(jobs))
+    assert calls == [jobs]
+
+
 def test_an_interrupted_caller_ends_its_jobs(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
