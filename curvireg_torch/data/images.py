@@ -339,6 +339,8 @@ def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[s
         raise ImageError(
             f"expected RGB or grey of 8 or 16 bits per channel, got {kind}; save it as PNG"
         )
+    if image.mode == "P" and image.has_transparency_data:
+        image = image.convert("RGBA")  # as Pillow asks for
     rgb = np.asarray(image.convert("RGB"))
     upper_bits = USED_BITS[-1] - 8
     if not _is_deep(image, data) or int(rgb.max(initial=0)) >= 2**upper_bits:

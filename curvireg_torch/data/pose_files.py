@@ -187,6 +187,9 @@ def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
         next((content[key] for key in keys if key in content), None)
         for keys in (("rotation", "R"), ("translation", "t"))
     )
+    if rotation is None or translation is None:
+        missing = "rotation of 3 x 3 numbers" if rotation is None else "translation"
+        raise InvalidInputError(f"no {missing}; expected {FORMATS}")
     R = check_numbers(_flat(rotation), "rotation", 9).view(3, 3)
     return PoseFile(
         transform(R, check_numbers(_flat(translation), "translation", 3)),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import MAX_MESH_LINES, CurviregError, MeshError
-from ..utils.files import file_digest, text_digest
+from ..utils.files import file_digest, foreign_content, text_digest
 from .cad import read_collada, read_step
 from .gltf import read_gltf
 from .obj import read_obj
@@ -25,6 +25,13 @@ from .usd import read_usd
 
 # it would print tracebacks of files that it cannot read
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
+# First bytes of formats that no other has, and how their files are named
+_MARKS = {
+    b"ply\n": (".ply",),
+    b"ply\r": (".ply",),
+    b"glTF": (".glb", ".gltf"),
+    b"ISO-10303-21": (".step", ".stp"),
+}
 # Formats whose files may name buffers, material files, textures or meshes beside them
 _WITH_COMPANIONS = (".dae", ".glb", ".gltf", ".obj", ".ply", ".urdf", ".usd", ".usda", ".usdc")
 
@@ -55,6 +62,7 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
     if link is not None and suffix != ".urdf":
         raise MeshError("only a URDF has links; leave the link out", subject=path)
     try:
+        _check_start(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of values that as_mesh reports
             if suffix == ".urdf":
@@ -82,6 +90,20 @@ def read_source(source: MeshSource, link: str | None = None) -> ReadMesh:
         raise MeshError(
             f"cannot be read as a mesh ({reason}); re-export the file", subject=path
         ) from error
+
+
+def _check_start(path: Path) -> None:
+    """Refuse a file that is none of a mesh, or one of another kind than its name says."""
+    with path.open("rb") as file:
+        start = file.read(200)
+    foreign = foreign_content(start)
+    if foreign is not None:
+        raise MeshError(foreign)
+    for mark, suffixes in _MARKS.items():
+        if start.startswith(mark) and path.suffix.lower() not in suffixes:
+            raise MeshError(
+                f"holds a mesh of another kind than its name says; name it {suffixes[0]}"
+            )
 
 
 def read_off(source: MeshSource) -> ReadMesh:

@@ -43,7 +43,10 @@ def read_gltf(source: MeshSource, data: bytes | None = None) -> ReadMesh:
     text, binary = _chunks(data)
     if len(text) > MAX_TABLE_BYTES:
         raise ValueError(f"its JSON is larger than {MAX_TABLE_BYTES:,} bytes")
-    tree = json.loads(text)
+    try:
+        tree = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"neither GLB nor glTF, or its JSON is damaged: {error}") from error
     try:
         _check(tree)
         return _File(tree, binary, source).mesh()

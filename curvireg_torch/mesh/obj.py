@@ -312,7 +312,7 @@ def _colour(text: bytes) -> tuple[float, ...] | None:
 def _set_texture(material: _Material, text: bytes) -> None:
     """The file name behind the options of a ``map_Kd``, and the options that move the texture."""
     while text.startswith(b"-"):
-        option, _, rest = text.partition(b" ")
+        option, rest = [*text.split(None, 1), b""][:2]
         expected = _MAP_OPTIONS.get(option.lower())
         if expected is None:
             break

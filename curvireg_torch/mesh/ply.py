@@ -94,13 +94,17 @@ class _Element:
         return np.column_stack(columns)
 
     def colours(self) -> NDArray[np.uint8] | None:
-        """(N, 3) colours under one of the names that exporters use; floating ones are in [0, 1]."""
+        """(N, 3) colours under one of the names that exporters use; floating ones are in [0, 1],
+        and those of 16 bits are scaled if they need more than 8."""
         for names in _COLOURS:
             values = self.table(names)
             if values is None or self._data is None:
                 continue
-            kind = np.asarray(self._data[names[0]]).dtype.kind
-            factor = 255.0 if kind == "f" and values.max(initial=0.0) <= 1.0 else 1.0
+            stored = np.asarray(self._data[names[0]]).dtype
+            largest = values.max(initial=0.0)
+            factor = 255.0 if stored.kind == "f" and largest <= 1.0 else 1.0
+            if stored == np.uint16 and largest > 255:
+                factor = 255.0 / 65535.0
             return np.clip(np.nan_to_num(factor * values).round(), 0, 255).astype(np.uint8)
         return None
 

@@ -9,6 +9,7 @@ from .source import MeshSource, ReadMesh, numbers, plain_text
 # Bytes before the faces of a binary file, and of each face
 _HEADER = 84
 _FACE = 50
+_TEXT = 512  # Bytes of which one is 0, or no ASCII, in any binary file
 _RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(rb"^[ \t]*+vertex[ \t]++([^\n]*+)", re.MULTILINE)
 _FACET = re.compile(rb"^[ \t]*+facet\b", re.MULTILINE)
@@ -19,7 +20,7 @@ _END = re.compile(rb"^[ \t]*+end[ \t]*+solid\b", re.MULTILINE)
 def read_stl(source: MeshSource) -> ReadMesh:
     """Read an STL file; three vertices for each face."""
     data = source.data()
-    return _binary(data) if _is_binary(data) else _ascii(source, plain_text(data).lower())
+    return _binary(source, data) if _is_binary(data) else _ascii(source, plain_text(data).lower())
 
 
 def _is_binary(data: bytes) -> bool:
@@ -32,14 +33,19 @@ def _is_binary(data: bytes) -> bool:
     return not (start.lstrip().startswith(b"solid") and b"\0" not in start)
 
 
-def _binary(data: bytes) -> ReadMesh:
-    if len(data) < _HEADER:
+def _binary(source: MeshSource, data: bytes) -> ReadMesh:
+    start = data[:_TEXT]
+    if len(data) < _HEADER or (start.isascii() and b"\0" not in start):
         raise ValueError("the file ends too early, or is no STL file")
     claimed = int.from_bytes(data[80:84], "little")
     whole = (len(data) - _HEADER) // _FACE
     if claimed > whole or (claimed == 0 and whole):
         raise ValueError(
             f"it says {claimed:,} faces and holds {whole:,}: it was cut while it was written"
+        )
+    if whole > claimed:
+        source.warn(
+            "cut", f"it says {claimed:,} faces and holds {whole:,}: the others are left out"
         )
     records = np.frombuffer(data, _RECORD, claimed, _HEADER)
     vertices = records["corners"].reshape(-1, 3).astype(np.float64)

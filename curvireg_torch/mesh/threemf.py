@@ -18,6 +18,9 @@ from .xml_files import check_xml
 _UNITS = {"millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
 _MICRON = "micron"
 _MODEL = "3dmodel"
+_UNREAD = ("beamlattice", "booleanshape", "displacementmesh", "levelset", "slicestack")
+"""Shapes of the extensions of 3MF."""
+
 Attributes = dict[str, str]
 
 
@@ -45,6 +48,7 @@ class _Model:
     texture_of: dict[str, str] = field(default_factory=dict)
     paths: dict[str, str] = field(default_factory=dict)
     lost: set[str] = field(default_factory=set)
+    unread: set[str] = field(default_factory=set)
 
 
 def read_threemf(source: MeshSource) -> ReadMesh:
@@ -91,7 +95,10 @@ class _Package:
     def model(self, path: str) -> _Model:
         """One model part of the package."""
         if path not in self._models:
-            self._models[path] = _parsed(self._content(path))
+            model = _parsed(self._content(path))
+            for kind in sorted(model.unread):
+                self._source.warn("parts", f"it has shapes that are not read ({kind}): left out")
+            self._models[path] = model
         return self._models[path]
 
     def parts(self, path: str, name: str, place: NDArray[np.float64], depth: int) -> list[ReadMesh]:
@@ -237,6 +244,8 @@ def _parsed(data: bytes) -> _Model:
             model.texture_of[group] = plain["texid"]
         elif kind == "tex2coord":
             model.coordinates[group].append((float(plain["u"]), float(plain["v"])))
+        elif kind in _UNREAD:
+            model.unread.add(kind)
         elif kind == "texture2d":
             model.paths[plain["id"]] = plain["path"]
 

@@ -20,6 +20,11 @@ OPENGL = (
     "around"
 )
 
+INVERSE = (
+    "at the start the mesh lies outside the photograph: the pose of the camera in the object? Then "
+    "give its inverse"
+)
+
 
 def why_outside(
     hull: Tensor, T: Tensor, K: Tensor, size: tuple[int, int]
@@ -43,6 +48,14 @@ def why_outside(
             return LostObjectError(f"at the start the translation is about 1000 times {unit}")
         also = f". Its translation is about 1000 times {unit}" if unit else ""
         return LostObjectError(f"{OPENGL}{also}", kind="opengl")
+    for sign, convention in (
+        (1.0, ""),
+        (-1.0, " with y and z turned around, as of OpenGL's camera"),
+    ):
+        inverse = torch.linalg.inv(T)
+        inverse[1:3] *= sign
+        if _is_seen(hull, inverse, K, size):
+            return LostObjectError(f"{INVERSE}{convention}")
     return None
 
 

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import os
+import re
 import secrets
 import signal
 import sys
@@ -254,6 +255,24 @@ def read_csv(path: Path) -> list[list[str]]:
         raise InvalidInputError(
             f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path
         ) from error
+
+
+_FOREIGN = {
+    re.compile(rb"version https://git-lfs"): "a pointer of Git LFS, not the file; run git lfs pull",
+    re.compile(rb"\x1f\x8b"): "packed by gzip; unpack it",
+    re.compile(rb"\s*<(!doctype\s+)?html", re.IGNORECASE): "a web page; fetch the file itself",
+}
+"""Starts of files that a download leaves in the place of another, and what to do."""
+
+
+def foreign_content(start: bytes) -> str | None:
+    """What a file is that cannot be what its name says, and what to do, by its first bytes.
+
+    Example:
+        >>> foreign_content(b"<!DOCTYPE html><html>")
+        'a web page; fetch the file itself'
+    """
+    return next((text for form, text in _FOREIGN.items() if form.match(start)), None)
 
 
 def file_name(text: str) -> str:

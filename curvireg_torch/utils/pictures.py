@@ -10,6 +10,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, MAX_IMAGE_SCANS, ImageError
+from .files import foreign_content
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -39,6 +40,9 @@ def picture_format(data: bytes) -> str:
     for name, start in PICTURE_STARTS.items():
         if start.match(data):
             return name
+    foreign = foreign_content(data[:200])
+    if foreign is not None:
+        raise ImageError(foreign)
     raise ImageError(f"not an image that is read ({PICTURE_NAMES}); convert it to JPEG or PNG")
 
 

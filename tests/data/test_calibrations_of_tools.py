@@ -266,3 +266,10 @@ def test_cameras_without_a_name_are_not_listed(tmp_path):
     with pytest.raises(InvalidInputError, match=r"choose one as FILE:NAME from color$"):
         load_camera(file)
     check(load_camera(f"{file}:color"), (), VGA)
+
+
+def test_what_a_download_leaves_in_place_of_a_calibration_is_named(tmp_path):
+    file = tmp_path / "camera.yaml"
+    file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
+    with pytest.raises(InvalidInputError, match="a pointer of Git LFS"):
+        load_camera(file)

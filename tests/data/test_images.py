@@ -331,3 +331,29 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
         assert torch.equal(camera.matrix, same.camera().matrix)
         assert (camera.source, camera.focal_deviation) == ("exif", 0.05)
         assert camera.matrix[:2, 2].tolist() == [(size[1] - 1) / 2, (size[0] - 1) / 2]
+
+
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
+        (b"<html><body>Not found", "a web page"),
+    ],
+)
+def test_what_a_download_leaves_in_place_of_a_photograph_is_named(tmp_path, start, words):
+    (tmp_path / "a.jpg").write_bytes(start)
+    with pytest.raises(ImageError, match=rf"a\.jpg: {words}"):
+        read_photo(tmp_path / "a.jpg")
+
+
+def test_palettes_with_several_transparent_colours(tmp_path, recwarn):
+    pixels = np.zeros((8, 8, 4), np.uint8)
+    pixels[:4] = (200, 30, 60, 255)
+    pixels[4:, :4] = (10, 220, 100, 0)
+    pixels[4:, 4:] = (10, 20, 200, 128)
+    Image.fromarray(pixels).quantize(8).save(tmp_path / "a.png")
+    photo = read_photo(tmp_path / "a.png")
+    assert photo.image[:, 0, 0].tolist() == [200, 30, 60]
+    assert photo.image[:, 7, 7].tolist() == [10, 20, 200]
+    assert "alpha channel dropped" in photo.notes
+    assert not recwarn.list

@@ -124,6 +124,8 @@ def test_what_is_no_pose_is_refused(tmp_path):
             {"rotation": [1.0, 0, 0, 0], "translation": [0, 0, 1]},
             "rotation: expected 9 finite numbers",
         ),
+        ({"quaternion": [0, 0, 0, 1], "translation": [0, 0, 1]}, "no rotation of 3 x 3 numbers"),
+        ({"rotation": R.tolist()}, "no translation; expected JSON"),
         ([], "expected JSON with rotation and translation, or T_cam_from_model"),
         ("text", "expected JSON with rotation"),
     ):

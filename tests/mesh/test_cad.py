@@ -282,6 +282,16 @@ def solid(number: int, attributes: str = "", triangle: str = "") -> str:
     return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
 
 
+def test_threemf_names_shapes_that_are_left_out(tmp_path: Path, load: Load) -> None:
+    lattice = "<b:beamlattice><b:beams/></b:beamlattice></mesh>"
+    resources = solid(1).replace("</mesh>", lattice).replace("<object", '<object xmlns:b="beams"')
+    mesh, texts = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
+    assert len(mesh.faces) == 12
+    assert texts == [
+        f"{tmp_path / 'a.3mf'}: it has shapes that are not read (beamlattice): left out"
+    ]
+
+
 def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load) -> None:
     components = (
         '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'

@@ -87,6 +87,34 @@ def test_mesh_files_and_mesh_digest_cover_every_file_that_is_read(
     assert mesh_digest(path) == before
 
 
+STARTS = {
+    b"version https://git-lfs.github.com/spec/v1\nsize 1\n": "Git LFS, not the file; run git lfs",
+    b"\x1f\x8b\x08\0": "packed by gzip; unpack it",
+    b"\n<!DOCTYPE HTML><title>": "a web page; fetch the file itself",
+}
+
+
+@pytest.mark.parametrize("suffix", ["obj", "stl", "glb", "ply", "3mf"])
+@pytest.mark.parametrize(("start", "words"), STARTS.items())
+def test_what_a_download_leaves_in_place_of_a_mesh_is_named(
+    tmp_path: Path, suffix: str, start: bytes, words: str
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(start)
+    with pytest.raises(MeshError, match=words):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("ply", "a.obj"), ("glb", "b.stl")])
+def test_a_mesh_under_the_name_of_another_kind_is_named(
+    tmp_path: Path, kind: str, name: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(trimesh.creation.box().export(file_type=kind))
+    with pytest.raises(MeshError, match=rf"of another kind than its name says; name it \.{kind}"):
+        load_mesh(path)
+
+
 def test_mesh_digest_accepts_damaged_meshes_and_banks(tmp_path: Path) -> None:
     path = write(tmp_path / "inside", "gltf")
     path.write_text("{")

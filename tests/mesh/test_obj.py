@@ -130,6 +130,7 @@ def test_materials_of_all_libraries_and_none_without_a_name(tmp_path: Path, load
         ("", (1, 1), (0, 0)),
         ("-s 1.000000 1.000000 1.000000", (1, 1), (0, 0)),
         ("-s 2 3 -o 0.25 0.5 0", (2, 3), (0.25, 0.5)),
+        ("-s\t2\t3\t1\t", (2, 3), (0, 0)),
         ("-o .5 -bm 1.5 -clamp on", (1, 1), (0.5, 0)),
         ("-blendu on -blendv off -mm 0 1 -texres 512 -imfchan l -t 1 1 1", (1, 1), (0, 0)),
     ],

@@ -50,6 +50,16 @@ def test_colours_under_every_name(
     np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
 
 
+def test_colours_of_16_bits_are_scaled(tmp_path: Path, load: Load) -> None:
+    vertex = "".join(f"property ushort {name}\n" for name in ("red", "green", "blue"))
+    extra = [" ".join(str(257 * shade) for shade in shades) for shades in SHADES]
+    (tmp_path / "a.ply").write_text(header(vertex, "") + rows(extra) + "3 0 1 2\n3 0 2 3\n")
+    mesh, _ = load(tmp_path / "a.ply")
+    colours = surface_colours(mesh)
+    assert colours is not None
+    np.testing.assert_array_equal(colours.corners, np.array(SHADES)[mesh.faces])
+
+
 def pictures(folder: Path) -> list[np.ndarray]:
     found = [np.random.default_rng(k).integers(0, 255, (8, 8, 3), np.uint8) for k in range(2)]
     for k, pixels in enumerate(found):

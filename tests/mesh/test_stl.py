@@ -51,6 +51,19 @@ def test_the_header_of_a_binary_file_says_nothing(
     assert not texts
 
 
+def test_faces_behind_the_last_one_are_named(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "a.stl").write_bytes(binary(claimed=5))
+    mesh, texts = load(tmp_path / "a.stl")
+    assert len(mesh.faces) == 5
+    assert "it says 5 faces and holds 12: the others are left out" in texts[0]
+
+
+def test_text_that_is_no_stl_is_not_taken_for_a_binary_file(tmp_path: Path) -> None:
+    (tmp_path / "a.stl").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n" * 9)
+    with pytest.raises(MeshError, match="is no STL file"):
+        cr.load_mesh(tmp_path / "a.stl")
+
+
 @pytest.mark.parametrize("cut", [1, 49, 50, 120, 599])
 def test_a_binary_file_that_is_cut_is_refused(tmp_path: Path, cut: int) -> None:
     (tmp_path / "a.stl").write_bytes(binary()[:-cut])

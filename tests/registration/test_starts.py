@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from curvireg_torch.registration.inputs import MIN_BOX_SIDE
-from curvireg_torch.registration.starts import OPENGL, why_outside
+from curvireg_torch.registration.starts import INVERSE, OPENGL, why_outside
 
 SIZE = (180, 240)
 K = torch.tensor([[260.0, 0, 119.5], [0, 260, 89.5], [0, 0, 1]], dtype=torch.float64)
@@ -39,6 +39,19 @@ def test_the_likely_mistake_is_named(scale):
     assert (str(mirrored), mirrored.kind) == (OPENGL, "opengl")
     assert why_outside(hull, pose(5.0 * scale, 0.0, 0.4 * scale), K, SIZE) is None
     assert why_outside(hull, pose(5.0 * scale, 0.0, -0.4 * scale), K, SIZE) is None
+
+
+@pytest.mark.parametrize("is_opengl", [False, True])
+def test_the_pose_of_the_camera_in_the_object_is_named(is_opengl):
+    hull = 0.05 * (torch.rand(20, 3, generator=torch.manual_seed(0), dtype=torch.float64) - 0.5)
+    quarter = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]], dtype=torch.float64)
+    right = pose(0.02, 0.01, 0.4)
+    right[:3, :3] = quarter
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+    wrong = torch.linalg.inv(flip @ right if is_opengl else right)
+    message = str(why_outside(hull, wrong, K, SIZE))
+    assert message.startswith(INVERSE)
+    assert ("OpenGL" in message) == is_opengl
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from ...errors import InvalidInputError
+from ...utils.files import foreign_content
 
 EXPECTED = (
     "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, "
@@ -45,6 +46,9 @@ def read_document(file: Path, expected: str = EXPECTED) -> Any:
             content.
     """
     data = file.read_bytes()
+    foreign = foreign_content(data[:200])
+    if foreign is not None:
+        raise InvalidInputError(foreign)
     if data.startswith((b"PK\3\4", b"\x93NUMPY")):
         return _arrays(data)
     if file.name == "cameras.bin":
