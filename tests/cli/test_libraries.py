@@ -23,6 +23,31 @@ print(len(trimesh.creation.box().vertex_adjacency_graph))
     assert done.stdout.split() == ["True", "True", "0", "8"]
 
 
+@pytest.mark.parametrize("module", ["numpy.exceptions", "torch._C", "trimesh"])
+def test_ctrl_c_while_libraries_are_loaded_interrupts_the_command(module: str) -> None:
+    """Not each library survives an exception in its import: numpy recurses without end."""
+    code = f"""
+import signal, sys
+from curvireg_torch.cli.libraries import load_libraries
+
+class Interrupting:
+    @staticmethod
+    def find_spec(name, *_):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting)
+try:
+    load_libraries()
+except KeyboardInterrupt:
+    print("interrupted", signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted True\n", "")
+
+
 def test_a_command_computes_small_products_on_one_thread() -> None:
     code = """
 import os
