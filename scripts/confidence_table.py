@@ -118,7 +118,16 @@ def generated_part(calibration: Mapping[str, Any]) -> str:
         "called reliable, {trusted:.3f} of these right. By kind of input:"
     )
     values = quality | {"commit": calibration["commit"], "trusted": quality["right if reliable"]}
-    return f"{sentence.format(**values)}\n\n{table_of_generated(quality['sets'])}"
+    covered = (
+        "Of {covariances} right and reliable answers, {50%:.2f} lie within the ellipsoid of 50 % "
+        "that their covariances describe, and {90%:.2f} within that of 90 %."
+    )
+    parts = [
+        sentence.format(**values),
+        table_of_generated(quality["sets"]),
+        covered.format(covariances=quality["covariances"], **quality["within"]),
+    ]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
 
 
 def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:

@@ -177,7 +177,7 @@ class Tally:
         from ..registration.words import verdict_counts
 
         rate = ""
-        if self.frames > 1:
+        if self.seconds_after_first > 0.0:
             rate = f", {(self.frames - 1) / self.seconds_after_first:.1f} frames per second"
         camera = f"; {self.camera}" if self.camera else ""
         return f"{self.frames} frames: {verdict_counts(self.counts)}{rate}{camera}"

@@ -28,6 +28,7 @@ from scripts.calibration.fits import first_probability, fit_logistic, fit_regist
 from scripts.calibration.measure import Row, rows_of
 from scripts.calibration.sets import KINDS, MODELS, render_sets, sets_of
 
+LEVELS = (0.5, 0.9)  # of ellipsoids whose coverage is measured
 CONSTANTS = REPOSITORY / "curvireg_torch" / "calibration" / "calibration.json"
 
 
@@ -55,18 +56,25 @@ def calibrate(
         constants[name], quality[name] = fit_registrations(
             rows, exact=name == "instance", present=constants[name] if level else None
         )
-        right = [row for row in rows if row["first"] and "distance2" in row]
-        distances = [
-            row["distance2"] for row in right if first_probability(row, constants[name]) >= RELIABLE
-        ]
-        if distances:
-            scale = (
-                constants["covariance_scale"]
-                * float(np.quantile(distances, 0.9))
-                / float(chi2.ppf(0.9, 6))
-            )
-            quality[name]["covariance_scale"] = round(scale, 3)
+        sure = [row for row in rows if first_probability(row, constants[name]) >= RELIABLE]
+        unique = [row for row in sure if row["first"] and "distance2" in row]
+        if unique:
+            distances = np.array([row["distance2"] for row in unique])
+            quality[name] |= covariance_quality(distances, constants["covariance_scale"])
     return constants, quality
+
+
+def covariance_quality(distances: np.ndarray, scale: float) -> Row:
+    """What covariances are worth, from squared Mahalanobis distances (n,) of reliable and right
+    poses to the truth: shares within the ellipsoids of 50 % and 90 %, and the ``covariance_scale``
+    with which 90 % would lie within the latter."""
+    within = {f"{level:.0%}": float((distances < chi2.ppf(level, 6)).mean()) for level in LEVELS}
+    wanted = scale * float(np.quantile(distances, 0.9)) / float(chi2.ppf(0.9, 6))
+    return {
+        "covariances": len(distances),
+        "within": within,
+        "covariance_scale": round(wanted, 3),
+    }
 
 
 def main() -> None:

@@ -296,5 +296,6 @@ def test_follow_and_lists_do_not_overwrite_each_other(follow, tmp_path, capsys):
 def test_the_message_of_a_tally_is_that_of_the_first_frame():
     tally = Tally()
     for message in ("first", "second"):
-        tally.add({"verdict": "failed", "message": message}, 1.0)
+        tally.add({"verdict": "failed", "message": message}, 0.0)  # as a coarse clock has it
     assert (tally.first_message, tally.frames) == ("first", 2)
+    assert str(tally) == "2 frames: 0 reliable, 0 unsure, 0 no match, 0 lost, 2 failed"

@@ -13,6 +13,7 @@ from curvireg_torch.registration.framing import outside_fraction
 from curvireg_torch.synthetic import example_mesh
 from scripts.benchmark.make import TWIN, Shapes, Tied, Twins
 from scripts.calibration import fits, measure, sets
+from scripts.calibration.calibrate import covariance_quality
 from scripts.scenes.scene import cut, look_at
 
 
@@ -36,6 +37,16 @@ def test_logistic_fit_recovers_weights_and_respects_signs():
     bound = fits.fit_logistic(rows, np.ones(4000), {"a": 1.0, "b": 1.0, "c": -1.0})
     assert bound["weights"]["a"] > 1.0
     assert (bound["weights"]["b"], bound["weights"]["c"]) == (0.0, 0.0)
+
+
+def test_covariances_are_too_small_by_the_factor_that_is_found():
+    """Errors of three times the standard deviations: nine times the scale would be right."""
+    errors = 3.0 * np.random.default_rng(0).normal(size=(20_000, 6))
+    quality = covariance_quality((errors**2).sum(axis=1), 2.0)
+    assert quality["covariances"] == 20_000
+    assert quality["covariance_scale"] == pytest.approx(18.0, rel=0.03)
+    exact = covariance_quality((errors**2).sum(axis=1) / 9.0, 2.0)
+    assert exact["within"] == pytest.approx({"50%": 0.5, "90%": 0.9}, abs=0.02)
 
 
 def test_shares_fit_recovers_slope_and_resolution():

@@ -47,11 +47,11 @@ def test_the_page_shows_the_confidences_of_the_calibration():
     assert generated_part(record) in (REPOSITORY / "docs" / "accuracy.md").read_text(
         encoding="utf-8"
     )
-    first, _, rest = generated_part(record).partition("\n\n")
-    assert first.startswith(
-        f"Fitted on {record['held out']['instance']['n']} generated photographs"
-    )
-    assert rest == table_of_generated(sets)
+    quality = record["held out"]["instance"]
+    sentence, lines, covered = generated_part(record).split("\n\n")
+    assert sentence.startswith(f"Fitted on {quality['n']} generated photographs")
+    assert lines == table_of_generated(sets).strip()
+    assert covered.startswith(f"Of {quality['covariances']} right and reliable answers")
     few = {"n": 7, "said": 0.126, "right": 0.0, "reliable": 0.5, "reliable and wrong": 3}
     changed = sets | {"wrong": few | {"auc": None}}
     assert "| another mesh | 7 | 0.13 | 0.00 | 0.50 | 3 |  |" in table_of_generated(changed)
