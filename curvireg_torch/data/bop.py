@@ -15,9 +15,11 @@ from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
 from .bop_models import BOPModels
+from .calibrations.record import flattened
 
 _README = "datasets/bop/README.md"
 _UNKNOWN_BOX = (math.nan,) * 4
+MAX_DIAMETERS = 20.0  # of a mesh over its distance: beyond, it is in mm and the poses in metres
 
 
 class BOPDataset(ObjectDataset):
@@ -89,7 +91,14 @@ class BOPDataset(ObjectDataset):
         if targets is None:
             targets = split == "test" and target_file.is_file()
         counts = _targets(target_file) if targets else None
-        for folder in sorted(p for p in scenes.iterdir() if p.is_dir() and p.name.isdecimal()):
+        folders = sorted(p for p in scenes.iterdir() if p.is_dir())
+        numbered = [folder for folder in folders if folder.name.isdecimal()]
+        if folders and not numbered:
+            raise MissingFileError(
+                f"no scene, which is a folder with a number as 000001; {_README} shows the layout",
+                subject=scenes,
+            )
+        for folder in numbered:
             self._index(folder, counts)
         self._check_unit()
         if counts:  # targets that were not found
@@ -99,11 +108,18 @@ class BOPDataset(ObjectDataset):
                 )
 
     def _check_unit(self) -> None:
-        """Refuse meshes that would be less than a pixel wide: their unit is not that of the
-        poses."""
+        """Refuse meshes that would be less than a pixel wide, or many times as large as they are
+        far: their unit is not that of the poses."""
         for item in self._items[:1]:
             depth = item["translation"][2]
-            width = item["model_info"]["diameter"] * item["camera_matrix"][0][0] / max(depth, 1e-9)
+            diameter = item["model_info"]["diameter"]
+            if 0 < depth < diameter / MAX_DIAMETERS:
+                message = (
+                    f"at the pose of image {item['image_id']} the mesh is {diameter:.4g} across "
+                    f"and {depth:.2g} away: cam_t_m2c in metres? scale it to mm, as the models are"
+                )
+                raise InvalidInputError(message, subject=item["model_path"])
+            width = diameter * item["camera_matrix"][0][0] / max(depth, 1e-9)
             if 0 < width < 1.0:
                 message = (
                     f"at the pose of image {item['image_id']} the mesh is {width:.2g} px "
@@ -119,7 +135,8 @@ class BOPDataset(ObjectDataset):
         contents: list[dict[str, Any]] = []
         for name in ("scene_gt.json", "scene_camera.json", "scene_gt_info.json"):
             try:
-                contents.append(read_json(folder / name, dict, _README))
+                content = read_json(folder / name, dict, _README)
+                contents.append({_without_zeros(key): value for key, value in content.items()})
             except MissingFileError:
                 if name != "scene_gt_info.json":
                     return self._skip("missing_annotation", f"{scene}/{name}")
@@ -163,9 +180,9 @@ class BOPDataset(ObjectDataset):
             return "corrupt_annotation"
         if not isinstance(camera, dict):
             return "missing_annotation"
-        rotation = finite_numbers(entry.get("cam_R_m2c"), 9)
-        translation = finite_numbers(entry.get("cam_t_m2c"), 3)
-        matrix = finite_numbers(camera.get("cam_K"), 9)
+        rotation = finite_numbers(flattened(entry.get("cam_R_m2c")), 9)
+        translation = finite_numbers(flattened(entry.get("cam_t_m2c")), 3)
+        matrix = finite_numbers(flattened(camera.get("cam_K")), 9)
         if rotation is None or translation is None or matrix is None:
             return "corrupt_annotation"
         try:
@@ -227,6 +244,10 @@ def images_by_number(scene: Path) -> dict[int, Path]:
             if path.suffix in IMAGE_SUFFIXES and path.stem.isdecimal():
                 found[int(path.stem)] = path
     return found
+
+
+def _without_zeros(key: str) -> str:
+    return str(int(key)) if key.isdecimal() and len(key) < 20 else key
 
 
 def _camera_pose(camera: dict[str, Any]) -> tuple[tuple[float, ...], ...]:

@@ -223,6 +223,46 @@ def test_bop_dataset_refuses_models_in_metres_without_models_info(tree):
         BOPDataset(tree[0])
 
 
+def test_bop_dataset_refuses_poses_in_metres(tree):
+    def in_metres(content):
+        content["0"][0]["cam_t_m2c"] = [value / 1000 for value in content["0"][0]["cam_t_m2c"]]
+
+    edit(tree, "scene_gt.json", in_metres)
+    with pytest.raises(
+        InvalidInputError,
+        match=r"image 0 the mesh is 86\.6 across and 0\.4 away: cam_t_m2c in metres",
+    ):
+        BOPDataset(tree[0], targets=False)
+
+
+def test_bop_dataset_reads_nested_matrices_and_zeros_before_numbers(tree):
+    before = BOPDataset(tree[0], targets=False)
+
+    def nested(content):
+        for name, value in list(content.items()):
+            for entry in value if isinstance(value, list) else [value]:
+                for key in {"cam_K", "cam_R_m2c"} & set(entry):
+                    rows = entry[key]
+                    entry[key] = [rows[:3], rows[3:6], rows[6:]]
+            content[name.zfill(6)] = content.pop(name)
+
+    edit(tree, "scene_camera.json", nested)
+    after = BOPDataset(tree[0], targets=False)
+    assert ids(after) == ids(before)
+    torch.testing.assert_close(after[0]["camera_matrix"], before[0]["camera_matrix"])
+    edit(tree, "scene_gt.json", lambda content: nested({"0": content["0"][:1]}))
+    after = BOPDataset(tree[0], targets=False)
+    assert ids(after) == ids(before)
+    torch.testing.assert_close(after[0]["rotation"], before[0]["rotation"])
+
+
+def test_bop_dataset_names_folders_that_are_no_scenes(tree):
+    for scene in (tree[0] / "test").iterdir():
+        scene.rename(scene.with_name(f"scene_{scene.name}"))
+    with pytest.raises(MissingFileError, match="no scene, which is a folder with a number"):
+        BOPDataset(tree[0])
+
+
 def test_bop_dataset_without_scene_gt_info_skips_what_is_behind_the_camera(tree):
     scene = tree[0] / "test" / "000002" / "scene_gt.json"
     scene.write_text(scene.read_text().replace("400.0", "-400.0"))
