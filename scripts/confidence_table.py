@@ -4,7 +4,8 @@
 
 The tables of generated photographs are written from scripts/results/calibration.json. RUN are
 folders that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their errors.csv
-the errors. Their table is written if there are any, its values into scripts/results/confidence.json.
+the errors. Their table is written if there are any, its values into
+scripts/results/confidence.json.
 """
 
 import argparse
