@@ -2,9 +2,10 @@
 
     python scripts/confidence_table.py [RUN ...]
 
-The table of generated photographs is written from scripts/results/calibration.json. RUN are folders
-that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their errors.csv the
-errors. Their table is written if there are any, its values into scripts/results/confidence.json.
+The tables of generated photographs are written from scripts/results/calibration.json. RUN are
+folders that ``curvireg evaluate`` wrote: their results.jsonl have the confidences, their errors.csv
+the errors. Their table is written if there are any, its values into
+scripts/results/confidence.json.
 """
 
 import argparse
@@ -39,6 +40,7 @@ GENERATED_HEADER = (
     "wrong of these",
     "AUC",
 )
+WITHHELD_HEADER = ("set", "N", "within 5°: given, none", "within 15°", "median")
 # by the name of their set in scripts/calibration
 GENERATED = {
     "shelves": "on full shelves, half of them grey",
@@ -68,6 +70,7 @@ def main() -> None:
     page = REPOSITORY / "docs" / "accuracy.md"
     calibration = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
     update_page(page, "generated", generated_part(calibration))
+    update_page(page, "withheld", table_of_withheld(calibration["held out"]["instance"]["sets"]))
     if options.run:
         rows = [measured(run) for run in options.run]
         record = {"date": today(), "commit": commit(), "sets": rows}
@@ -138,6 +141,17 @@ def table_of_generated(sets: Mapping[str, dict[str, Any]]) -> str:
         auc = "" if one["auc"] is None else f"{one['auc']:.2f}"
         shares = [f"{one[key]:.2f}" for key in ("said", "right", "reliable")]
         cells.append([photographs, str(one["n"]), *shares, str(one["reliable and wrong"]), auc])
+    return "\n".join(table_lines(cells)) + "\n"
+
+
+def table_of_withheld(sets: Mapping[str, dict[str, Any]]) -> str:
+    """Markdown, of the same generated photographs with their cameras and without."""
+    cells = [list(WITHHELD_HEADER)]
+    for name in ("shapes", "packages"):
+        both = (sets[name], sets[f"estimated_{name}"])
+        pairs = [[f"{one[f'within {angle}']:.2f}" for one in both] for angle in (5, 15)]
+        pairs.append([f"{one['median']:.1f}°" for one in both])
+        cells.append([name, str(sets[name]["n"]), *(", ".join(pair) for pair in pairs)])
     return "\n".join(table_lines(cells)) + "\n"
 
 

@@ -4,7 +4,14 @@ from pathlib import Path
 import pytest
 
 from scripts._shared import REPOSITORY, RESULTS
-from scripts.confidence_table import GENERATED, generated_part, measured, table, table_of_generated
+from scripts.confidence_table import (
+    GENERATED,
+    generated_part,
+    measured,
+    table,
+    table_of_generated,
+    table_of_withheld,
+)
 
 
 def run(folder: Path, column: str) -> Path:
@@ -55,3 +62,14 @@ def test_the_page_shows_the_confidences_of_the_calibration():
     few = {"n": 7, "said": 0.126, "right": 0.0, "reliable": 0.5, "reliable and wrong": 3}
     changed = sets | {"wrong": few | {"auc": None}}
     assert "| another mesh | 7 | 0.13 | 0.00 | 0.50 | 3 |  |" in table_of_generated(changed)
+
+
+def test_photographs_with_and_without_cameras_stand_side_by_side():
+    record = json.loads((RESULTS / "calibration.json").read_text(encoding="utf-8"))
+    sets = record["held out"]["instance"]["sets"]
+    assert table_of_withheld(sets) in (REPOSITORY / "docs" / "accuracy.md").read_text("utf-8")
+    given = {"n": 3, "within 5": 0.25, "within 15": 0.75, "median": 4.04}
+    none = {"n": 3, "within 5": 0.125, "within 15": 0.5, "median": 9.96}
+    changed = sets | {"packages": given, "estimated_packages": none}
+    last = table_of_withheld(changed).splitlines()[-1]
+    assert last == "| packages | 3 | 0.25, 0.12 | 0.75, 0.50 | 4.0°, 10.0° |"
