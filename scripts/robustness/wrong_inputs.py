@@ -49,7 +49,7 @@ distortion_coefficients: [-0.25, 0.1, 0., 0., 0.]
     "chain.yaml": """cam0:
   camera_model: pinhole
   distortion_model: radtan
-  distortion_coeffs: [-0.25, 0.1, 0, 0, 0]
+  distortion_coeffs: [-0.25, 0.1, 0, 0, 0.01]
   intrinsics: [260, 260, 119.5, 89.5]
 cam1:
   intrinsics: [260, 260, 119.5, 89.5]
