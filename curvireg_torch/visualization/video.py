@@ -50,19 +50,23 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         self.fps = fps
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
+        self._waiting: list[Registration | FailedRegistration] = []
 
     def add(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
         """Draw and write the next frame: (1 or 3, H, W), or None if it could not be read.
 
-        All frames get the size of the first one that could.
+        All frames get the size of the first one that could, for which those before it wait.
         """
+        if image is None and self._writer is None:
+            self._waiting.append(result)
+            return
         if image is None:
-            if self._writer is None:
-                return
             image = torch.zeros(3, self._size[1], self._size[0], dtype=torch.uint8)
         picture = annotated_frame(self.registrar, image, result)
         if self._writer is None:
             self._writer = self._open(picture)
+            for earlier in self._waiting:
+                self.add(None, earlier)
         if picture.shape[1::-1] != self._size:
             picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
         self._writer.write(picture[..., ::-1])
