@@ -123,12 +123,14 @@ def generated_part(calibration: Mapping[str, Any]) -> str:
     values = quality | {"commit": calibration["commit"], "trusted": quality["right if reliable"]}
     covered = (
         "Of {covariances} right and reliable answers, {50%:.2f} lie within the ellipsoid of 50 % "
-        "that their covariances describe, and {90%:.2f} within that of 90 %."
+        "that their covariances describe, and {90%:.2f} within that of 90 %; with {factor:.2f} "
+        "times the variance, 0.90 would."
     )
+    factor = quality["covariance_scale"] / calibration["constants"]["covariance_scale"]
     parts = [
         sentence.format(**values),
         table_of_generated(quality["sets"]),
-        covered.format(covariances=quality["covariances"], **quality["within"]),
+        covered.format(covariances=quality["covariances"], factor=factor, **quality["within"]),
     ]
     return "\n\n".join(part.strip() for part in parts) + "\n"
 

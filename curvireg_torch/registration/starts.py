@@ -48,14 +48,12 @@ def why_outside(
             return LostObjectError(f"at the start the translation is about 1000 times {unit}")
         also = f". Its translation is about 1000 times {unit}" if unit else ""
         return LostObjectError(f"{OPENGL}{also}", kind="opengl")
-    for sign, convention in (
-        (1.0, ""),
-        (-1.0, " with y and z turned around, as of OpenGL's camera"),
-    ):
-        inverse = torch.linalg.inv(T)
-        inverse[1:3] *= sign
-        if _is_seen(hull, inverse, K, size):
-            return LostObjectError(f"{INVERSE}{convention}")
+    inverse = torch.linalg.inv(T)
+    if _is_seen(hull, inverse, K, size):
+        return LostObjectError(INVERSE)
+    inverse[1:3] *= -1.0
+    if _is_seen(hull, inverse, K, size):
+        return LostObjectError(f"{INVERSE} with y and z turned around, as of OpenGL's camera")
     return None
 
 

@@ -59,6 +59,9 @@ def test_the_page_shows_the_confidences_of_the_calibration():
     assert sentence.startswith(f"Fitted on {quality['n']} generated photographs")
     assert lines == table_of_generated(sets).strip()
     assert covered.startswith(f"Of {quality['covariances']} right and reliable answers")
+    half = json.loads(json.dumps(record))
+    half["constants"]["covariance_scale"] = 2.0 * quality["covariance_scale"]
+    assert "with 0.50 times the variance, 0.90 would." in generated_part(half)
     few = {"n": 7, "said": 0.126, "right": 0.0, "reliable": 0.5, "reliable and wrong": 3}
     changed = sets | {"wrong": few | {"auc": None}}
     assert "| another mesh | 7 | 0.13 | 0.00 | 0.50 | 3 |  |" in table_of_generated(changed)
