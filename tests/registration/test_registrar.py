@@ -431,6 +431,9 @@ def test_check_crop_refuses_any_single_colour():
     """Its channels differ from each other, and none shows anything."""
     with pytest.raises(ImageError, match="one colour"):
         check_crop(torch.tensor([0.8, 0.2, 0.1])[:, None, None].expand(3, 8, 8))
+    red = torch.zeros(3, 8, 8)
+    red[0, :4] = 0.5
+    check_crop(red)  # one channel shows something
 
 
 def test_boxes_are_compared_inside_the_photograph():
