@@ -17,8 +17,14 @@ from tests._support import scenes
 from tests._support.miniature import write_bop, write_pascal3d, write_web
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``cuda`` where there is no GPU."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out tests marked ``browser`` unless ``-m`` names them: they take long.
+
+    Skip tests marked ``cuda`` where there is no GPU."""
+    if "browser" not in config.option.markexpr:
+        left_out = [item for item in items if item.get_closest_marker("browser")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("cuda"):
