@@ -6,6 +6,7 @@ imports heavy modules, so that help and mistakes in options appear at once, and 
 """
 
 import argparse
+import errno
 import os
 import sys
 import warnings
@@ -21,6 +22,10 @@ from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
 
 __all__ = ["build_parser", "main", "parse"]
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of writing alone. The commands' messages name their files: one without is of standard
+output."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _discard_output()
         return 128 + 13  # as shells report SIGPIPE
     except OSError as error:  # those of files are in the messages of their commands
-        if not _discard_output():
+        if not _discard_output() and error.errno not in FULL:
             raise
         print(
             f"curvireg: error: standard output: cannot be written ({error.strerror}); make room, "
@@ -54,6 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
+
+
+def _is_of_output(error: Exception) -> bool:
+    """Whether a full disk refused what was printed: larger texts than its buffer holds fail at
+    once."""
+    return isinstance(error, OSError) and error.errno in FULL and error.filename is None
 
 
 def _discard_output() -> bool:
@@ -112,7 +123,7 @@ def _run(arguments: argparse.Namespace) -> int:
         try:
             return arguments.run(arguments) or 0
         except (CurviregError, OSError) as error:
-            if arguments.debug or isinstance(error, BrokenPipeError):
+            if arguments.debug or isinstance(error, BrokenPipeError) or _is_of_output(error):
                 raise
             if isinstance(error, CurviregError):
                 text = with_advice(error)

@@ -37,6 +37,10 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **how
         )
 
+    def print_help(self, file: Any = None) -> None:
+        """Print the help; argparse itself says nothing if it cannot be written."""
+        print(self.format_help(), end="", file=file)
+
 
 def add_command(commands: Any, name: str, *examples: str, **how: Any) -> Any:
     """Add a command, with examples below its help, ``--debug``, and what it ``run``s."""

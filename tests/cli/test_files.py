@@ -99,19 +99,55 @@ def test_main_ends_silently_when_the_reader_of_a_pipe_has_gone(unbuffered):
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("words", [["cache"], ["--version"], ["register", "--help"]])
-def test_output_that_cannot_be_written_is_a_line_and_a_code(words):
-    """The disk is full."""
+def test_output_that_cannot_be_written_is_a_line_and_a_code(words, unbuffered):
+    """The disk is full; the help is longer than the buffer of standard output."""
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
     command = [sys.executable, "-m", "curvireg_torch", *words]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120
+            command,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=120,
+            env=environment,
         )
     line = done.stderr.splitlines()[-1]
     assert line.startswith("curvireg: error: standard output: cannot be written (No space left")
     assert "Traceback" not in done.stderr
+    assert done.returncode == 2
+
+
+PRINT_MUCH = """
+import sys
+from curvireg_torch.cli import commands, main
+commands.show_cache = lambda arguments: print("x" * 100_000)
+sys.exit(main(["cache"]))
+"""
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_long_result_that_cannot_be_written_is_a_line_and_a_code(unbuffered):
+    """What does not fit into the buffer of standard output fails while the command runs."""
+    if not Path("/dev/full").exists():
+        pytest.skip("this system has no /dev/full")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", PRINT_MUCH],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=120,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("curvireg: error: standard output: cannot be written (No space left")
     assert done.returncode == 2
 
 
