@@ -19,13 +19,13 @@ from ..errors import (
     MAX_MESH_BYTES,
     MAX_MESH_PARTS,
 )
+from ..formats.xml_files import check_xml, local_name
 from ..utils.choices import UNITS
 from ..utils.extras import check_extras
 from ..utils.pictures import picture_format
 from .gltf import read_gltf
 from .scenes import joined_scene
 from .source import MeshSource, ReadMesh, spellings
-from .xml_files import check_xml, local_name
 
 # Chords of curves may be off by so much of a curve's length, and turn by so many radians: of a
 # cylinder 0.1 % of the radius. Tenfold finer ones change no contour of 256 px.

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MAX_MESH_BYTES, MAX_MESH_FACES, MAX_MESH_PARTS
+from ..formats.xml_files import check_xml
 from .colours import SurfaceColours
 from .source import MeshSource, Pixels, ReadMesh
-from .xml_files import check_xml
 
 _UNITS = {"millimeter": "mm", "centimeter": "cm", "inch": "in", "foot": "ft", "meter": "m"}
 _MICRON = "micron"

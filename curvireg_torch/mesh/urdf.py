@@ -13,10 +13,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..errors import MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES
+from ..formats.xml_files import check_xml
 from ..utils.choices import UNITS
 from .colours import SurfaceColours
 from .source import MeshSource, ReadMesh
-from .xml_files import check_xml
 
 ReadPart = Callable[[MeshSource], ReadMesh]
 
