@@ -4,6 +4,7 @@ views."""
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Self
 
 import torch
@@ -29,6 +30,7 @@ from ..terms import (
 )
 from ..utils.checks import as_boxes, check_pixels
 from ..utils.company import by_key, compute_together
+from ..utils.files import text_digest
 from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
@@ -172,7 +174,7 @@ class ViewMatcher(nn.Module):
         """Compute from bank and pipeline what is on the bank's device, and is not copied."""
         for name in _PREPARED:
             self.__dict__.pop(name, None)
-        self._described_views = DescribedViews(self.bank.described_views_file)
+        self._described_views = DescribedViews(self._described_views_file())
         terms = [
             term
             for term in self.pipeline.terms
@@ -181,6 +183,15 @@ class ViewMatcher(nn.Module):
         self._terms: list[tuple[Term, Comparison]] = [
             (term, term.build(self.bank)) for term in terms
         ]
+
+    def _described_views_file(self) -> Path | None:
+        """Where features of pictures that this renderer draws of a cached bank are kept. Other
+        renderers draw others; those of a custom one, whose name says nothing, are not kept."""
+        shared = self.bank.described_views_file
+        if shared is None or not isinstance(self._renderer, str):
+            return None
+        digest = text_digest(f"{shared.name} {self._renderer}", size=16)
+        return shared.with_name(f"views-{digest}.safetensors")
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Move to another device. Modules convert their tensors by a function: what it does to one

@@ -1,4 +1,5 @@
 import math
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -10,6 +11,7 @@ from curvireg_torch import ViewMatcher
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle, sample_views
 from curvireg_torch.matching import distinct_views
+from curvireg_torch.rendering import make_renderer
 from curvireg_torch.terms import Appearance, Correlation, Repeatability
 from tests._support.scenes import scene
 
@@ -183,3 +185,22 @@ def test_appearance_is_compared_with_the_views_that_were_compared(small_bank):
             values = torch.cat([compared.double(), torch.tensor([mine], dtype=torch.float64)])
             expected = (mine - 0.30) / float(values.std(correction=0))
             assert score == pytest.approx(expected, rel=1e-5)
+
+
+def test_features_of_pictures_are_kept_by_the_name_of_their_renderer(small_bank, tmp_path):
+    """What another renderer draws differs; a custom one has no name by which to find it again."""
+    small_bank = copy(small_bank)
+    small_bank.described_views_file = tmp_path / f"views-{'0' * 32}.safetensors"
+
+    def known(renderer, value):
+        """Features of view 0, which are ``value`` if they are described now."""
+        matcher = ViewMatcher(small_bank, renderer=renderer)
+        return matcher._described_views.features([0], lambda _: torch.tensor([[value]])).item()
+
+    assert known(make_renderer(small_bank.mesh), 1.0) == 1.0
+    assert not list(tmp_path.iterdir())
+    for value, name in ((2.0, "auto"), (3.0, "embree")):
+        assert known(name, value) == value
+        assert known(name, 4.0) == value, "read from the file"
+        assert known(make_renderer(small_bank.mesh), 5.0) == 5.0
+    assert len(list(tmp_path.glob("views-*.safetensors"))) == 2
