@@ -305,3 +305,13 @@ def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
     box = torch.cat([pixels.amin(dim=0), pixels.amax(dim=0)])
     # EXIF rounds the focal length to mm: to 1.3 % here
     torch.testing.assert_close(box, torch.tensor(truth["box"]).double(), atol=10.0, rtol=0)
+
+
+def test_a_matrix_of_the_picture_at_half_size_is_named():
+    camera = cr.load_camera(real_case("n73-camera-of-half-the-size") / "cam_K.txt")
+    folder = real_case("lamp")
+    item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [camera])[0]
+    assert any("seems to be of a picture of 480 x 360" in text for text in item.warnings)
+    of_photograph = cr.camera_matrix(1100, 1100, 479.5, 359.5)
+    item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [of_photograph])[0]
+    assert not item.warnings

@@ -34,7 +34,14 @@ def test_cameras_and_boxes_that_look_like_mistakes_are_questioned_or_refused():
         ((12801, 12801, 319.5, 239.5), VGA, ["2.9 degrees; scale it"]),
         ((572, 573, 325, 242), VGA, []),
         ((12799, 12799, 319.5, 239.5), VGA, []),
-        ((600, 600, 0, 1), VGA, []),
+        ((600, 600, 0, 200), VGA, []),
+        # half the size, 2/3 and 1.6 times
+        ((286, 286, 162.5, 120.5), VGA, ["seems to be of a picture of 326 x 242; scale it"]),
+        ((381, 381, 216.5, 161.25), VGA, ["a picture of 434 x 324"]),
+        ((915, 915, 520, 387.5), VGA, ["a picture of 1041 x 776"]),
+        # cropped, or within 0.1 of the middle
+        ((572, 573, 162.5, 242), VGA, []),
+        ((572, 573, 380, 288), VGA, []),
     ):
         warnings = camera_warnings(camera_matrix(*camera), size)
         text = "; ".join(warnings)
