@@ -31,7 +31,7 @@ class EvidenceWeights:
     similarity: float = 10.0
     edge_support: float = 0.0
     appearance: float = 2.5
-    landmarks: float = 6.0
+    keypoints: float = 6.0
     details: float = 1.0
     contours: float = 10.0
 
@@ -99,7 +99,7 @@ class Evidence(Rows):
         similarity: normalised correlation of the pose's view with the photograph.
         edge_support: of the fitted pose; 0 without the contour fit.
         appearance: log appearance score of the pose; 0 without that term.
-        landmarks: log (1 + n) with the number n of keypoints that agree with the pose, beyond those
+        keypoints: log (1 + n) with the number n of keypoints that agree with the pose, beyond those
             that agree by chance; 0 without colours, camera or contour fit, with a similar mesh, and
             where a given pose is refined.
         details: by how much the contours that only this pose or only the best one predicts speak
@@ -119,7 +119,7 @@ class Evidence(Rows):
     similarity: Tensor
     edge_support: Tensor
     appearance: Tensor
-    landmarks: Tensor
+    keypoints: Tensor
     details: Tensor
     contours: Tensor
 
@@ -131,7 +131,7 @@ class Evidence(Rows):
             similarity=seen.similarity,
             edge_support=seen.edge_support.nan_to_num(0.0),
             appearance=seen.appearance.double(),
-            landmarks=seen.keypoints.log1p(),
+            keypoints=seen.keypoints.log1p(),
             details=torch.zeros_like(seen.similarity),
             contours=seen.contours,
         )

@@ -34,7 +34,7 @@ __all__ = [
     "Pipeline",
     "ViewPolicy",
 ]
-VERSION = 2  # of the JSON form
+VERSION = 3  # of the JSON form
 CUSTOM = "custom:"  # Prefix of the name of a field that is passed with each call
 
 Settings = TypeVar("Settings")

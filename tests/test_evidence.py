@@ -54,7 +54,7 @@ def test_evidence_is_read_from_poses():
     )
     read = Evidence.of(seen)
     assert read.edge_support.tolist() == pytest.approx([0.4, 0.0])
-    assert read.landmarks.expm1().tolist() == pytest.approx([0.0, 20.0])
+    assert read.keypoints.expm1().tolist() == pytest.approx([0.0, 20.0])
     assert read.details.tolist() == [0.0, 0.0]
     assert read.contours.tolist() == pytest.approx([0.3, 0.0])
     assert list(read.named(1)) == NAMES
@@ -79,7 +79,7 @@ def test_many_keypoints_outweigh_what_an_occluder_takes_away_and_one_does_not():
         similarity=similarity,
         contours=contours,
         appearance=[0.0, -4.0, 0.0, -0.5],
-        landmarks=keypoints,
+        keypoints=keypoints,
     )
     order = four.scores(EvidenceWeights()).argsort(descending=True)
     assert order.tolist() == [2, 3, 1, 0]

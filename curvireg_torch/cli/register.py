@@ -121,7 +121,7 @@ def add_register(commands: Any) -> None:
         "start_convention",
         "instances",
         "field",
-        "top",
+        "hypotheses",
         "refine",
     )
     add_limits(parser)
@@ -179,8 +179,8 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "--instances applies only without a box; leave --box and --mask out"
     if arguments.instances is not None and (arguments.start or rig is not None):
         return "--start and --views are of one object; leave --instances out"
-    if arguments.top is not None and arguments.start:
-        return "--start refines one pose; leave --top out"
+    if arguments.hypotheses is not None and arguments.start:
+        return "--start refines one pose; leave --hypotheses out"
     alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
     if alone and arguments.jobs > 1:
         return "--jobs: several processes share several photographs; leave it out for one result"
@@ -330,7 +330,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
                 raise
         if out is not None:
             found.write(out)
-        _write_pose(arguments, found.document, found.registrar.of_model(found.model))
+        _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photo.notes, *camera_in_words(found.document)]
@@ -340,7 +340,7 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
             "photograph"
         )
     if not found.reliable and options.pose == "upright" and options.up is None:
-        axis = mesh_up(found.registrar.of_model(found.model).bank.mesh)
+        axis = mesh_up(found.registrar.of_mesh(found.mesh_index).bank.mesh)
         remarks.append(f"--pose upright: {axis} of the mesh is taken as up; --up names another")
     if remarks:  # with --json, standard output holds only the result
         print(f"{path}: {'; '.join(remarks)}", file=sys.stderr if arguments.json else sys.stdout)
@@ -362,10 +362,10 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
             result, document, photographs = register_rig(
                 arguments.views, rig, registrar, bank_seconds=seconds
             )
-        document["mesh"] = str(options.meshes[result.model])
+        document["mesh"] = str(options.meshes[result.mesh_index])
         if out is not None:
             write_views(out, document, registrar, result, photographs)
-        _write_pose(arguments, document, registrar.of_model(result.model))
+        _write_pose(arguments, document, registrar.of_mesh(result.mesh_index))
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["photographs"]:
@@ -427,7 +427,7 @@ def _register_several(
         "unit",
         "link",
         "up",
-        "top",
+        "hypotheses",
         "refine",
         "renderer",
         "device",

@@ -129,26 +129,27 @@ def fit_to_edges(
     *,
     finish: int | None = None,
     wide_angles: Sequence[float] = (),
-    quick: Tensor | None = None,
-    again: bool = False,
+    short_fits: Tensor | None = None,
+    refit: bool = False,
     settings: FitSettings = FitSettings(),
 ) -> ContourFit:
     """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras
-    ``K`` (N, 3, 3). ``quick`` (N, 4, 4) are the poses of a :func:`quick_fit` from them, if there
-    was one. A pose that is fitted ``again`` is kept if the best fit at half size returns to it."""
+    ``K`` (N, 3, 3). ``short_fits`` (N, 4, 4) are the poses of a :func:`short_fit` from them, if
+    there was one. A pose that is fitted again (``refit``) is kept if the best fit at half size
+    returns to it."""
     N = len(T0)
     device = T0.device
     rows = torch.arange(N, device=device)
     full, half = (
         ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2)
     )
-    if quick is None:
-        wide = _turned(T0, half.centre, wide_angles)
+    if short_fits is None:
+        wide = _rotated(T0, half.centre, wide_angles)
         every = rows.repeat_interleave(wide.shape[1])
-        quick = quick_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
-    angles = (settings.start_angle, settings.far_angle) if again else (settings.start_angle,)
-    turned = _turned(T0, half.centre, angles, roll=settings.start_roll)
-    around = torch.cat([turned, quick.view(N, -1, 4, 4)], dim=1)
+        short_fits = short_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
+    angles = (settings.start_angle, settings.far_angle) if refit else (settings.start_angle,)
+    rotated = _rotated(T0, half.centre, angles, roll=settings.start_roll)
+    around = torch.cat([rotated, short_fits.view(N, -1, 4, 4)], dim=1)
     M = around.shape[1]
     every = rows.repeat_interleave(M)
     begun = half.state(T0)
@@ -175,7 +176,7 @@ def fit_to_edges(
     index = chosen.nonzero()[:, 0]
     others = (~chosen).nonzero()[:, 0]
     source, T = _two_best(half, fits, supports, index)
-    if again:
+    if refit:
         leaves = (
             half[index].mean_shift(begun.points[index], T0[index], T[: len(index)])
             > SAME_POSE_SHIFT
@@ -201,7 +202,7 @@ def fit_to_edges(
 
 
 @torch.no_grad()
-def quick_fit(
+def short_fit(
     contours: Contours,
     crops: EdgeCrops,
     K: Tensor,
@@ -216,10 +217,10 @@ def quick_fit(
     return state.T, quarter.supports(state)[1]
 
 
-def _turned(
+def _rotated(
     T: Tensor, centre: Tensor, angles: Sequence[float], *, roll: float | None = None
 ) -> Tensor:
-    """(N, M, 4, 4) poses: each of (N, 4, 4), then turned about the camera's x and y axes by
+    """(N, M, 4, 4) poses: each of (N, 4, 4), then rotated about the camera's x and y axes by
     +-``angles`` degrees, and about its z axis by +-``roll``."""
     axes = torch.eye(6, dtype=T.dtype, device=T.device)[:3]
     both = torch.cat([axes, -axes])

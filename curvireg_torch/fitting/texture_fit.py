@@ -93,8 +93,8 @@ def fit_texture(
 
     ``draw`` gives (N, 3, H, W) pictures of the mesh from poses (N, 4, 4), cameras (N, 3, 3) and a
     size (H, W). ``problem`` is that of one pose at full size, without a mask, ``photograph`` (C, S,
-    S) its crop; ``starts`` (N, 4, 4) are the pose whose contours are fitted, and :func:`turned`
-    ones.
+    S) its crop; ``starts`` (N, 4, 4) are those of
+    :func:`rotated_starts`.
     """
     texture = _TextureRounds(draw, renderer, problem, _as_array(photograph))
     support = problem.edge_support(problem.state(starts[:1]))
@@ -129,7 +129,7 @@ def fit_texture(
     )
 
 
-def turned(fit: ContourFit, centre: Tensor) -> Tensor:
+def rotated_starts(fit: ContourFit, centre: Tensor) -> Tensor:
     """(1, 4, 4) or (3, 4, 4): the pose of a fit, then turned both ways about the axis that contours
     do not determine, if there is one."""
     T = fit.transform

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..rendering.contours import Contours
 from ..utils.company import by_key, compute_together
-from .contour_fit import fit_to_edges, quick_fit
+from .contour_fit import fit_to_edges, short_fit
 from .details import ContourDetails, compared, contour_details
 from .edges import EdgeCrops
 from .measured_fit import ContourFit, contour_evidence, contour_support
@@ -120,16 +120,16 @@ def _fits(requests: Sequence[FitRequest]) -> list[Tensors]:
     return _computed(requests, fitted)
 
 
-def quick_fit_together(
+def short_fit_together(
     contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """:func:`.quick_fit`, on the device of the contours; the result is on the CPU."""
-    T, support = compute_together(_quick_fits, FitRequest(contours, crops, K, T, image_index, {}))
+    """:func:`.short_fit`, on the device of the contours; the result is on the CPU."""
+    T, support = compute_together(_short_fits, FitRequest(contours, crops, K, T, image_index, {}))
     return T, support
 
 
-def _quick_fits(requests: Sequence[FitRequest]) -> list[Tensors]:
-    return _computed(requests, lambda request: quick_fit(*request.arguments()))
+def _short_fits(requests: Sequence[FitRequest]) -> list[Tensors]:
+    return _computed(requests, lambda request: short_fit(*request.arguments()))
 
 
 def support_together(

@@ -34,8 +34,8 @@ def open_registrar(
             pipeline = replace(pipeline, views=banks[0].pipeline.views)
     if not options.refine:
         pipeline = replace(pipeline, contours=False, search=False)
-    if options.top is not None:
-        pipeline = replace(pipeline, hypotheses=options.top)
+    if options.hypotheses is not None:
+        pipeline = replace(pipeline, hypotheses=options.hypotheses)
     settings: dict[str, Any] = {"renderer": options.renderer, "mesh_is": options.mesh_is}
     return Registrar(banks, pipeline=pipeline, field=options.network, **settings)
 

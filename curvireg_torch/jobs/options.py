@@ -251,7 +251,7 @@ class RegisterOptions:
         1, "without a box: up to so many objects (default: 1)", type=whole_number(1)
     )
     field: Path | None = _option(None, "weights of a learned field", type=Path)
-    top: int | None = _option(
+    hypotheses: int | None = _option(
         None, "hypotheses to carry and report (default: 5)", type=whole_number(1)
     )
     refine: bool = _option(

@@ -228,11 +228,11 @@ def register_observation(
     if result.detection is not None:
         box = result.detection.box
     elif entry.box is None and entry.mask is None:
-        box = projected_box(registrar.of_model(result.model).describer, result.projection)
+        box = projected_box(registrar.of_mesh(result.mesh_index).describer, result.projection)
     seconds = observation.seconds + time.perf_counter() - start
     document = {
         **result_document(result, registrar, {"bank": bank_seconds, "register": seconds}),
-        "mesh": str(entry.meshes[result.model]) if entry.meshes else None,
+        "mesh": str(entry.meshes[result.mesh_index]) if entry.meshes else None,
         "inputs": {
             "photo": entry.name,
             "mesh": ", ".join(map(str, entry.meshes)),

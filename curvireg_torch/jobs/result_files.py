@@ -38,7 +38,7 @@ def write_result(
     The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
     :class:`OutputError` if a file cannot be written.
     """
-    mesh = registrar.of_model(result.model).bank.mesh
+    mesh = registrar.of_mesh(result.mesh_index).bank.mesh
     camera = document["camera"]
     distorts = camera is not None and (camera["model"] == "fisheye" or any(camera["distortion"]))
     note = "Distortion of the lens removed." if distorts else ""
@@ -59,7 +59,7 @@ def write_views(
     views: Sequence[View],
 ) -> None:
     """Write the files of one pose in several photographs."""
-    faces = len(registrar.of_model(result.model).bank.mesh.faces)
+    faces = len(registrar.of_mesh(result.mesh_index).bank.mesh.faces)
     arguments = (registrar, result, views)
     _write(out, document, faces, lambda: views_picture(*arguments), lambda: views_glb(*arguments))
 
@@ -74,7 +74,7 @@ def views_picture(registrar: Registrar, result: Registration, views: Sequence[Vi
             box = None if pose.box is None else pose.box.tolist()
             projection = pose.T_cam_from_model, view.camera.matrix
             shown.append((projection, view.image, box, f"{view.name}: {pose.failure or score}"))
-    return png(views_sheet(registrar.of_model(result.model).describer, shown))
+    return png(views_sheet(registrar.of_mesh(result.mesh_index).describer, shown))
 
 
 def views_glb(registrar: Registrar, result: Registration, views: Sequence[View]) -> bytes:
@@ -84,7 +84,7 @@ def views_glb(registrar: Registrar, result: Registration, views: Sequence[View])
     for view, pose in zip(views, result.views, strict=True):
         if view.image is not None and not pose.failure:
             cameras.append((view.T_cam_from_world, view.camera.matrix, view.image))
-    return scene_glb(registrar.of_model(result.model).bank.mesh, result.transform, cameras)
+    return scene_glb(registrar.of_mesh(result.mesh_index).bank.mesh, result.transform, cameras)
 
 
 def _write(

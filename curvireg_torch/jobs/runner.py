@@ -179,7 +179,7 @@ def _row(
                 "inputs": {"picture": photo.facts()},
             }
         return failed_row(error, seconds=seconds, **places)
-    describer = registrar.of_model(found.model).describer
+    describer = registrar.of_mesh(found.mesh_index).describer
     box = found.box.tolist()
     copies = drawn_copies(registrar, found.copies)
     write_file(picture, thumbnail(describer, found.projection, found.image, box, copies))

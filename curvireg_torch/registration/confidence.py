@@ -30,8 +30,8 @@ EVIDENCE_FEATURES = (
     "margin",
     "edge_support",
     "contours",
-    "concentration",
-    "landmarks",
+    "ranking_share",
+    "keypoints",
 )
 DOUBT_FEATURES = ("unmatched", "undetermined", "outside", "border", "focal")  # the more, the worse
 CONFIDENCE_FEATURES = (*EVIDENCE_FEATURES, *DOUBT_FEATURES)
@@ -147,13 +147,13 @@ def are_near(rotations: Tensor, rotation: Tensor, symmetries: Tensor | None = No
     return angles <= RIVAL_ANGLE + ROUNDING
 
 
-def concentration(scores: Tensor, near: Tensor) -> float | None:
+def ranking_share(scores: Tensor, near: Tensor) -> float | None:
     """Fraction of the sum of S^4 over all views (N,) that the views ``near`` (N,) a pose have; None
     if all are near.
 
     Example:
         >>> import torch
-        >>> round(concentration(torch.tensor([1.0, 0.5]), torch.tensor([True, False])), 4)
+        >>> round(ranking_share(torch.tensor([1.0, 0.5]), torch.tensor([True, False])), 4)
         0.9412
     """
     scores = scores.double()
@@ -198,15 +198,15 @@ def confidence_features(
 ) -> dict[str, float | None]:
     """``CONFIDENCE_FEATURES`` of the best hypothesis of one photograph.
 
-    similarity, edge_support, contours, landmarks: of the best hypothesis. margin: its score minus
+    similarity, edge_support, contours, keypoints: of the best hypothesis. margin: its score minus
     the largest of its rivals, clamped to +-5; None without rivals. unmatched: by how much
-    ``printed`` exceeds its landmarks: a print that the photograph does not show speaks against an
+    ``printed`` exceeds its keypoints: a print that the photograph does not show speaks against an
     answer, and a mesh without print has none to find.
 
     Args:
         evidence: of the H hypotheses, the best first.
         scores: (H,) theirs, without keypoints, which a similar print beside the object has too.
-        share: :func:`concentration` of the ranking.
+        share: :func:`ranking_share` of the ranking.
         printed: log (1 + n) with the number n of keypoints that a view of the mesh has; 0 where
             keypoints are not looked for, as with a mesh without colours.
         undetermined: :func:`undetermined_axes` of the best hypothesis.
@@ -225,9 +225,9 @@ def confidence_features(
         "margin": margin,
         "edge_support": best["edge_support"],
         "contours": best["contours"],
-        "concentration": share,
-        "landmarks": best["landmarks"],
-        "unmatched": max(printed - best["landmarks"], 0.0),
+        "ranking_share": share,
+        "keypoints": best["keypoints"],
+        "unmatched": max(printed - best["keypoints"], 0.0),
         "undetermined": undetermined,
         "outside": outside,
         "border": border,

@@ -13,7 +13,7 @@ from .result import Detection, Registration
 from .target import Target
 
 # Version of the keys of result.json; raised when a key is removed or changes its meaning
-SCHEMA = 4
+SCHEMA = 5
 # Keys of result.json that have another name in the lines of results.jsonl
 LINE_KEYS = {"hypotheses": "top", "no_match_probability": "none"}
 CONVENTIONS = {  # docs/results.md describes all keys
@@ -38,7 +38,7 @@ def result_document(
 ) -> dict[str, Any]:
     """:meth:`Registration.to_dict` and how the result was computed, with the seconds of ``bank``
     and ``register``."""
-    target = target.of_model(result.model)
+    target = target.of_mesh(result.mesh_index)
     bank = target.bank
     symmetries = target.symmetries_of(exact=target.is_exact)
     return {

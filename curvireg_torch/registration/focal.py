@@ -2,7 +2,7 @@
 the pose.
 
 Perspective shows the focal length: near parts of an object look larger, the more so the nearer the
-camera is. Of five cameras, the one whose quick fits have the most evidence is a start, from which
+camera is. Of five cameras, the one whose short fits have the most evidence is a start, from which
 contours are fitted with log f as a seventh unknown. A prior on log f stays where perspective is too
 weak to tell.
 """
@@ -29,7 +29,7 @@ from ..geometry.cameras import camera_matrix
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
 from .inputs import ImageItem
-from .poses import Poses, placed, with_quick_fit
+from .poses import Poses, placed, with_short_fit
 
 FIELDS_OF_VIEW = (12.0, 25.0, 45.0, 65.0, 85.0)
 """Degrees across the longer side of the photograph that are tried: factors of about 2 between focal
@@ -83,9 +83,9 @@ def starts_of_fields(
     screening_weight: float,
 ) -> Poses:
     """Of ``starts``, the same views with each of several cameras, those that are fitted, with their
-    quick fits and the most evidence first: the best view with each camera, and at least ``count``
+    short fits and the most evidence first: the best view with each camera, and at least ``count``
     views with their best camera."""
-    poses, support = with_quick_fit(describer, crops, Poses.cat(starts))
+    poses, support = with_short_fit(describer, crops, Poses.cat(starts))
     evidence = (poses.rank + screening_weight * support).view(len(starts), -1)
     views = evidence.shape[1]
     of_field = evidence.argmax(dim=1) + views * torch.arange(len(starts))

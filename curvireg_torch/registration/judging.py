@@ -10,11 +10,11 @@ from ..evidence import Evidence
 from .candidates import Candidates
 from .confidence import (
     are_near,
-    concentration,
     confidence_features,
     hypothesis_probabilities,
     is_calibrated,
     probability_of_any,
+    ranking_share,
     undetermined_axes,
 )
 from .framing import border_sides, outside_fraction, outside_warnings
@@ -68,8 +68,8 @@ def judged(
     near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
     measured = confidence_features(
         evidence[compared],
-        evidence[compared].scores(replace(weights, landmarks=0.0)),
-        concentration(work.ranking.scores[0], near),
+        evidence[compared].scores(replace(weights, keypoints=0.0)),
+        ranking_share(work.ranking.scores[0], near),
         printed=work.printed,
         undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
         outside=fraction,
@@ -79,8 +79,8 @@ def judged(
     gain = _gain_outside(target, evidence, best, order[outside[order]])
     # limits that leave no rival do not make a pose uncertain
     if gain is not None and len(compared) == 1:
-        share = measured["concentration"] or 1.0
-        measured = {**measured, "margin": max(-gain, 0.0), "concentration": share}
+        share = measured["ranking_share"] or 1.0
+        measured = {**measured, "margin": max(-gain, 0.0), "ranking_share": share}
     probabilities: tuple[float, ...] = ()
     if is_calibrated(target.pipeline):
         any_right = probability_of_any(measured, exact=work.exact)
@@ -142,13 +142,15 @@ def _contradiction(target: Target, work: Work, best: Poses, gain: float | None) 
 
 
 def better_of(
-    one: Registration | FailedRegistration, rival: Registration | FailedRegistration, model: int
+    one: Registration | FailedRegistration,
+    rival: Registration | FailedRegistration,
+    mesh_index: int,
 ) -> Registration | FailedRegistration:
-    """The registration with more confidence, or with a higher score where there is none; ``model``
-    is the rival's."""
+    """The registration with more confidence, or with a higher score where there is none;
+    ``mesh_index`` is the rival's."""
     if not isinstance(rival, Registration):
         return one
     if not isinstance(one, Registration):
-        return replace(rival, model=model)
+        return replace(rival, mesh_index=mesh_index)
     ahead = (rival.confidence or 0.0, rival.score) > (one.confidence or 0.0, one.score)
-    return replace(rival, model=model) if ahead else one
+    return replace(rival, mesh_index=mesh_index) if ahead else one

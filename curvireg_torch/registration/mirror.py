@@ -22,7 +22,7 @@ from ..mesh.reflections import reflection_plane
 from .candidates import Candidates
 from .confidence import resolution
 from .described import DescribedPhotograph, evidence_of
-from .poses import Poses, placed, with_quick_fit
+from .poses import Poses, placed, with_short_fit
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
 from .work import Work
@@ -43,7 +43,7 @@ def compared_with_mirror_image(
 ) -> Registration:
     """A result whose ``best`` pose is one. If it is probably right and the mirror image of the mesh
     fits better, it gets a warning, and ``DOUBT`` of its confidence."""
-    is_printed = float(best.evidence.landmarks) >= DETERMINING_KEYPOINTS
+    is_printed = float(best.evidence.keypoints) >= DETERMINING_KEYPOINTS
     # a print that is found is not mirrored
     if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:
         return result
@@ -64,11 +64,11 @@ def mirror_gain(target: Target, work: Work, crops: EdgeCrops, best: Candidates) 
     image = target.mirror_image
     centre = image.describer.centre
     starts = reflected_poses(best.poses, plane, target.describer.centre, centre)
-    fitted, _ = with_quick_fit(image.describer, crops, starts)
+    fitted, _ = with_short_fit(image.describer, crops, starts)
     photograph = DescribedPhotograph(
         work.query, Ranking.none(), work.descriptor, crops, keypoints=None, frame=work.frame
     )
-    seen = evidence_of(image, photograph, placed(fitted, fitted.quick, centre))
+    seen = evidence_of(image, photograph, placed(fitted, fitted.short_fit, centre))
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
     return float(seen.scores(of_shape).max() - best.evidence.scores(of_shape))

@@ -28,10 +28,10 @@ from .poses import (
     fit_texture_of,
     projected_box,
     with_edge_support,
-    with_quick_fit,
+    with_short_fit,
 )
 from .priors import Limits
-from .refits import fitted_again
+from .refits import refitted
 from .result import Registration
 from .search import search
 from .siblings import Rival, with_siblings
@@ -116,14 +116,14 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
 
 def _fitted(target: Target, work: Work, crops: EdgeCrops, starts: Poses) -> Poses:
     """Fit the contours of the starts, those without a short fit after one."""
-    unknown = starts.quick[:, 0, 0].isnan().nonzero()[:, 0]
+    unknown = starts.short_fit[:, 0, 0].isnan().nonzero()[:, 0]
     if len(unknown):
-        quick, _ = with_quick_fit(target.describer, crops, starts[unknown])
-        starts = starts.replaced(unknown, quick)
+        fitted, _ = with_short_fit(target.describer, crops, starts[unknown])
+        starts = starts.replaced(unknown, fitted)
     finish = target.pipeline.fit.finished_fits if work.starts is None else FINISHED
     if work.frame is not None:  # at the border as many poses of larger boxes compete
         finish *= 2
-    return fitted_poses(target, work, crops, starts, quick=starts.quick, finish=finish)
+    return fitted_poses(target, work, crops, starts, short_fits=starts.short_fit, finish=finish)
 
 
 def _improved(
@@ -133,7 +133,7 @@ def _improved(
     best one among its siblings."""
     if work.item.focal_deviation:
         found = with_fitted_focal_lengths(target, work, crops, found)
-    found = fitted_again(target, work, crops, found)
+    found = refitted(target, work, crops, found)
     found, rival = with_siblings(target, work, crops, found)
     return _with_texture(target, work, crops, found), rival
 
@@ -263,7 +263,7 @@ def _with_box(target: Target, work: Work, box: Tensor) -> Work:
 def _screened(target: Target, crops: EdgeCrops, poses: Poses, count: int) -> Poses:
     """The ``count`` poses with the largest sum of rank and weighted edge support after a short
     fit, best first."""
-    poses, support = with_quick_fit(target.describer, crops, poses)
+    poses, support = with_short_fit(target.describer, crops, poses)
     score = poses.rank + target.pipeline.fit.screening_weight * support
     return poses[score.argsort(descending=True, stable=True)[:count]]
 

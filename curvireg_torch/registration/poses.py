@@ -13,8 +13,8 @@ from ..evidence import EvidenceWeights
 from ..fitting.contour_problem import ContourProblem
 from ..fitting.edges import EdgeCrops
 from ..fitting.measured_fit import ContourFit
-from ..fitting.texture_fit import fit_texture, turned
-from ..fitting.together import fit_together, quick_fit_together, support_together
+from ..fitting.texture_fit import fit_texture, rotated_starts
+from ..fitting.together import fit_together, short_fit_together, support_together
 from ..geometry.cameras import point_in_cameras, pose_from_box, projected_boxes, rotation_towards
 from ..matching import Ranking, ViewBank, ViewDescriber, distinct_views
 from ..pipeline import FitSettings
@@ -34,7 +34,7 @@ __all__ = [
     "placed",
     "projected_box",
     "with_edge_support",
-    "with_quick_fit",
+    "with_short_fit",
 ]
 
 
@@ -53,7 +53,7 @@ class Poses(Rows):
         covariance: (H, 6, 6) of a fit, NaN without one, see :func:`fit_contours`.
         edge_support, start_support: (H,) of a fit, NaN without one.
         observable: (H,) number of directions that a fit determines.
-        quick: (H, 4, 4) the poses after a :func:`quick_fit`, NaN without one; those of starts.
+        short_fit: (H, 4, 4) the poses after a :func:`short_fit`, NaN without one; those of starts.
     """
 
     crop_index: Tensor
@@ -67,7 +67,7 @@ class Poses(Rows):
     edge_support: Tensor
     start_support: Tensor
     observable: Tensor
-    quick: Tensor
+    short_fit: Tensor
 
     @staticmethod
     def at(T: Tensor, cameras: Tensor, centre: Tensor, view: Tensor, rank: Tensor) -> "Poses":
@@ -75,9 +75,11 @@ class Poses(Rows):
         nan = torch.full((len(T),), torch.nan, dtype=torch.float64)
         none = torch.zeros_like(view)
         unknown = nan[:, None, None].repeat(1, 6, 6)
-        quick = torch.full_like(T, torch.nan)
+        short_fit = torch.full_like(T, torch.nan)
         return placed(
-            Poses(none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none, quick),
+            Poses(
+                none, view, rank, T[:, :3, :3], nan, T, cameras, unknown, nan, nan, none, short_fit
+            ),
             T,
             centre,
         )
@@ -158,14 +160,14 @@ def fit_poses(
     return poses.with_fit(fit, describer.centre)
 
 
-def with_quick_fit(
+def with_short_fit(
     describer: ViewDescriber, crops: EdgeCrops, poses: Poses
 ) -> tuple[Poses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
-    :func:`quick_fit`."""
+    :func:`short_fit`."""
     given = describer.device_contours, crops, poses.cameras, poses.T, poses.crop_index
-    T, support = quick_fit_together(*given)
-    return replace(poses, quick=T), support
+    T, support = short_fit_together(*given)
+    return replace(poses, short_fit=T), support
 
 
 def fit_texture_of(
@@ -178,7 +180,7 @@ def fit_texture_of(
     one = poses[torch.tensor([h])]
     problem = ContourProblem.of(describer.contours, crops, one.cameras, one.crop_index)
     photograph = crops.crops[int(one.crop_index)]
-    starts = turned(one.fit, describer.centre)
+    starts = rotated_starts(one.fit, describer.centre)
     fit = fit_texture(
         describer.draw, describer.renderer, replace(problem, mask=None), photograph, starts
     )
@@ -197,7 +199,7 @@ def common_score(hypothesis: Hypothesis, weights: EvidenceWeights) -> float:
     keypoints, weighted."""
     evidence = hypothesis.evidence
     similarity = weights.similarity * evidence["similarity"]
-    return similarity + weights.landmarks * evidence["landmarks"]
+    return similarity + weights.keypoints * evidence["keypoints"]
 
 
 def distinct_poses(

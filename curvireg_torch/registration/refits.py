@@ -13,7 +13,7 @@ from .target import Target
 from .work import Work, fitted_poses
 
 
-def fitted_again(target: Target, work: Work, crops: EdgeCrops, found: Candidates) -> Candidates:
+def refitted(target: Target, work: Work, crops: EdgeCrops, found: Candidates) -> Candidates:
     """Fit the best pose again from where it is, then its close rivals: fits that differ in effort
     cannot be compared. Results with a higher score are kept."""
     weights = target.score_weights(exact=True)
@@ -38,7 +38,7 @@ def _refitted(
 ) -> Candidates:
     """Fit poses again, and keep the results that have a higher score."""
     before = found[index]
-    fitted = fitted_poses(target, work, crops, before.poses, again=True)
+    fitted = fitted_poses(target, work, crops, before.poses, refit=True)
     moved = (before.poses.T != fitted.T).flatten(1).any(dim=1)
     if not bool(moved.any()):
         return found

@@ -47,8 +47,8 @@ class Registrar(Target):
 
     Args:
         bank_or_mesh: a :class:`ViewBank`, a :class:`ViewMatcher`, a mesh, its path, or a list of
-            meshes or paths, of which the best is reported, with its number as ``model``; the bank
-            of a mesh is read from the disk cache or built.
+            meshes or paths, of which the best is reported, with its ``mesh_index``; the bank of a
+            mesh is read from the disk cache or built.
         pipeline: all settings; default that of a bank, else ``Pipeline()``.
             ``replace(pipeline, contours=False)`` reports views of the bank,
             ``replace(pipeline, hypotheses=k)`` k hypotheses.
@@ -219,9 +219,9 @@ class Registrar(Target):
 
         def register(item: ImageItem, index: int) -> Registration | FailedRegistration:
             best = self._result_of(item, index, detects=detects)
-            for model, other in enumerate(self.others, 1):
+            for mesh_index, other in enumerate(self.others, 1):
                 rival = other._result_of(item, index, detects=detects)
-                best = better_of(best, rival, model)
+                best = better_of(best, rival, mesh_index)
             return best
 
         if detects:
@@ -245,9 +245,9 @@ class Registrar(Target):
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 
-    def of_model(self, model: int) -> "Registrar":
-        """Return the registrar of one of several meshes, by :attr:`Registration.model`."""
-        return self.others[model - 1] if model else self
+    def of_mesh(self, mesh_index: int) -> "Registrar":
+        """Return the registrar of one of several meshes, by :attr:`Registration.mesh_index`."""
+        return self.others[mesh_index - 1] if mesh_index else self
 
     @in_full_precision
     def refine(
@@ -274,9 +274,9 @@ class Registrar(Target):
             if not self.others:
                 raise
             result = FailedRegistration(error)
-        for model, other in enumerate(self.others, 1):
+        for mesh_index, other in enumerate(self.others, 1):
             with suppress(CurviregError):  # that of the first mesh is raised if all fail
-                result = better_of(result, other.register_views(*given), model)
+                result = better_of(result, other.register_views(*given), mesh_index)
         if isinstance(result, FailedRegistration):
             raise result.error
         return result

@@ -212,7 +212,7 @@ class Registration:
         feature_is_hidden: whether a small feature of the mesh tells turns of it apart, as the pull
             tab of a can does, and the photograph does not show it: the pose is right up to these
             turns.
-        model: number of the mesh, of several.
+        mesh_index: of several meshes, which one this is a pose of.
         camera: of the photograph without its distortion; its ``source`` tells whether it was given,
             and ``focal_deviation`` how well its focal length is known. None without a camera, and
             of several photographs.
@@ -241,7 +241,7 @@ class Registration:
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     feature_is_hidden: bool = False
-    model: int = 0
+    mesh_index: int = 0
     camera: Camera | None = None
     views: tuple[PhotographPose, ...] = ()
     reliable_from: float = RELIABLE
@@ -294,7 +294,7 @@ class Registration:
             return False
         if best.translation is None or best.edge_support is None:  # nothing to determine them by
             return True
-        if best.evidence.get("landmarks", 0.0) >= DETERMINING_KEYPOINTS:
+        if best.evidence.get("keypoints", 0.0) >= DETERMINING_KEYPOINTS:
             return True
         deviations = best.standard_deviations
         return deviations is not None and bool(deviations[0].isfinite().any())

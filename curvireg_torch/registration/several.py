@@ -225,7 +225,7 @@ def _joint_features(
     scores."""
     measured = [p.result.confidence_features for p in rig.photographs]
     known = [
-        features["concentration"] for features in measured if features["concentration"] is not None
+        features["ranking_share"] for features in measured if features["ranking_share"] is not None
     ]
     outside = [
         outside_fraction(rig.describer.hull, p.camera @ answer.T[0], p.K, p.size)

@@ -123,7 +123,7 @@ def with_siblings(
     )
     kept = siblings.best()
     if kept:
-        fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], again=True)
+        fitted = fitted_poses(target, work, crops, siblings.poses[torch.tensor([kept])], refit=True)
         new = evidence_of(target, work, fitted)
         found = found.with_fitted(best, fitted, new, work.limits)
     rival = siblings.rival(kept, found.evidence[best], notable=symmetries.notable)

@@ -190,9 +190,9 @@ class Target:
         other.pipeline = replace(self.pipeline, hypotheses=count)
         return other
 
-    def of_model(self, model: int) -> "Target":
-        """The target that is one of several meshes, by :attr:`Registration.model`."""
-        return self.others[model - 1] if model else self
+    def of_mesh(self, mesh_index: int) -> "Target":
+        """The target that is one of several meshes, by :attr:`Registration.mesh_index`."""
+        return self.others[mesh_index - 1] if mesh_index else self
 
     def share(self) -> None:
         """Create what threads share once, before they use it.

@@ -68,7 +68,7 @@ def contour_overlay(
     """
     item = image_item(image, as_numbers(box, "box"))
     H, W = item.size
-    describer = registrar.of_model(getattr(result, "model", 0)).describer
+    describer = registrar.of_mesh(getattr(result, "mesh_index", 0)).describer
     more = drawn_copies(registrar, copies)
     return draw_window(
         describer, result.projection, item.image, (0, 0, W, H), 1.0, item.box.tolist(), more
@@ -79,7 +79,9 @@ def drawn_copies(registrar: Registrar, copies: Sequence[Registration]) -> list[D
     """What is drawn of further objects that :func:`.detect` found."""
     return [
         Drawn(
-            registrar.of_model(copy.model).describer, copy.projection, copy.detection.box.tolist()
+            registrar.of_mesh(copy.mesh_index).describer,
+            copy.projection,
+            copy.detection.box.tolist(),
         )
         for copy in copies
         if copy.detection is not None
@@ -198,7 +200,7 @@ def registration_sheet(
     """
     item = image_item(image, as_numbers(box, "box"))
     more = drawn_copies(registrar, copies)
-    registrar = registrar.of_model(result.model)
+    registrar = registrar.of_mesh(result.mesh_index)
     H, W = item.size
     scale = min(max(LEAST, H, W), MOST) / max(H, W)
     whole = (0, 0, W, H)
@@ -255,7 +257,7 @@ def _draw_caption(
     if result.translation is not None:
         pose += f", {float(f'{result.distance:.3g}'):g} {mesh_unit(mesh) or 'units'} away"
     if registrar.others:
-        pose = f"mesh {result.model}, {pose}"
+        pose = f"mesh {result.mesh_index}, {pose}"
     room = draw.im.size[0] - right - 1.5 * size
     font = ImageFont.load_default(min(size, size * room / draw.textlength(pose, font)))
     draw.text((right + size / 2, y + 0.8 * size), pose, INK, font, anchor="lm")

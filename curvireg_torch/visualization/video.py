@@ -98,7 +98,7 @@ def annotated_frame(
     and a caption."""
     H, W = image.shape[-2:]
     found = isinstance(result, Registration)
-    describer = registrar.of_model(result.model if found else 0).describer
+    describer = registrar.of_mesh(result.mesh_index if found else 0).describer
     scale = min(1.0, _LONGER_SIDE / max(H, W))
     picture = draw_window(
         describer, result.projection if found else None, image, (0, 0, W, H), scale

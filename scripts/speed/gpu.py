@@ -139,7 +139,7 @@ def measure(options: argparse.Namespace, record: Callable[[str, Any], None]) -> 
     found = two(images, boxes, new.K)
     models = [0] * (count // 2) + [1] * (count - count // 2)
     pairs = zip(found, models, strict=True)
-    right = [result.ok and result.model == model for result, model in pairs]
+    right = [result.ok and result.mesh_index == model for result, model in pairs]
     measured = {"seconds": seconds, "photographs_per_second": count / seconds}
     record("two_meshes", {**measured, "right_mesh": sum(right) / count})
 

@@ -19,7 +19,7 @@ from tests._support.scenes import scene, truck_bank
 
 
 def test_register_writes_result_and_overlay(register_one, document, tmp_path, capsys):
-    assert register_one("--camera", *CAMERA, "--top", "3", mesh="learned.safetensors") == 0
+    assert register_one("--camera", *CAMERA, "--hypotheses", "3", mesh="learned.safetensors") == 0
     result = document()
     # swapped CX and CY would move it by 30 px of 260: 0.16 of its distance
     check_pose(result, scene(0)[2], 15.0, 0.05)
@@ -193,7 +193,7 @@ IGNORED = [
     # words of register; part of the message
     ("a.png m.ply --preset fast --pipeline p.json", "expected one of --preset and --pipeline"),
     ("a.png m.ply --start s.json --camera exif --instances 2", "leave --instances out"),
-    ("a.png m.ply --start s.json --camera exif --top 2", "leave --top out"),
+    ("a.png m.ply --start s.json --camera exif --hypotheses 2", "leave --hypotheses out"),
     ("--views rig.csv m.ply --instances 2", "leave --instances out"),
     ("a.png m.ply --jobs 2", "--jobs: several processes share several photographs"),
     ("--views rig.csv m.ply --jobs 2", "--jobs: several processes share several photographs"),

@@ -104,7 +104,7 @@ def test_the_page_of_commands_is_current():
     assert (DOCS / "commands.md").read_text(encoding="utf-8") == page
     for heading in ("register", "evaluate bop", "plot overlay", "cache"):
         assert f"\n## curvireg {heading}\n" in page
-    for option in ("--top TOP", "--no-refine", "--every N", "--quiet", "--out DIR"):
+    for option in ("--hypotheses HYPOTHESES", "--no-refine", "--every N", "--quiet", "--out DIR"):
         assert f"| `{option}` |" in page
 
 

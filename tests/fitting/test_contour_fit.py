@@ -11,7 +11,7 @@ from torch import Tensor
 from curvireg_torch import camera_matrix, rotation_error
 from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.fitting import contour_fit
-from curvireg_torch.fitting.contour_fit import fit_to_edges, quick_fit
+from curvireg_torch.fitting.contour_fit import fit_to_edges, short_fit
 from curvireg_torch.fitting.contour_problem import ContourProblem, ContourState
 from curvireg_torch.fitting.edges import EdgeCrops, EdgeField, ObjectMask, inside_photographs
 from curvireg_torch.fitting.least_squares import apply_twist, project
@@ -397,7 +397,7 @@ def test_fit_rejects_bad_input():
             fitted(noise(), start, **options)
 
 
-def test_a_quick_fit_reaches_far_and_counts_the_mask():
+def test_a_short_fit_reaches_far_and_counts_the_mask():
     """At a quarter of the size, edges are found from 28 px beside them, which a fit at full size
     does not reach."""
     image = silhouette(cube(), CUBE_POSE)
@@ -408,14 +408,14 @@ def test_a_quick_fit_reaches_far_and_counts_the_mask():
     depth = float((CUBE_POSE[:3, :3] @ mesh_centre(cube()) + CUBE_POSE[:3, 3])[2])
     beside = CUBE_POSE.clone()
     beside[0, 3] += 28.0 / focal * depth
-    right, far = quick_fit(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside]))[
+    right, far = short_fit(contours, crops, K.expand(2, 3, 3), torch.stack([CUBE_POSE, beside]))[
         1
     ].tolist()
     assert far > 0.95 * right
     inside = crop_photographs([image], BOX[None], size=64, margin=0.1)[:, :1].clamp(0, 1)
     with_mask, against = (
         float(
-            quick_fit(
+            short_fit(
                 contours, EdgeCrops.cut([image], BOX[None], 0.1, mask), K[None], CUBE_POSE[None]
             )[1]
         )
@@ -424,7 +424,7 @@ def test_a_quick_fit_reaches_far_and_counts_the_mask():
     assert with_mask > 1.5 * against
 
 
-def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
+def test_known_short_fits_change_nothing_and_fitted_poses_are_kept():
     """A pose that is fitted again moves only if fits around it end elsewhere."""
     image = silhouette(cube(), CUBE_POSE)
     contours = MeshContours(cube())
@@ -434,11 +434,13 @@ def test_known_quick_fits_change_nothing_and_fitted_poses_are_kept():
     )
     problem = contours, crops, K.expand(2, 3, 3)
     first = fit_to_edges(*problem, starts, FIRST.repeat(2))
-    known = fit_to_edges(*problem, starts, FIRST.repeat(2), quick=quick_fit(*problem, starts)[0])
+    known = fit_to_edges(
+        *problem, starts, FIRST.repeat(2), short_fits=short_fit(*problem, starts)[0]
+    )
     assert known.transform.equal(first.transform)
     assert known.edge_support.equal(first.edge_support)
     mixed = torch.stack([first.transform[0], starts[1]])
-    again = fit_to_edges(*problem, mixed, FIRST.repeat(2), again=True)
+    again = fit_to_edges(*problem, mixed, FIRST.repeat(2), refit=True)
     assert again.transform[0].equal(mixed[0])
     assert float(rotation_error(again.transform[1, :3, :3], CUBE_POSE[:3, :3])) < 1
 
@@ -452,5 +454,5 @@ def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(mo
     crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
     for again in (False, True):
         problem = MeshContours(cube()), crops, K[None], CUBE_POSE[None], FIRST
-        fit_to_edges(*problem, quick=CUBE_POSE[None], again=again)
+        fit_to_edges(*problem, short_fits=CUBE_POSE[None], refit=again)
     assert angles == [(8.0,), (8.0, 16.0)]

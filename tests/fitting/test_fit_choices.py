@@ -40,7 +40,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch, T: Tensor, weigh: Weigh, **options: 
     crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
     cameras = K.expand(len(T), 3, 3)
     index = torch.zeros(len(T), dtype=torch.long)
-    return fit_to_edges(MeshContours(cube()), crops, cameras, T, index, quick=T, **options)
+    return fit_to_edges(MeshContours(cube()), crops, cameras, T, index, short_fits=T, **options)
 
 
 def test_the_weighted_support_decides_and_the_plain_one_is_reported(monkeypatch):

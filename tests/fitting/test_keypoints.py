@@ -179,8 +179,8 @@ def test_keypoints_decide_where_most_of_the_object_is_hidden():
     ]
     result = cr.Registrar(mesh(), views=around, mesh_is="exact")([image], box[None], K)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 5.0
-    assert result.hypotheses[0].evidence["landmarks"] > max(
-        h.evidence["landmarks"] for h in result.hypotheses[1:]
+    assert result.hypotheses[0].evidence["keypoints"] > max(
+        h.evidence["keypoints"] for h in result.hypotheses[1:]
     )
 
 

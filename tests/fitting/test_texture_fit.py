@@ -13,7 +13,12 @@ import curvireg_torch as cr
 from curvireg_torch.fitting.contour_problem import ContourProblem
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.fitting.least_squares import apply_twist
-from curvireg_torch.fitting.texture_fit import _TextureRounds, fit_texture, match_patches, turned
+from curvireg_torch.fitting.texture_fit import (
+    _TextureRounds,
+    fit_texture,
+    match_patches,
+    rotated_starts,
+)
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.geometry.cameras import projected_boxes, transform
 from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint, up_rotation
@@ -79,7 +84,7 @@ def test_can_that_is_turned_far_is_found_from_turned_starts(renderer):
     box = projected_boxes(extreme_points(MESH), TRUTH, CAMERA)
     contours = fit_contours(CONTOURS, image, box[0], CAMERA, start)
     assert int(contours.observable) == 5
-    starts = turned(contours, CENTRE)
+    starts = rotated_starts(contours, CENTRE)
     assert len(starts) == 3
     found = fit(renderer, image, starts)
     assert found is not None
@@ -96,9 +101,9 @@ def test_turned_starts_need_an_axis_that_contours_do_not_determine():
             TRUTH, covariance, torch.ones(1), torch.ones(1), torch.tensor([observable])
         )
 
-    assert turned(contours(covariance, 6), CENTRE).equal(TRUTH)
-    assert turned(contours(covariance * torch.nan, 0), CENTRE).equal(TRUTH)
-    starts = turned(contours(covariance, 5), CENTRE)
+    assert rotated_starts(contours(covariance, 6), CENTRE).equal(TRUTH)
+    assert rotated_starts(contours(covariance * torch.nan, 0), CENTRE).equal(TRUTH)
+    starts = rotated_starts(contours(covariance, 5), CENTRE)
     assert rotation_error(starts[:, :3, :3], R).round().tolist() == [0, 16, 16]
     assert torch.allclose(
         (starts[1, :3, :3] @ R.mT)[1], torch.tensor([0.0, 1, 0], dtype=torch.float64)

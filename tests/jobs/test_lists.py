@@ -71,7 +71,7 @@ def test_register_list_registers_changed_rows_again(registrar, entry, tmp_path, 
         return observe(replace(one, box=entry.box, instances=1), photo)
 
     monkeypatch.setattr(runner, "observe", observe_in_box)
-    for settings in ({"top": 1}, {"top": 2}):
+    for settings in ({"hypotheses": 1}, {"hypotheses": 2}):
         done.clear()
         for _ in range(2):
             assert register_rows(rows, tmp_path / "out", registrar, settings).posed == 5

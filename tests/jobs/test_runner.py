@@ -107,10 +107,10 @@ def test_other_requests_settings_and_code_are_registered_again(entries, tmp_path
     registered(entries, tmp_path / "out")
     changed = [replace(entries[0], box=(1.0, 2.0, 3.0, 4.0)), *entries[1:]]
     assert registered(changed, tmp_path / "out") == ["0a"]
-    assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
-    assert registered(changed, tmp_path / "out", settings={"top": 2}) == []
+    assert len(registered(changed, tmp_path / "out", settings={"hypotheses": 2})) == 4
+    assert registered(changed, tmp_path / "out", settings={"hypotheses": 2}) == []
     monkeypatch.setattr(runner, "results_digest", lambda: "newer")
-    assert len(registered(changed, tmp_path / "out", settings={"top": 2})) == 4
+    assert len(registered(changed, tmp_path / "out", settings={"hypotheses": 2})) == 4
 
 
 @pytest.mark.parametrize(

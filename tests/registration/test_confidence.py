@@ -31,7 +31,7 @@ def scores_of(values: dict[int, float], others: float) -> torch.Tensor:
     return torch.tensor([values.get(view, others) for view in range(30)])
 
 
-def test_concentration_in_closed_form():
+def test_ranking_share_in_closed_form():
     """Two peaks, a plateau, one peak, and scores of zero; views 1 to 5 are within 30 degrees of
     view 3."""
     near = confidence.are_near(R30, R30[3])
@@ -43,8 +43,8 @@ def test_concentration_in_closed_form():
         (scores_of({5: 1.0}, 0.0), 1.0),
         (torch.zeros(30), 0.0),
     ):
-        assert confidence.concentration(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    assert confidence.concentration(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
+        assert confidence.ranking_share(scores, near) == pytest.approx(expected, rel=1e-4, abs=1e-6)
+    assert confidence.ranking_share(torch.ones(3), torch.ones(3, dtype=torch.bool)) is None
 
 
 @pytest.mark.parametrize(("degrees", "expected"), [(30.0004, True), (30.01, False)])
@@ -103,8 +103,8 @@ def test_evidence_raises_the_confidence_and_doubt_lowers_it(exact):
         "margin": 0.0,
         "edge_support": 0.5,
         "contours": 0.4,
-        "concentration": 0.3,
-        "landmarks": 1.0,
+        "ranking_share": 0.3,
+        "keypoints": 1.0,
     }
     tied |= {"unmatched": 1.0, "undetermined": 0.5, "outside": 0.1, "border": 1.0, "focal": 0.1}
     decisive = ("similarity", "edge_support") if exact else ("similarity",)
@@ -120,7 +120,7 @@ def test_confidence_features():
         similarity=torch.tensor([0.7, 0.6, 0.5]).double(),
         edge_support=torch.tensor([0.4, 0.5, 0.1]).double(),
         appearance=torch.tensor([1.0, 0.4, 0.8]).double(),
-        landmarks=torch.tensor([2.0, 0.0, 3.0]).double(),
+        keypoints=torch.tensor([2.0, 0.0, 3.0]).double(),
         details=torch.tensor([0.5, 0.0, 0.0]).double(),
         contours=torch.tensor([0.9, 0.8, 1.0]).double(),
     )
@@ -132,8 +132,8 @@ def test_confidence_features():
         "margin": 2.5,
         "edge_support": 0.4,
         "contours": 0.9,
-        "concentration": 0.3,
-        "landmarks": 2.0,
+        "ranking_share": 0.3,
+        "keypoints": 2.0,
         "unmatched": 1.5,
         **doubts,
     }
@@ -146,7 +146,7 @@ def test_confidence_features():
     unknown = {**given, "focal": 3.0}
     assert confidence.confidence_features(evidence, scores, 0.3, **unknown)["focal"] == 1.0
     alone = confidence.confidence_features(evidence[:1], scores[:1], None, **given)
-    assert alone["margin"] is alone["concentration"] is None
+    assert alone["margin"] is alone["ranking_share"] is None
 
 
 def test_undetermined_axes():
@@ -257,7 +257,7 @@ def test_result_of_a_bank_without_rival_views_is_at_most_as_likely_as_not():
     near = sample_views(elevations=[10])[:3]
     bank = ViewBank.build(truck_bank().mesh, near, image_size=96, progress=False)
     result = Registrar(bank)([image], box[None], CAMERA)[0]
-    assert result.confidence_features["concentration"] is None
+    assert result.confidence_features["ranking_share"] is None
     assert result.confidence <= confidence.UNCOMPARED_CONFIDENCE
 
 

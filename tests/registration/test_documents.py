@@ -22,7 +22,7 @@ class Bank(list):
 
 REGISTRAR = SimpleNamespace(
     bank=Bank([0, 1]),
-    of_model=lambda _: REGISTRAR,
+    of_mesh=lambda _: REGISTRAR,
     pipeline=SimpleNamespace(describe=dict),
     is_exact=True,
     symmetries_of=lambda exact: torch.eye(4).repeat(3, 1, 1) if exact else None,

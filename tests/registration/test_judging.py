@@ -149,10 +149,10 @@ def test_views_up_to_symmetries_are_near():
     """Of views at 0, 90 and 180 degrees."""
     evidence = evidence_of(similarity=[0.6, 0.5])
     poses = poses_at(0.0, 90.0)
-    plain = judgement(poses, evidence).confidence_features["concentration"]
+    plain = judgement(poses, evidence).confidence_features["ranking_share"]
     assert plain == pytest.approx(1.0 / (1.0 + 0.5**4 + 0.25**4))
     two = torch.stack([torch.eye(4), HALF_TURN])
-    both = judgement(poses, evidence, symmetries=two).confidence_features["concentration"]
+    both = judgement(poses, evidence, symmetries=two).confidence_features["ranking_share"]
     assert both == pytest.approx((1.0 + 0.25**4) / (1.0 + 0.5**4 + 0.25**4))
 
 
@@ -194,14 +194,14 @@ def test_the_better_of_two_meshes_is_the_more_confident_one():
     certain = judgement(poses, evidence_of(similarity=[0.58, 0.1]))
     assert certain.score < doubtful.score
     assert certain.confidence > doubtful.confidence
-    assert better_of(doubtful, certain, 2).model == 2
+    assert better_of(doubtful, certain, 2).mesh_index == 2
     assert better_of(certain, doubtful, 2) is certain
     assert better_of(certain, certain, 2) is certain, "the first of equal ones"
     one = replace(certain, probabilities=())
     rival = replace(doubtful, probabilities=())
-    assert better_of(one, rival, 1).model == 1
+    assert better_of(one, rival, 1).mesh_index == 1
     assert better_of(rival, one, 1) is rival
     failed = FailedRegistration(LostObjectError("lost"))
-    assert better_of(failed, certain, 3).model == 3
+    assert better_of(failed, certain, 3).mesh_index == 3
     assert better_of(certain, failed, 3) is certain
     assert better_of(failed, failed, 3) is failed

@@ -72,7 +72,7 @@ def test_registrar_of_several_meshes_reports_the_best(tmp_path, monkeypatch):
     meshes = [trimesh.creation.box((0.1, 0.2, 0.1)), example_mesh()]
     views = sample_views(azimuth_step=15, elevations=[0, 20, 40])
     result = Registrar(meshes, views=views)([IMAGE], BOX[None], CAMERA)[0]
-    assert result.model == 1
+    assert result.mesh_index == 1
     assert float(rotation_error(result.rotation, TRUTH[:3, :3])) < 5
     with pytest.raises(InvalidInputError, match="empty list"):
         Registrar([])
@@ -162,27 +162,27 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
 
 
 @pytest.mark.parametrize(("shift", "calls"), [(-1.0, 3), (math.inf, 2)])
-def test_starts_have_one_quick_fit_and_a_pose_that_stays_is_described_once(
+def test_starts_have_one_short_fit_and_a_pose_that_stays_is_described_once(
     monkeypatch, shift, calls
 ):
     """The descriptions: of all poses, of the one that is fitted again if it moves, and of those
     that merged."""
     registrar = truck_registrar()
-    quick_fit = contour_fit.quick_fit
+    short_fit = contour_fit.short_fit
     fits = []
     described = []
     measure = Evidence.of
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
-        return quick_fit(contours, crops, K, T, *index)
+        return short_fit(contours, crops, K, T, *index)
 
     def measured(seen):
         described.append(len(seen.rank))
         return measure(seen)
 
     for module in (contour_fit, together):
-        monkeypatch.setattr(module, "quick_fit", counted)
+        monkeypatch.setattr(module, "short_fit", counted)
     monkeypatch.setattr(Evidence, "of", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
@@ -353,7 +353,7 @@ def test_wrong_box_is_corrected():
 
 @pytest.mark.parametrize(
     ("better", "evidence"),
-    [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"landmarks": 2.0})],
+    [(True, {"similarity": 0.71}), (False, {"similarity": 0.69}), (True, {"keypoints": 2.0})],
 )
 def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evidence):
     """Evidence that depends on the box, as the rank does, is not compared."""
@@ -462,9 +462,9 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
         return found
 
     monkeypatch.setattr(registrar_module, "register_views", register)
-    assert both.register_views([IMAGE], None, CAMERA, None).model == 1
+    assert both.register_views([IMAGE], None, CAMERA, None).mesh_index == 1
     absent.add(both.others[0])
     with pytest.raises(LostObjectError, match="first"):
         both.register_views([IMAGE], None, CAMERA, None)
     absent.remove(both)
-    assert both.register_views([IMAGE], None, CAMERA, None).model == 0
+    assert both.register_views([IMAGE], None, CAMERA, None).mesh_index == 0

@@ -102,7 +102,7 @@ def test_reliable_needs_confidence_no_warnings_and_a_rotation_that_contours_dete
     )
     assert not fitted.reliable
     for keypoints, determine in ((7, False), (8, True)):
-        evidence = {"landmarks": math.log1p(keypoints - 2)}
+        evidence = {"keypoints": math.log1p(keypoints - 2)}
         agreed = tuple(replace(h, evidence=evidence) for h in fitted.hypotheses)
         assert replace(fitted, hypotheses=agreed).reliable == determine
     variances[0] = 1e-4

@@ -200,7 +200,7 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
 
     for module, name in (
         (work, "fit_poses"),
-        (photograph, "with_quick_fit"),
+        (photograph, "with_short_fit"),
         (photograph, "with_edge_support"),
         (photograph, "fit_texture_of"),
         (photograph, "EdgeCrops"),

@@ -22,7 +22,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 def photograph(index: int, **changes: Any) -> Any:
     """A photograph that was registered alone, with a ``confidence`` and an ``angle`` from the joint
     pose."""
-    features = {"concentration": changes.pop("concentration", 0.5)}
+    features = {"ranking_share": changes.pop("ranking_share", 0.5)}
     result = {
         "confidence": 0.5,
         "probabilities": (0.5,),
@@ -180,9 +180,9 @@ def test_failed_photographs_say_why_and_do_not_count(monkeypatch):
 
 def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     """The fraction outside is a thousandth of the height here."""
-    first = photograph(0, concentration=0.2, warnings=("b", "a", "own"))
-    second = photograph(1, concentration=None, warnings=("a", "b"))
-    third = photograph(2, concentration=0.6, warnings=("b", "x", "a"))
+    first = photograph(0, ranking_share=0.2, warnings=("b", "a", "own"))
+    second = photograph(1, ranking_share=None, warnings=("a", "b"))
+    third = photograph(2, ranking_share=0.6, warnings=("b", "x", "a"))
     first.size = (100, 200)
     second.size = (300, 200)
     third.size = (100, 200)
@@ -192,9 +192,9 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     scores = SCORES | {2: [1.0, 1.0, 1.0]}
     result = joint(monkeypatch, found, scores, vote={0: 0.5, 1: 1.0, 2: 0.5})
     features = result.confidence_features
-    assert features["concentration"] == pytest.approx(0.4), "of those that know it"
+    assert features["ranking_share"] == pytest.approx(0.4), "of those that know it"
     assert features["outside"] == pytest.approx(0.25 * 0.1 + 0.5 * 0.3 + 0.25 * 0.1)
     assert features["border"] == pytest.approx(0.5 * 2)
     assert features["undetermined"] == 3.0
-    assert features["unmatched"] == pytest.approx(3.5 - features["landmarks"])
+    assert features["unmatched"] == pytest.approx(3.5 - features["keypoints"])
     assert result.warnings == ("a", "b")

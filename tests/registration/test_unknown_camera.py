@@ -64,13 +64,13 @@ def test_the_angle_to_the_centre_of_the_box():
 
 
 def test_starts_are_the_best_view_of_each_camera_and_the_best_views(monkeypatch):
-    """Of three cameras and four views; the quick fits of the second camera reach most."""
+    """Of three cameras and four views; the short fits of the second camera reach most."""
     support = torch.tensor(
         [[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]]
     ).double()
     given = [poses_at(4, K=(1.0 + k) * CAMERA, rank=[0.0, -1.0, -2.0, -3.0]) for k in range(3)]
     monkeypatch.setattr(
-        focal, "with_quick_fit", lambda _, __, poses: (poses, support.flatten().clone())
+        focal, "with_short_fit", lambda _, __, poses: (poses, support.flatten().clone())
     )
     ranked = support * 20.0 - torch.arange(4)
     chosen = focal.starts_of_fields(NOTHING, NOTHING, given, 2, screening_weight=20.0)
