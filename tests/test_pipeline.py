@@ -118,7 +118,7 @@ def test_read_completes_a_partial_file_with_defaults_and_names_the_file_and_the_
         Pipeline.read(tmp_path / "none.json")
     for text, message in (
         ("{", "not JSON"),
-        ('{"version": 99}', "version 2"),
+        ('{"version": 99}', "version 3"),
         ('{"field": "nope"}', "field: expected one of 'learned'"),
         ('{"colour": 1}', "colour"),
         ('{"views": {"theta_step": 0}}', "theta_step"),
