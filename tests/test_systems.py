@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.data.box_files import BoxFile
 from curvireg_torch.data.calibrations import load_camera
 from curvireg_torch.data.masks import mask_file
+from curvireg_torch.formats.boxes import BoxFile, PictureSize
 from curvireg_torch.mesh.source import MeshSource
 from curvireg_torch.utils.files import split_name
 from tests._support.scenes import CAMERA, scene, truck_registrar
@@ -127,7 +127,12 @@ def test_drives_are_no_names_within_files(
     assert mask_file(f"{name}:2") == (file, 2)
     assert float(load_camera(f"{name}:right").matrix[0, 0]) == 60.0
     file.write_text('[{"image_id": "a", "bbox": [10, 20, 30, 40], "category_id": 3}]')
-    assert BoxFile(f"{name}:3").box(Path("a.jpg")) == (9.5, 19.5, 39.5, 59.5)
+    assert BoxFile(f"{name}:3").box(Path("a.jpg"), lambda: PictureSize((48, 64))) == (
+        9.5,
+        19.5,
+        39.5,
+        59.5,
+    )
     assert split_name(f"{name}.txt") == (Path(f"{name}.txt"), ""), "it does not exist"
 
 

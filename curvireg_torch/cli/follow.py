@@ -298,7 +298,7 @@ def _box(
 ) -> list[float] | None:
     """The given box of the first frame, or a detector's of any; a frame that has none is searched
     for the object."""
-    from ..data.box_files import pixel_box
+    from ..formats.boxes import pixel_box
 
     size = (image.shape[-2], image.shape[-1])
     if options.box is not None:
@@ -306,7 +306,7 @@ def _box(
         return list(pixel_box(options.box, kind, size)) if is_first else None
     video, _, number = name.rpartition("-")
     names = [name, f"{video}_{int(number) + 1}"] if number.isdecimal() else [name]
-    found = (options.detected_box(Path(text), size) for text in names)
+    found = (options.detected_box(text, size) for text in names)
     return next((list(box) for box in found if box is not None), None)
 
 

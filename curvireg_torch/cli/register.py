@@ -562,6 +562,8 @@ def _advice(document: Mapping[str, Any]) -> str:
         return "the box ends at the border of the photograph: take one that shows the whole object"
     if document["translation"] is None:
         return f"give the --camera, and check {mesh}"
+    if suspicion := _suspicious_box(document.get("inputs", {})):
+        return f"{suspicion}; and check {mesh}"
     if (features.get("undetermined") or 0.0) >= OPEN_AXES:
         return (
             f"the contours that were found leave its rotation open: take a sharper or closer "
@@ -569,6 +571,23 @@ def _advice(document: Mapping[str, Any]) -> str:
             f"and check {mesh}"
         )
     return f"check that the box is tight, and {mesh}"
+
+
+def _suspicious_box(inputs: Mapping[str, Any]) -> str:
+    """What a box of an answer that is not reliable may be instead of px of the photograph as it is
+    shown; "" without a suspicion."""
+    box = inputs.get("box")
+    picture = inputs.get("picture")
+    if box is None or picture is None:
+        return ""
+    if max(box) <= 100.0 < min(picture["width"], picture["height"]):
+        return "the box is in px: of percent, divide it by 100 and add --box-format fractions"
+    if (orientation := picture["orientation"]) != 1:
+        return (
+            f"box and mask are of the photograph as it is shown, with its EXIF orientation "
+            f"{orientation} applied: check that they are not of the pixels in the file"
+        )
+    return ""
 
 
 @contextmanager

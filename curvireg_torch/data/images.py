@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, CurviregError, ImageError, MissingFileError
+from ..formats.boxes import PictureSize
 from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
@@ -204,8 +205,8 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
-def photo_size(path: Path) -> tuple[int, int]:
-    """(H, W) of a photograph as :func:`read_photo` shows it, from its header; errors are the
+def picture_size(path: Path) -> PictureSize:
+    """The size of a photograph as :func:`read_photo` shows it, from its header; errors are the
     same."""
 
     def stored_size(image: "Image", *_: object) -> tuple[int, int]:
@@ -214,7 +215,8 @@ def photo_size(path: Path) -> tuple[int, int]:
         return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
 
     (width, height), orientation = decoded(path, stored_size)
-    return (width, height) if orientation > 4 else (height, width)
+    is_turned = orientation > 4
+    return PictureSize((width, height) if is_turned else (height, width), orientation)
 
 
 class _Exif(NamedTuple):
@@ -402,7 +404,7 @@ def _notes(image: "Image") -> tuple[str, ...]:
     return tuple(text for text, applies in notes.items() if applies)
 
 
-def oriented(x: NDArray[np.uint8], orientation: int) -> NDArray[np.uint8]:
+def oriented(x: NDArray[Any], orientation: int) -> NDArray[Any]:
     """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
     x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
     return x.swapaxes(0, 1) if orientation > 4 else x

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..data import Photo, read_photo
 from ..data.frames import VideoFrame
-from ..data.masks import mask_file
+from ..data.masks import mask_as_shown, mask_file
 from ..data.pose_files import PoseFile
 from ..errors import CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
@@ -133,7 +133,8 @@ def observe(entry: Entry, photo: Photo) -> Observation:
     if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     camera, source = camera_of(entry, photo)
-    boxes, masks = (None if given is None else [given] for given in (entry.box, entry.mask))
+    mask = mask_as_shown(entry.mask, photo)
+    boxes, masks = (None if given is None else [given] for given in (entry.box, mask))
     item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):
         raise item.with_subject(entry.name)

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,9 +29,10 @@ from ..utils.choices import (
 )
 
 if TYPE_CHECKING:
-    from ..data.box_files import Box, BoxFile
     from ..data.pose_files import PoseFile
     from ..features import LearnedCurvilinearSaliency
+    from ..formats.boxes import BoxFile
+    from ..formats.boxes.files import Corners
     from ..geometry import Camera
     from ..geometry.pose_prior import PosePrior
     from ..pipeline import Pipeline
@@ -161,9 +162,9 @@ class RegisterOptions:
     )
     boxes: Path | None = _option(
         None,
-        "boxes of a detector, the best for each photograph: JSON of COCO or MegaPose, a text file "
-        "of YOLO, or a folder "
-        "of these; PATH:LABEL takes one label",
+        "boxes of a detector, the best for each photograph: JSON of COCO, MegaPose or LabelMe, XML "
+        "of Pascal VOC, a text file of YOLO, or a folder of these; PATH:LABEL takes one label, "
+        "PATH:id=7 one number of a tracker",
         type=Path,
     )
     camera: Any = _option(  # four numbers, a Camera, or None
@@ -292,27 +293,31 @@ class RegisterOptions:
 
     @cached_property
     def _box_file(self) -> "BoxFile | None":
-        from ..data.box_files import BoxFile
+        from ..formats.boxes import BoxFile
 
         return None if self.boxes is None else BoxFile(self.boxes)
 
-    def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Box | None":
+    def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Corners | None":
         """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that
         of a detector."""
-        from ..data.box_files import pixel_box
-        from ..data.images import photo_size
+        from ..data.images import picture_size
+        from ..formats.boxes import pixel_box
 
         numbers = self.box if numbers is None else numbers
         if numbers is None:
-            return None if self._box_file is None else self._box_file.box(photo)
+            return (
+                None
+                if self._box_file is None
+                else self._box_file.box(photo, partial(picture_size, photo))
+            )
         kind = self.box_format or "xyxy"
         is_relative = kind in ("fractions", "yolo") and photo.suffix.lower() not in VIDEOS
-        return pixel_box(numbers, kind, photo_size(photo) if is_relative else None)
+        return pixel_box(numbers, kind, picture_size(photo).shown if is_relative else None)
 
-    def detected_box(self, photo: Path, size: tuple[int, int]) -> "Box | None":
-        """The box of a detector for a photograph of (H, W), or for a frame by its name; None where
-        it has none, or there is no detector."""
-        return None if self._box_file is None else self._box_file.find(photo, size)
+    def detected_box(self, name: str, size: tuple[int, int]) -> "Corners | None":
+        """The box of a detector for a frame of (H, W) by its name; None where it has none, or there
+        is no detector."""
+        return None if self._box_file is None else self._box_file.of_frame(name, size)
 
     def read_start(self) -> "PoseFile | None":
         """The pose of the file ``start``, or None."""

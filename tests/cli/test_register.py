@@ -320,6 +320,11 @@ def test_register_refines_a_start_or_writes_that_the_object_is_lost(
     assert "outside the photograph" in capsys.readouterr().err
 
 
+def inputs_with(*, box=(300, 200, 500, 400), **picture):
+    picture = {"width": 960, "height": 720, "orientation": 1, **picture}
+    return {"inputs": {"box": box, "picture": picture}}
+
+
 def test_advice_names_what_was_measured_or_says_less():
     document = {"warnings": [], "ambiguous": None, "translation": [0, 0, 1], "edge_support": 0.1}
     document["confidence_features"] = {"border": 0, "undetermined": 0.1}
@@ -330,6 +335,10 @@ def test_advice_names_what_was_measured_or_says_less():
         ({"confidence_features": {"border": 1}}, "border of the photograph"),
         ({"translation": None}, "--camera"),
         ({"confidence_features": {"border": 0, "undetermined": 1.2}}, "rotation open"),
+        (inputs_with(box=[34.8, 20.3, 74, 79.7]), "of percent, divide it by 100"),
+        (inputs_with(box=[34.8, 20.3, 174, 79.7]), "check that the box is tight"),
+        (inputs_with(width=90, box=[34, 20, 74, 79]), "check that the box is tight"),
+        (inputs_with(orientation=6), "EXIF orientation 6 applied"),
     ):
         assert words in _advice({**document, **change})
 

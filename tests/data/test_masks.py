@@ -8,7 +8,8 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch.data.masks import mask_file, read_mask
+from curvireg_torch.data.images import read_photo
+from curvireg_torch.data.masks import mask_as_shown, mask_file, read_mask
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 from curvireg_torch.registration.inputs import image_item
 from tests._support.exif import exif, with_exif
@@ -114,3 +115,22 @@ def test_a_file_whose_name_ends_like_a_label_is_read(tmp_path):
     assert mask_file(file) == (tmp_path / "labels.png", 2)
     file.write_bytes(b"")
     assert mask_file(file) == (file, None)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("form", ["path", "array", "tensor"])
+def test_masks_of_the_pixels_in_the_file_are_turned_with_the_photograph(
+    tmp_path, orientation, form
+):
+    """Where the shape shows it: of a picture that is turned by 90 degrees."""
+    pixels = np.where(OBJECT[..., None], 255, 40).astype(np.uint8).repeat(3, axis=2)
+    Image.fromarray(pixels).save(tmp_path / "photo.png")
+    with_exif(tmp_path / "photo.png", exif(orientation))
+    photo = read_photo(tmp_path / "photo.png")
+    as_shown = photo.image[0].numpy() == 255
+    given = OBJECT if orientation > 4 else as_shown
+    mask = written(tmp_path / "mask.png", 255 * given.astype(np.uint8))
+    forms = {"path": mask, "array": given, "tensor": torch.from_numpy(np.array(given))}
+    for shown in (forms[form], as_shown):
+        item = image_item(photo.image, None, mask=mask_as_shown(shown, photo))
+        assert np.array_equal(item.mask.numpy() >= 0.5, as_shown)

@@ -1,0 +1,291 @@
+"""The boxes that a file lists, as they are written there."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from ...errors import InvalidInputError
+from ...utils.files import check_table_size, finite_numbers, read_json
+from ..xml_files import check_xml
+
+README = "docs/formats.md"
+SUFFIXES = (".txt", ".json", ".xml")
+"""Of files of boxes of one photograph, by which a folder of them is searched."""
+
+PIXEL_CENTRE = 0.5
+"""px from the centre of the first pixel to the picture's edge, where detectors count from."""
+
+ANY_FOLDER = "*"
+"""Of the path of an image: a folder of any name."""
+
+ID_LABEL = "id="
+"""Start of the label by which a box of a tracker is chosen."""
+
+Corners = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ImageBox:
+    """One box of a file.
+
+    Attributes:
+        corners: x0, y0, x1, y1 from the picture's edge: in px, or in fractions of the picture.
+        is_relative: whether they are fractions.
+        image: the photograph as the file names it, perhaps with folders; "" of a file of one
+            photograph, which does not name it.
+        size: (H, W) of the picture that the box is of, where the file states it.
+        score: of the detector; 1 without one.
+        labels: number and name of what the box shows.
+        track: the number that a tracker gave the object; "" without one.
+    """
+
+    corners: Corners
+    is_relative: bool = False
+    image: str = ""
+    size: tuple[int, int] | None = None
+    score: float = 1.0
+    labels: frozenset[str] = frozenset()
+    track: str = ""
+
+
+def read_boxes(file: Path) -> list[ImageBox]:
+    """The boxes of a file.
+
+    Args:
+        file: JSON of COCO, its annotations or its results; ``object_data.json`` of MegaPose; JSON
+            of LabelMe; XML of Pascal VOC; or a text file of YOLO with boxes, oriented boxes or
+            polygons, around which a box is laid.
+
+    Raises:
+        InvalidInputError: it is none of these, or has a value that cannot be meant.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "photo.txt")
+        >>> _ = file.write_text("0 0.5 0.5 0.5 0.25 0.9")
+        >>> read_boxes(file)[0].corners, read_boxes(file)[0].score
+        ((0.25, 0.375, 0.75, 0.625), 0.9)
+    """
+    try:
+        if file.suffix.lower() == ".txt":
+            return list(_yolo(_text(file)))
+        if file.suffix.lower() == ".xml":
+            return list(_xml(file))
+        return list(_json(read_json(file, (dict, list), README)))
+    except InvalidInputError as error:
+        raise error.with_subject(file) from error
+
+
+def _text(file: Path) -> str:
+    check_table_size(file)
+    return file.read_text(encoding="utf-8", errors="replace")
+
+
+def _refused(what: str) -> InvalidInputError:
+    return InvalidInputError(f"{what}; {README} shows the formats")
+
+
+# ---- YOLO: fractions of the picture -------------------------------------------------------------
+
+
+def _yolo(text: str) -> Iterator[ImageBox]:
+    """Lines of CLASS and numbers: a box with perhaps a score and a tracker's number, an oriented
+    box, or a polygon."""
+    for count, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            numbers = tuple(map(float, words[1:]))
+        except ValueError:
+            numbers = ()
+        box = _yolo_box(numbers) if all(map(math.isfinite, numbers)) else None
+        if box is None:
+            expected = "CLASS CX CY WIDTH HEIGHT [SCORE], or CLASS X0 Y0 X1 Y1 X2 Y2 ..., of YOLO"
+            raise _refused(f"line {count}: expected {expected}")
+        yield replace(box, labels=frozenset(words[:1]))
+
+
+def _yolo_box(numbers: Sequence[float]) -> ImageBox | None:
+    """The box of the numbers of a line; None if there are too few."""
+    count = len(numbers)
+    ends_with_track = count in (5, 6) and numbers[-1] >= 1.0 and numbers[-1] == int(numbers[-1])
+    if count in (4, 5) or (count == 6 and ends_with_track):
+        x, y, width, height, *more = numbers
+        corners = (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+        track = str(int(more.pop())) if ends_with_track else ""
+        score = more[0] if more else 1.0
+        if score > 1.0:
+            raise _refused(f"a score of {score:g}, above 1")
+        return ImageBox(corners, True, score=score, track=track)
+    if count < 6:
+        return None
+    # of an oriented box or a polygon, behind which a score may stand
+    score = numbers[-1] if count % 2 else 1.0
+    return ImageBox(_around(numbers[: count - count % 2]), True, score=score)
+
+
+def _around(numbers: Sequence[float]) -> Corners:
+    """The corners around points x, y, x, y, ..."""
+    x = numbers[::2]
+    y = numbers[1::2]
+    return min(x), min(y), max(x), max(y)
+
+
+# ---- JSON: COCO, MegaPose, LabelMe --------------------------------------------------------------
+
+
+def _json(content: Any) -> Iterator[ImageBox]:
+    for detect, read in _JSON_READERS:
+        if detect(content):
+            return read(content)
+    raise _refused("expected detections of COCO, or annotations of LabelMe")
+
+
+def _is_label_studio(content: Any) -> bool:
+    first = content[0] if isinstance(content, list) and content else None
+    return isinstance(first, dict) and "data" in first and "bbox" not in first
+
+
+def _label_studio(_: Any) -> Iterator[ImageBox]:
+    raise InvalidInputError("Label Studio's own JSON; export it as COCO, or as YOLO")
+
+
+def _is_labelme(content: Any) -> bool:
+    return isinstance(content, dict) and isinstance(content.get("shapes"), list)
+
+
+def _labelme(content: Mapping[str, Any]) -> Iterator[ImageBox]:
+    """Shapes of points in px from the picture's edge; a circle is its centre and a point on it."""
+    size = _size(content.get("imageHeight"), content.get("imageWidth"))
+    image = str(content.get("imagePath") or "")
+    for index, shape in enumerate(content["shapes"]):
+        numbers = _numbers_of_points(shape.get("points") if isinstance(shape, dict) else None)
+        if len(numbers) < 4:
+            raise _refused(f"shape {index}: expected points x, y")
+        corners = _around(numbers)
+        if shape.get("shape_type") == "circle":
+            x, y, *edge = numbers[:4]
+            radius = math.dist((x, y), edge)
+            corners = (x - radius, y - radius, x + radius, y + radius)
+        label = frozenset({str(shape.get("label", ""))} - {""})
+        yield ImageBox(corners, image=image, size=size, labels=label)
+
+
+def _numbers_of_points(points: Any) -> Sequence[float]:
+    """x, y, x, y, ... of a list of points; none of anything else."""
+    if not isinstance(points, list):
+        return ()
+    numbers: list[float] = []
+    for point in points:
+        numbers += finite_numbers(point, 2) or (math.nan,)
+    return () if any(map(math.isnan, numbers)) else numbers
+
+
+def _is_coco(content: Any) -> bool:
+    items = content.get("annotations") if isinstance(content, dict) else content
+    return isinstance(items, list)
+
+
+def _coco(content: Any) -> Iterator[ImageBox]:
+    """Of COCO x, y, width, height from the picture's edge; of MegaPose ``bbox_modal``, corners from
+    the centre of the first pixel."""
+    items = content
+    images: Mapping[str, Mapping[str, Any]] = {}
+    categories: Mapping[str, Mapping[str, Any]] = {}
+    if isinstance(content, dict):
+        items = content["annotations"]
+        images = _by_id(content.get("images"))
+        categories = _by_id(content.get("categories"))
+    for index, item in enumerate(items):
+        fields = item if isinstance(item, dict) else {}
+        is_corners = "bbox" not in fields
+        numbers = finite_numbers(fields.get("bbox_modal" if is_corners else "bbox"), 4)
+        if numbers is None:
+            raise _refused(f"entry {index}: expected bbox of 4 numbers")
+        x, y, c, d = numbers
+        corners = (x, y, x + c, y + d)
+        if is_corners:
+            corners = (
+                x + PIXEL_CENTRE,
+                y + PIXEL_CENTRE,
+                c + PIXEL_CENTRE,
+                d + PIXEL_CENTRE,
+            )
+        score = finite_numbers([fields.get("score", 1.0)], 1) or (0.0,)
+        category = str(fields.get("category_id", ""))
+        name = str(categories.get(category, {}).get("name", ""))
+        labels = frozenset({category, str(fields.get("label", "")), name} - {""})
+        number = str(fields.get("image_id", ""))
+        image = images.get(number, {})
+        file_name = str(image.get("file_name", "") or number)
+        if (scene := fields.get("scene_id")) is not None:  # of BOP: scene/rgb/image
+            file_name = f"{scene}/{ANY_FOLDER}/{file_name}"
+        size = _size(image.get("height"), image.get("width"))
+        yield ImageBox(corners, image=file_name, size=size, score=score[0], labels=labels)
+
+
+def _by_id(entries: Any) -> dict[str, Mapping[str, Any]]:
+    """The dicts of a list by their ``id``."""
+    known = entries if isinstance(entries, list) else []
+    return {str(entry.get("id")): entry for entry in known if isinstance(entry, dict)}
+
+
+def _size(height: Any, width: Any) -> tuple[int, int] | None:
+    """(H, W) where both are whole numbers > 0."""
+    sides = finite_numbers([height, width], 2)
+    if sides is None or min(sides) < 1 or any(side != int(side) for side in sides):
+        return None
+    return int(sides[0]), int(sides[1])
+
+
+_JSON_READERS: tuple[tuple[Callable[[Any], bool], Callable[[Any], Iterator[ImageBox]]], ...] = (
+    (_is_label_studio, _label_studio),
+    (_is_labelme, _labelme),
+    (_is_coco, _coco),
+)
+
+
+# ---- XML: Pascal VOC ----------------------------------------------------------------------------
+
+
+def _xml(file: Path) -> Iterator[ImageBox]:
+    check_table_size(file)
+    data = file.read_bytes()
+    try:
+        check_xml(data)
+        root = ElementTree.fromstring(data)
+    except (ValueError, ElementTree.ParseError, LookupError) as error:
+        raise InvalidInputError(f"damaged, or no XML that is read ({error})") from error
+    if root.tag == "annotations":
+        raise InvalidInputError("CVAT's own XML; export it as COCO 1.0, YOLO, or PASCAL VOC")
+    if root.tag != "annotation":
+        raise _refused("expected <annotation> of Pascal VOC")
+    return _voc(root)
+
+
+def _voc(root: ElementTree.Element) -> Iterator[ImageBox]:
+    """Corners in px. The tools that write this today count from the picture's edge; VOC itself
+    counts pixels from 1, which is half a pixel off at each side."""
+    size = _size(_number(root, "size/height"), _number(root, "size/width"))
+    image = root.findtext("filename", "").strip()
+    folder = root.findtext("folder", "").strip()
+    for index, item in enumerate(root.iter("object")):
+        sides = [_number(item, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")]
+        corners = finite_numbers(sides, 4)
+        if corners is None:
+            raise _refused(f"object {index}: expected <bndbox> of xmin, ymin, xmax, ymax")
+        x0, y0, x1, y1 = corners
+        label = frozenset({item.findtext("name", "").strip()} - {""})
+        name = f"{folder}/{image}" if folder and image else image
+        yield ImageBox((x0, y0, x1, y1), image=name, size=size, labels=label)
+
+
+def _number(element: ElementTree.Element, path: str) -> float | None:
+    try:
+        return float(element.findtext(path, ""))
+    except ValueError:
+        return None

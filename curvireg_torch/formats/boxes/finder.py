@@ -1,0 +1,343 @@
+"""The box of a photograph, in px, among those of a file or a folder."""
+
+import os
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from ...errors import CurviregWarning, InvalidInputError, MissingFileError
+from ...utils.choices import BOX_FORMATS
+from ...utils.files import split_name
+from .files import (
+    ANY_FOLDER,
+    ID_LABEL,
+    PIXEL_CENTRE,
+    README,
+    SUFFIXES,
+    Corners,
+    ImageBox,
+    read_boxes,
+)
+
+MAX_FOLDERS = 8  # around a photograph by which it is told from others of its name
+
+
+class PictureSize(NamedTuple):
+    """(H, W) of a photograph as viewers show it, and its EXIF orientation, 1 to 8."""
+
+    shown: tuple[int, int]
+    orientation: int = 1
+
+    @property
+    def stored(self) -> tuple[int, int]:
+        """(H, W) of the pixels in the file."""
+        return self.shown[::-1] if self.orientation > 4 else self.shown
+
+
+def pixel_box(
+    numbers: Sequence[float], box_format: str, size: tuple[int, int] | None = None
+) -> Corners:
+    """x0, y0, x1, y1 in px of the four numbers of a box.
+
+    Args:
+        numbers: the box.
+        box_format: "xyxy", as they are; "xywh": x0, y0, width, height in px; "fractions": x0, y0,
+            x1, y1 in fractions of the picture; "yolo": centre x, y, width, height in fractions.
+        size: (H, W) of the photograph, for fractions.
+
+    Example:
+        >>> pixel_box((0.5, 0.5, 0.5, 0.25), "yolo", (480, 640))
+        (159.5, 179.5, 479.5, 299.5)
+    """
+    a, b, c, d = numbers
+    if box_format == "xyxy":
+        return a, b, c, d
+    if box_format == "xywh":
+        return a, b, a + c, b + d
+    if size is None:
+        raise InvalidInputError(f"box: {box_format} of a photograph, not of a video; give px")
+    if box_format == "yolo":
+        return _of_fractions((a - c / 2, b - d / 2, a + c / 2, b + d / 2), size)
+    return _of_fractions((a, b, c, d), size)
+
+
+def _of_fractions(corners: Corners, size: tuple[int, int]) -> Corners:
+    if not all(-0.5 <= value <= 1.5 for value in corners):
+        kinds = ", ".join(BOX_FORMATS)
+        raise InvalidInputError(
+            f"box: expected fractions of the picture from 0 to 1; of px, give another format "
+            f"({kinds})"
+        )
+    height, width = size
+    x0, y0, x1, y1 = corners
+    return _from_centre((x0 * width, y0 * height, x1 * width, y1 * height))
+
+
+def _from_centre(corners: Corners) -> Corners:
+    """px that count from the centre of the first pixel, of px from the picture's edge."""
+    x0, y0, x1, y1 = corners
+    return x0 - PIXEL_CENTRE, y0 - PIXEL_CENTRE, x1 - PIXEL_CENTRE, y1 - PIXEL_CENTRE
+
+
+class BoxFile:
+    """The boxes of a detector or an annotation tool, and the best one of each photograph.
+
+    A photograph is found by the end of its path: by the file's name, or the name without its
+    ending, and by the folders that distinguish the photographs of the file.
+
+    Args:
+        path: a file of :func:`.read_boxes`, or a folder of them, each called as its photograph.
+            ``PATH:LABEL`` takes only boxes of this label: its number, or its name; or
+            ``PATH:id=7`` of this number of a tracker.
+
+    Raises:
+        MissingFileError: there is no such file or folder.
+        InvalidInputError: the file cannot be read.
+
+    Example:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp(), "boxes.json")
+        >>> _ = file.write_text('[{"image_id": "a", "bbox": [10, 20, 30, 40], "score": 0.9}]')
+        >>> BoxFile(file).box(Path("a.jpg"), lambda: PictureSize((480, 640)))
+        (9.5, 19.5, 39.5, 59.5)
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path, self.label = split_name(path)
+        # the photograph that was given boxes which name no folder: another of its name is refused
+        self._owners: dict[str, str] = {}
+        if not self.path.exists():
+            raise MissingFileError(
+                f"no such file or folder; {README} shows the formats", subject=path
+            )
+        if self.path.is_file():
+            _ = self._images
+
+    def box(self, photo: Path, picture: Callable[[], PictureSize]) -> Corners:
+        """x0, y0, x1, y1 in px of the best box of a photograph.
+
+        Args:
+            photo: its path.
+            picture: returns its size; called where the box depends on it.
+
+        Raises:
+            InvalidInputError: the photograph has no box, or several, none of which is the best; or
+                boxes that are of a picture of another size, or of another photograph of its name.
+        """
+        found = self._find(photo, picture, owner=os.path.abspath(photo))
+        if found is None:
+            kind = f" of label {self.label!r}" if self.label else ""
+            raise InvalidInputError(
+                f"no box{kind} in {self.path}; detect it again, or leave the photograph out"
+            )
+        return found
+
+    def of_frame(self, name: str, size: tuple[int, int]) -> Corners | None:
+        """:meth:`box` of a frame of a video of (H, W), called as its picture would be; None if it
+        has none."""
+        return self._find(Path(name), lambda: PictureSize(size), owner="")
+
+    def _find(
+        self, photo: Path, picture: Callable[[], PictureSize], *, owner: str
+    ) -> Corners | None:
+        boxes = self._of(photo, owner)
+        if self.label.startswith(ID_LABEL):
+            boxes = [box for box in boxes if box.track == self.label.removeprefix(ID_LABEL)]
+        elif self.label:
+            boxes = [box for box in boxes if self.label in box.labels]
+        return _in_pixels(_best(boxes), picture) if boxes else None
+
+    def _of(self, photo: Path, owner: str) -> list[ImageBox]:
+        if self.path.is_dir():
+            file, is_certain = self._label_file(photo)
+            boxes = [] if file is None else read_boxes(file)
+            key = str(file)
+        else:
+            key, is_certain = self._image(photo)
+            boxes = self._images.get(key, [])
+        if boxes and owner and not is_certain:
+            self._check_owner(key, owner)
+        return boxes
+
+    def _check_owner(self, key: str, owner: str) -> None:
+        """Refuse boxes that another photograph was given already; say once that folders differ."""
+        if self.path.is_file() and _folders(key) and not self._owners:
+            warnings.warn(CurviregWarning(f"boxes of {key} are used for {owner}"), stacklevel=2)
+        first = self._owners.setdefault(key, owner)
+        if first != owner:
+            raise InvalidInputError(
+                f"its box in {self.path} may be that of {first}, too; name their folders in the "
+                "file, or put the files of boxes into folders called as theirs"
+            )
+
+    def _label_file(self, photo: Path) -> tuple[Path | None, bool]:
+        """The file of a folder that is called as a photograph, in as many folders called as its
+        own as there are; and whether there is such a folder."""
+        around = Path(os.path.abspath(photo)).parts[1:-1][-MAX_FOLDERS:]
+        for count in range(len(around), -1, -1):
+            folder = self.path.joinpath(*around[len(around) - count :])
+            files = [folder / f"{photo.stem}{suffix}" for suffix in SUFFIXES]
+            files = [file for file in files if file.is_file()]
+            if len(files) > 1:
+                names = " and ".join(file.name for file in files)
+                raise InvalidInputError(f"{folder}: {names} for one photograph; keep one of them")
+            if files:
+                return files[0], count > 0
+        return None, True
+
+    @cached_property
+    def _images(self) -> Mapping[str, list[ImageBox]]:
+        """The boxes of a file, by the photograph as the file names it."""
+        images: dict[str, list[ImageBox]] = {}
+        for box in read_boxes(self.path):
+            images.setdefault(box.image, []).append(box)
+        return images
+
+    @cached_property
+    def _names(self) -> Mapping[str, list[str]]:
+        """The images of a file by the names that a photograph may be found by."""
+        names: dict[str, list[str]] = {}
+        for image in self._images:
+            last = PurePosixPath(_posix(image)).name
+            for name in dict.fromkeys((last, _stem(last), _without_zeros(_stem(last)))):
+                names.setdefault(name, []).append(image)
+        return names
+
+    @cached_property
+    def _common_folders(self) -> int:
+        """Number of folders that the images of a file have in common, from the first one on."""
+        levels = zip(*map(_folders, self._images), strict=False)
+        return sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, levels))
+
+    def _distinguishing_folders(self, image: str) -> int:
+        """Number of folders of an image that those around a photograph must match."""
+        folders = _folders(image)
+        is_scene = ANY_FOLDER in folders
+        return len(folders) - (0 if is_scene else self._common_folders)
+
+    def _image(self, photo: Path) -> tuple[str, bool]:
+        """The image of a file that is a photograph, and whether one of its folders says so."""
+        around = _folders(os.path.abspath(photo))
+        for name in (photo.name, photo.stem, _without_zeros(photo.stem)):
+            matches = {
+                image: _matching(_folders(image), around) for image in self._names.get(name, [])
+            }
+            matches = {
+                image: count
+                for image, count in matches.items()
+                if count >= self._distinguishing_folders(image)
+            }
+            if not matches:
+                continue
+            most = max(matches.values())
+            chosen = [image for image, count in matches.items() if count == most]
+            if len(chosen) > 1:
+                names = " and ".join(chosen[:3])
+                raise InvalidInputError(
+                    f"{self.path}: {names} may both be this photograph; name their folders"
+                )
+            (image,) = chosen
+            return image, most > 0
+        return "", False
+
+
+def _posix(name: str) -> str:
+    return name.replace("\\", "/")
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def _without_zeros(name: str) -> str:
+    return str(int(name)) if name.isdecimal() and len(name) < 20 else name
+
+
+def _folders(name: str) -> list[str]:
+    """The folders of a path, numbers without zeros in front."""
+    parts = PurePosixPath(_posix(name)).parts[:-1]
+    return [_without_zeros(part) for part in parts if part not in ("/", ".", "..")]
+
+
+def _matching(folders: Sequence[str], around: Sequence[str]) -> int:
+    """How many folders at the end of two paths are the same."""
+    count = 0
+    for ours, theirs in zip(reversed(folders), reversed(around), strict=False):
+        if ours not in (theirs, ANY_FOLDER):
+            break
+        count += 1
+    return count
+
+
+def _best(boxes: Sequence[ImageBox]) -> ImageBox:
+    """The box of the highest score; two that differ in what they show are refused."""
+    most = max(box.score for box in boxes)
+    best = [box for box in boxes if box.score == most]
+    tracks = dict.fromkeys(box.track for box in best)
+    if len(tracks) > 1:
+        listed = ", ".join(filter(None, tracks))
+        raise InvalidInputError(
+            f"boxes with a tracker's numbers ({listed}) and without scores; choose one as "
+            f"PATH:{ID_LABEL}NUMBER, or write scores (save_conf of ultralytics)"
+        )
+    kinds = dict.fromkeys(max(box.labels, key=_is_word, default="") for box in best)
+    if len(kinds) > 1:
+        listed = ", ".join(list(kinds)[:8])
+        raise InvalidInputError(
+            f"boxes of several labels, none with a higher score; choose one as PATH:LABEL: {listed}"
+        )
+    return best[0]
+
+
+def _is_word(label: str) -> tuple[bool, str]:
+    """Order of labels, of which the name says more than the number."""
+    return not label.isdecimal(), label
+
+
+def _in_pixels(box: ImageBox, picture: Callable[[], PictureSize]) -> Corners:
+    """The corners in px of a photograph as it is shown."""
+    if box.is_relative:
+        return _of_fractions(box.corners, picture().shown)
+    if box.size is None:
+        return _from_centre(box.corners)
+    return _from_centre(_fitted(box.corners, box.size, picture()))
+
+
+def _fitted(corners: Corners, size: tuple[int, int], picture: PictureSize) -> Corners:
+    """The corners in a photograph of those in a picture of another size, or that was not turned as
+    its EXIF data say."""
+    if not _has_proportions(size, picture.shown):
+        if not _has_proportions(size, picture.stored):
+            boxed = f"{size[1]} x {size[0]} px"
+            shown = f"{picture.shown[1]} x {picture.shown[0]}"
+            raise InvalidInputError(
+                f"its boxes are of a picture of {boxed}, but the photograph has {shown}, another "
+                f"aspect ratio; give boxes of this photograph, uncropped"
+            )
+        corners = _turned(corners, size, picture.orientation)
+        size = size[::-1]
+    y = picture.shown[0] / size[0]
+    x = picture.shown[1] / size[1]
+    x0, y0, x1, y1 = corners
+    return x0 * x, y0 * y, x1 * x, y1 * y
+
+
+def _has_proportions(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two pictures differ in scale alone; sides are rounded."""
+    (h, w), (H, W) = size, other
+    return abs(w * H / h - W) <= 1 or abs(h * W / w - H) <= 1
+
+
+def _turned(corners: Corners, size: tuple[int, int], orientation: int) -> Corners:
+    """Corners in the stored picture of (H, W) as they are where its EXIF orientation, above 4, is
+    applied."""
+    height, width = size
+    x0, y0, x1, y1 = corners
+    if orientation in (7, 8):
+        x0, x1 = width - x1, width - x0
+    if orientation in (6, 7):
+        y0, y1 = height - y1, height - y0
+    return y0, x0, y1, x1

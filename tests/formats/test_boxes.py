@@ -1,0 +1,408 @@
+"""Boxes as detectors and annotation tools write them."""
+
+import json
+import warnings
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from curvireg_torch.data.images import oriented, picture_size
+from curvireg_torch.errors import CurviregWarning, InvalidInputError, MissingFileError
+from curvireg_torch.formats.boxes import BoxFile, PictureSize, pixel_box, read_boxes
+from curvireg_torch.jobs.options import with_advice
+from curvireg_torch.registration.inputs import image_items
+from tests._support.exif import exif, with_exif
+from tests._support.real_data import real_case
+
+SIZE = (48, 64)
+BOX = (15.5, 11.5, 47.5, 35.5)  # of the pixels 16 to 47 and 12 to 35
+OTHER = (0.5, 0.5, 8.5, 8.5)
+
+
+@pytest.fixture
+def photo(tmp_path):
+    """A picture of 48 x 64 px."""
+    path = tmp_path / "000012.png"
+    Image.fromarray(np.zeros((*SIZE, 3), np.uint8)).save(path)
+    return path
+
+
+def written(path, content):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def box_of(path, photo, size=SIZE, orientation=1):
+    """The box of a photograph that need not exist."""
+    return BoxFile(path).box(Path(photo), lambda: PictureSize(size, orientation))
+
+
+def test_formats_of_four_numbers():
+    assert pixel_box(BOX, "xyxy") == BOX
+    assert pixel_box((15.5, 11.5, 32.0, 24.0), "xywh") == BOX
+    assert pixel_box((0.25, 0.25, 0.75, 0.75), "fractions", SIZE) == BOX
+    assert pixel_box((0.5, 0.5, 0.5, 0.5), "yolo", SIZE) == BOX
+    with pytest.raises(
+        InvalidInputError,
+        match="expected fractions of the picture from 0 to 1; of px, give another format",
+    ):
+        pixel_box((16.0, 12.0, 47.0, 35.0), "yolo", SIZE)
+    with pytest.raises(InvalidInputError, match="not of a video"):
+        pixel_box((0.5, 0.5, 0.5, 0.5), "yolo")
+
+
+def test_the_size_is_that_of_the_turned_photograph(tmp_path, photo):
+    assert picture_size(photo) == (SIZE, 1)
+    with_exif(photo, exif(6))
+    assert picture_size(photo) == (SIZE[::-1], 6)
+    assert picture_size(photo).stored == SIZE
+    Image.new("RGB", SIZE[::-1]).save(tmp_path / "a.tif", tiffinfo={274: 6})
+    assert picture_size(tmp_path / "a.tif").shown == SIZE[::-1]
+
+
+# ---- YOLO ---------------------------------------------------------------------------------------
+
+
+def test_the_best_box_of_yolo(tmp_path, photo):
+    labels = tmp_path / "labels"
+    written(labels / "000012.txt", "0 0.1 0.1 0.1 0.1 0.3\n2 0.5 0.5 0.5 0.5 0.9\n\n")
+    assert box_of(labels, photo) == BOX
+    assert box_of(labels / "000012.txt", photo) == BOX
+    x0, *_ = box_of(f"{labels}:0", photo)
+    assert x0 == pytest.approx(0.05 * 64 - 0.5)
+    with pytest.raises(InvalidInputError, match="no box of label '7' in"):
+        box_of(f"{labels}:7", photo)
+    with pytest.raises(InvalidInputError, match="no box in"):
+        box_of(labels, "other.png")
+
+
+@pytest.mark.parametrize(
+    ("line", "score", "track"),
+    [
+        ("0 0.5 0.5 0.5 0.5", 1.0, ""),
+        ("0 0.5 0.5 0.5 0.5 0.25", 0.25, ""),
+        ("0 0.5 0.5 0.5 0.5 7", 1.0, "7"),  # of yolo track
+        ("0 0.5 0.5 0.5 0.5 0.25 7", 0.25, "7"),
+        ("0 0.25 0.5 0.5 0.25 0.75 0.75", 1.0, ""),  # a triangle
+        ("0 0.25 0.25 0.75 0.25 0.75 0.75 0.25 0.75", 1.0, ""),  # an oriented box
+        ("0 0.5 0.25 0.75 0.5 0.5 0.75 0.25 0.5 0.25", 0.25, ""),  # with its score
+        ("0 0.25 0.5 0.5 0.25 0.75 0.5 0.6 0.75 0.4 0.75", 1.0, ""),  # a polygon
+    ],
+)
+def test_lines_of_yolo_are_boxes_oriented_boxes_and_polygons(tmp_path, line, score, track):
+    (box,) = read_boxes(written(tmp_path / "a.txt", line))
+    assert box.corners == pytest.approx((0.25, 0.25, 0.75, 0.75))
+    assert (box.score, box.track, box.labels) == (score, track, {"0"})
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("0 0.5 0.5 0.5", "line 1: expected CLASS CX CY WIDTH HEIGHT"),
+        ("0 0.5 0.5 0.5 nan", "line 1: expected CLASS CX CY WIDTH HEIGHT"),
+        ("0 0.5 0.5 0.5 0.5 1.5", "a score of 1.5, above 1"),
+        ("0 0.5 0.5 0.5 0.5 1.5 3", "a score of 1.5, above 1"),
+    ],
+)
+def test_other_lines_of_yolo_are_refused(tmp_path, line, words):
+    with pytest.raises(InvalidInputError, match=f"a.txt: {words}"):
+        read_boxes(written(tmp_path / "a.txt", line))
+
+
+def test_numbers_of_a_tracker_are_no_scores(tmp_path):
+    lines = "0 0.5 0.5 0.5 0.5 1\n0 0.1 0.1 0.1 0.1 7\n"
+    file = written(tmp_path / "photo.txt", lines)
+    with pytest.raises(InvalidInputError, match=r"a tracker's numbers \(1, 7\) .* as PATH:id=NUMB"):
+        box_of(file, "photo.jpg")
+    assert box_of(f"{file}:id=1", "photo.jpg") == BOX
+    assert box_of(f"{file}:id=7", "photo.jpg") == pytest.approx((2.7, 1.9, 9.1, 6.7))
+    with pytest.raises(InvalidInputError, match="no box of label 'id=3'"):
+        box_of(f"{file}:id=3", "photo.jpg")
+    scored = written(tmp_path / "scored.txt", lines.replace(" 1\n", " 0.9 1\n"))
+    assert box_of(scored, "scored.jpg") != BOX  # 1 where a score is not written
+
+
+# ---- COCO, BOP, MegaPose ------------------------------------------------------------------------
+
+
+def item(image, score, box=(16, 12, 32, 24), **more):
+    return {"image_id": image, "category_id": 3, "bbox": list(box), "score": score, **more}
+
+
+@pytest.mark.parametrize("image", ["000012", "000012.png", 12])
+def test_results_of_coco(tmp_path, photo, image):
+    file = written(
+        tmp_path / "boxes.json", [item(image, 0.2, (0, 0, 9, 9)), item(image, 0.8), item(7, 1.0)]
+    )
+    assert box_of(file, photo) == BOX
+    assert box_of(f"{file}:3", photo) == BOX
+    with pytest.raises(InvalidInputError, match="no box of label '4'"):
+        box_of(f"{file}:4", photo)
+
+
+def annotations(*images, height=48, width=64):
+    """COCO's annotations: each image with its box, and the annotations' size of the pictures."""
+    size = {"height": height, "width": width} if height else {}
+    return {
+        "images": [
+            {"id": 90 + index, "file_name": name, **size} for index, (name, _) in enumerate(images)
+        ],
+        "categories": [{"id": 3, "name": "can"}, {"id": 4, "name": "box"}],
+        "annotations": [
+            {"image_id": 90 + index, "category_id": 3, "bbox": list(box)}
+            for index, (_, box) in enumerate(images)
+        ],
+    }
+
+
+PIXELS = (16, 12, 32, 24)  # BOX in COCO
+CORNER = (1, 1, 8, 8)  # OTHER
+
+
+def test_annotations_of_coco_name_images_and_categories(tmp_path):
+    file = written(tmp_path / "boxes.json", annotations(("shots\\000012.png", PIXELS)))
+    assert box_of(f"{file}:can", "shots/000012.png") == BOX
+    with pytest.raises(InvalidInputError, match="no box of label 'box'"):
+        box_of(f"{file}:box", "shots/000012.png")
+
+
+def test_photographs_of_one_name_are_told_apart_by_their_folders(tmp_path):
+    content = annotations(("set/cam1/000001.jpg", CORNER), ("set/cam2/000001.jpg", PIXELS))
+    boxes = BoxFile(written(tmp_path / "boxes.json", content))
+    of = partial(boxes.box, picture=lambda: PictureSize(SIZE))
+    assert of(Path("cam2/000001.jpg")) == BOX
+    assert of(Path("elsewhere/cam1/000001.jpg")) == OTHER
+    assert of(tmp_path / "cam2" / "000001.png") == BOX  # another ending
+    with pytest.raises(InvalidInputError, match="no box in"):
+        of(Path("cam3/000001.jpg"))
+
+
+def test_the_folder_of_a_file_of_one_folder_need_not_be_that_of_the_photographs(tmp_path):
+    content = annotations(("export/000001.jpg", CORNER), ("export/000002.jpg", PIXELS))
+    boxes = BoxFile(written(tmp_path / "boxes.json", content))
+    picture = partial(PictureSize, SIZE)
+    with pytest.warns(CurviregWarning, match=r"boxes of export/000002.jpg are used for .*shots/0"):
+        assert boxes.box(Path("shots/000002.jpg"), picture) == BOX
+    with pytest.raises(InvalidInputError, match=r"may be that of .*shots/000002.jpg, too"):
+        boxes.box(Path("other/000002.jpg"), picture)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert boxes.box(Path("export/000002.jpg"), picture) == BOX
+
+
+def test_two_images_that_may_be_the_photograph_are_refused(tmp_path):
+    content = annotations(("cam1/a.jpg", CORNER), ("cam1/a.png", PIXELS))
+    file = written(tmp_path / "boxes.json", content)
+    assert box_of(file, "cam1/a.png") == BOX
+    with pytest.raises(InvalidInputError, match=r"cam1/a.jpg and cam1/a.png may both be this"):
+        box_of(file, "cam1/a.tif")
+
+
+@pytest.mark.parametrize(
+    ("annotated", "orientation", "shown"),
+    [
+        ((48, 64), 1, (48, 64)),
+        ((24, 32), 1, (48, 64)),
+        ((96, 128), 1, (48, 64)),
+        *(((48, 64), number, (64, 48)) for number in range(5, 9)),
+        ((96, 128), 6, (64, 48)),
+        ((64, 48), 6, (64, 48)),  # of a tool that turns pictures, as ours
+    ],
+)
+def test_boxes_of_pictures_of_another_size_or_not_turned(tmp_path, annotated, orientation, shown):
+    """The box of some white pixels, in a picture of another size or orientation."""
+    height, width = annotated
+    is_stored = orientation > 4 and height < width
+    stored = np.zeros((48, 64, 1), np.uint8)
+    stored[6:18, 8:40] = 1
+    seen = oriented(stored, orientation)
+    pixels = stored if is_stored else seen
+    factor = height / pixels.shape[0]
+    rows, columns = pixels[..., 0].nonzero()
+    corner = (factor * columns.min(), factor * rows.min())
+    sides = (factor * (np.ptp(columns) + 1), factor * (np.ptp(rows) + 1))
+    box = tuple(map(float, (*corner, *sides)))
+    content = annotations(("a.jpg", box), height=height, width=width)
+    file = written(tmp_path / "boxes.json", content)
+    rows, columns = seen[..., 0].nonzero()
+    expected = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+    found = box_of(file, "a.jpg", shown, orientation)
+    assert found == pytest.approx(tuple(value - 0.5 for value in map(float, expected)))
+
+
+def test_boxes_of_a_picture_of_other_proportions_are_refused(tmp_path):
+    file = written(tmp_path / "boxes.json", annotations(("a.jpg", PIXELS), height=48, width=80))
+    for orientation in (1, 6):
+        with pytest.raises(InvalidInputError, match=r"of 80 x 48 px, but .* 64 x 48, another"):
+            box_of(file, "a.jpg", SIZE, orientation)
+    with pytest.raises(InvalidInputError, match="a picture of 80 x 48 px"):
+        box_of(file, "a.jpg", (80, 48))  # 90 degrees, which no EXIF data explain
+
+
+def test_detections_of_bop_are_of_scenes(tmp_path):
+    boxes = [item(12, 0.9, (0, 0, 9, 9), scene_id=2), item(12, 0.5, scene_id=1)]
+    photo = tmp_path / "000001" / "rgb" / "000012.png"
+    assert box_of(written(tmp_path / "boxes.json", boxes), photo) == BOX
+    without = written(tmp_path / "without.json", [item(12, 0.9, (0, 0, 9, 9)), boxes[1]])
+    assert box_of(without, photo) == BOX, "the scene goes before the number alone"
+    only = written(tmp_path / "only.json", boxes[1:])
+    with pytest.raises(InvalidInputError, match="no box in"):
+        box_of(only, tmp_path / "000003" / "rgb" / "000012.png")
+
+
+def test_megapose_writes_corners_of_the_only_photograph(tmp_path, photo):
+    file = written(tmp_path / "object_data.json", [{"label": "can", "bbox_modal": list(BOX)}])
+    assert box_of(file, photo) == BOX
+    assert box_of(f"{file}:can", photo) == BOX
+    boxes = BoxFile(file)
+    boxes.box(photo, partial(PictureSize, SIZE))
+    boxes.box(photo, partial(PictureSize, SIZE))
+    with pytest.raises(InvalidInputError, match="may be that of"):
+        boxes.box(Path("second.png"), partial(PictureSize, SIZE))
+    assert boxes.of_frame("turn-000001", SIZE) == boxes.of_frame("turn-000002", SIZE) == BOX
+
+
+def test_boxes_of_two_labels_without_scores_need_a_choice(tmp_path):
+    content = annotations(("a.jpg", CORNER), ("b.jpg", PIXELS))
+    content["annotations"][1] |= {"image_id": 90, "category_id": 4}
+    file = written(tmp_path / "boxes.json", content)
+    with pytest.raises(InvalidInputError, match="as PATH:LABEL: can, box"):
+        box_of(file, "a.jpg")
+    assert box_of(f"{file}:box", "a.jpg") == box_of(f"{file}:4", "a.jpg") == BOX
+    content["annotations"][1]["category_id"] = 3  # two of a kind: the first
+    assert box_of(written(tmp_path / "two.json", content), "a.jpg") == OTHER
+
+
+# ---- LabelMe, VOC, and folders -------------------------------------------------------------------
+
+LABELME = {
+    "shapes": [
+        {"label": "can", "points": [[48, 36], [16, 12]], "shape_type": "rectangle"},
+        {"label": "box", "points": [[1, 1], [9, 1], [9, 9], [1, 9]], "shape_type": "polygon"},
+        {"label": "eye", "points": [[5, 5], [5, 9]], "shape_type": "circle"},
+    ],
+    "imagePath": "..\\shots\\photo.jpg",
+    "imageHeight": 48,
+    "imageWidth": 64,
+}
+VOC = """<annotation><folder>shots</folder><filename>photo.jpg</filename>
+<size><width>64</width><height>48</height><depth>3</depth></size>
+<object><name>can</name><bndbox><xmin>16</xmin><ymin>12</ymin><xmax>48</xmax><ymax>36</ymax></bndbox>
+</object><object><name>box</name><part><name>lid</name></part>
+<bndbox><xmin>1.0</xmin><ymin>1.0</ymin><xmax>9.0</xmax><ymax>9.0</ymax></bndbox></object></annotation>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("photo.json", LABELME), ("photo.xml", VOC)], ids=["labelme", "voc"]
+)
+def test_annotation_tools(tmp_path, name, content):
+    file = written(tmp_path / "labels" / name, content)
+    for path in (file, file.parent):
+        assert box_of(f"{path}:can", "shots/photo.jpg") == BOX
+        assert box_of(f"{path}:box", "shots/photo.jpg") == OTHER
+        assert box_of(f"{path}:can", "shots/photo.jpg", (96, 128)) == (31.5, 23.5, 95.5, 71.5)
+        with pytest.raises(InvalidInputError, match="choose one as PATH:LABEL: can, box"):
+            box_of(path, "shots/photo.jpg")
+    with pytest.raises(InvalidInputError, match="no box of label 'can'"):
+        box_of(f"{file}:can", "shots/photo-2.jpg")
+
+
+def test_a_circle_of_labelme_is_a_centre_and_a_point_on_it(tmp_path):
+    file = written(tmp_path / "photo.json", LABELME)
+    assert box_of(f"{file}:eye", "shots/photo.jpg") == OTHER
+
+
+def test_folders_of_labels_have_the_folders_of_the_photographs(tmp_path):
+    labels = tmp_path / "labels"
+    written(labels / "cam1" / "a.txt", "0 0.5 0.5 0.5 0.5")
+    written(labels / "a.txt", "0 0.25 0.25 0.25 0.25")
+    boxes = BoxFile(labels)
+    of = partial(boxes.box, picture=partial(PictureSize, SIZE))
+    assert of(Path("shots/cam1/a.jpg")) == BOX
+    below = of(Path("shots/cam2/a.jpg"))
+    assert below == pytest.approx((7.5, 5.5, 23.5, 17.5))
+    with pytest.raises(InvalidInputError, match=r"may be that of .*cam2/a.jpg, too; name their"):
+        of(Path("shots/cam3/a.jpg"))
+    written(labels / "a.xml", VOC)
+    with pytest.raises(InvalidInputError, match=r"a.txt and a.xml for one photograph; keep one"):
+        of(Path("shots/cam2/a.jpg"))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.json", {"a": 1}, "expected detections of COCO, or annotations of LabelMe"),
+        ("a.json", [{"image_id": 1}], "entry 0: expected bbox of 4 numbers"),
+        ("a.json", [{"data": {"image": "a.jpg"}}], "Label Studio's own JSON; export it as COCO"),
+        ("a.json", {"shapes": [{"points": [[1, 2], [3]]}]}, "shape 0: expected points x, y"),
+        ("a.json", {"shapes": [{"points": [[1, 2]]}]}, "shape 0: expected points x, y"),
+        ("a.xml", "<annotations><image/></annotations>", "CVAT's own XML; export it as COCO 1.0"),
+        ("a.xml", "<svg/>", "expected <annotation> of Pascal VOC"),
+        ("a.xml", "<annotation><object/></annotation>", "object 0: expected <bndbox> of xmin"),
+        ("a.xml", "<annotation>", "damaged, or no XML that is read"),
+        ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><annotation/>", "an XML document type"),
+    ],
+)
+def test_what_is_no_file_of_boxes_is_refused(tmp_path, name, content, words):
+    file = written(tmp_path / name, content)
+    with pytest.raises(InvalidInputError, match=f"{name}: .*{words}"):
+        BoxFile(file)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(MissingFileError, match="no such file or folder"):
+        BoxFile(tmp_path / "lost.json:3")
+
+
+# ---- shared cases --------------------------------------------------------------------------------
+
+LAMP = (334.0, 146.0, 711.0, 573.5)
+VGA3 = PictureSize((720, 960))
+
+
+def test_two_cameras_in_one_file_of_coco():
+    boxes = BoxFile(real_case("n23-coco-subfolders") / "annotations.json")
+    assert boxes.box(Path("cam2/000001.jpg"), lambda: VGA3) == pytest.approx(LAMP, abs=0.6)
+    assert boxes.box(Path("cam1/000001.jpg"), lambda: VGA3) == (39.5, 29.5, 239.5, 199.5)
+
+
+def test_labels_of_yolo_track():
+    labels = real_case("n20-yolo-track-id") / "labels"
+    with pytest.raises(InvalidInputError, match="a tracker's numbers"):
+        BoxFile(labels).box(Path("photo.jpg"), lambda: VGA3)
+    chosen = BoxFile(f"{labels}:id=1").box(Path("photo.jpg"), lambda: VGA3)
+    assert chosen == pytest.approx(LAMP, abs=0.6)
+
+
+def test_files_of_annotation_tools():
+    folder = real_case("n25-annotation-tools")
+    for name in ("labelme.json", "voc.xml"):
+        found = BoxFile(folder / name).box(Path("photo.jpg"), lambda: VGA3)
+        assert found == pytest.approx(LAMP, abs=0.6)
+    for name, words in (("cvat.xml", "CVAT's own XML; export"), ("label_studio.json", "export")):
+        with pytest.raises(InvalidInputError, match=words):
+            BoxFile(folder / name)
+
+
+# ---- boxes by hand -------------------------------------------------------------------------------
+
+
+def test_messages_name_the_format_that_is_suspected():
+    pictures = torch.rand(1, 3, 48, 64)
+    for box, words in (
+        (
+            [0.3, 0.2, 0.7, 0.8],
+            "in px, not fractions of the photograph; multiply them by its size, or give "
+            "--box-format fractions, or yolo",
+        ),
+        ([40.0, 30.0, 20.0, 15.0], "corners, not width and height, or --box-format xywh"),
+        ([5.0, 5.0, 10.0, 40.0], "the part of the photograph in the box has 5.0 px"),
+    ):
+        (found,) = image_items(pictures, [box], None)
+        assert words in with_advice(found)
+        assert "--" not in str(found)
