@@ -145,10 +145,12 @@ def _by_focal_length(problem: ContourProblem, state: ContourState, uv: Tensor, J
 @dataclass(frozen=True)
 class FocalInformation:
     """What edges tell of log f: the ``amount`` (N,) in the units of the normal equations, and the
-    ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance."""
+    ``scale`` (N,) in px^2, by which one divides it to have the inverse of a variance; and the first
+    ``step`` (N,) of log f towards its best value."""
 
     amount: Tensor
     scale: Tensor
+    step: Tensor
 
     @property
     def variance(self) -> Tensor:
@@ -169,12 +171,14 @@ def focal_information(
     imitation = damped_solution(J.mT @ (W * J), J.mT @ (W * by_focal), 1e-6)
     own = by_focal - J @ imitation[..., None]
     alone = Measurements(own, measured.distance, W)
-    amount = alone.equations()[0][:, 0, 0]
+    A, b = alone.equations()
+    amount = A[:, 0, 0]
+    step = b[:, 0, 0] / amount.clamp(min=1e-12)
     sums = summed_by_cells(uv, W * measured.distance * own)[..., 0]
     spread = sums.square().sum(dim=1) + residual_variance(measured) * (W * own).square().sum(
         dim=(1, 2)
     )
     scale = FOCAL_SCALE * spread / amount.clamp(min=1e-12)
-    return FocalInformation(amount, scale), _motion_with_focal_length(
+    return FocalInformation(amount, scale, step), _motion_with_focal_length(
         state.T, problem.centre
     ) - imitation

@@ -12,6 +12,7 @@ from ..fitting.edges import EdgeCrops
 from ..matching import Ranking
 from ..terms import QueryFeatures
 from ..utils.rows import Rows
+from .camera_check import with_checked_camera
 from .candidates import Candidates
 from .confidence import are_near
 from .described import evidence_of
@@ -110,8 +111,9 @@ def register(target: Target, item: ImageItem, query: QueryFeatures) -> Registrat
     result = replace(result, feature_is_hidden=rival.feature_is_hidden)
     if work.crops is None or not work.exact:
         return result
-    best = found.best(target.score_weights(exact=True))
-    return compared_with_mirror_image(target, work, work.crops, found[best], result)
+    best = found[found.best(target.score_weights(exact=True))]
+    result = compared_with_mirror_image(target, work, work.crops, best, result)
+    return with_checked_camera(target, work, work.crops, best.poses, result)
 
 
 def _fitted(target: Target, work: Work, crops: EdgeCrops, starts: Poses) -> Poses:

@@ -118,7 +118,7 @@ def test_the_covariance_is_that_of_the_origin(monkeypatch):
     pose = replace(poses_at(1), covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
     motion = torch.tensor([[0.02, -0.03, 0.01, 0.3, -0.1, 0.5]], dtype=torch.float64)
     none = torch.ones(1, dtype=torch.float64)
-    information = FocalInformation(amount=none, scale=0.04 * none)
+    information = FocalInformation(amount=none, scale=0.04 * none, step=none)
     problem = SimpleNamespace(state=lambda _: None)
     monkeypatch.setattr(focal.ContourProblem, "of", lambda *_: problem)
     monkeypatch.setattr(focal, "focal_information", lambda *_: (information, motion))

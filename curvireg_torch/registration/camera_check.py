@@ -1,0 +1,122 @@
+"""Whether a photograph agrees with the focal length that was given for it.
+
+Perspective shows the focal length of a photograph of a known object. Where it does so clearly, a
+given one that differs belongs to another picture: one of another size, cropped, stretched, or taken
+with another lens or zoom. The pose is then wrong, though its contours lie on edges.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..fitting.contour_problem import ContourProblem
+from ..fitting.edges import EdgeCrops
+from ..fitting.focal_length import FocalPrior, fit_focal_length, focal_information, scaled_cameras
+from ..fitting.measured_fit import FULL_SIZE_RADII
+from ..rendering.contours import Contours
+from .focal import FULL_RADII, HALF_RADII, REPORTED_VARIANCE
+from .poses import Poses
+from .result import Registration
+from .target import Target
+from .work import Work
+
+CLEAR_DEVIATION = 0.15
+"""Standard deviation of log f up to which a photograph determines its focal length."""
+
+CONTRADICTION = 3.0
+"""Standard deviations from which a given focal length is named."""
+
+NOTICED_STEP = 0.02
+"""First step of log f from which a focal length is fitted: with the right camera most first steps
+are smaller, and a fit takes ten times as long as a step."""
+
+LARGEST_CHANGE = 2.0
+WIDE = 2.0
+"""Largest change of log f, and deviation of a prior that does not matter."""
+
+
+def with_checked_camera(
+    target: Target, work: Work, crops: EdgeCrops, best: Poses, result: Registration
+) -> Registration:
+    """A result whose ``best`` pose is one, with a warning if it is reliable and the photograph
+    contradicts the focal length of its camera."""
+    if not result.reliable or work.item.camera_source == "estimated":
+        return result
+    gap, deviation = focal_gaps(
+        target.describer.contours, crops, best.cameras, best.T, best.crop_index
+    )
+    text = focal_contradiction(
+        float(best.cameras[0, 0, 0]),
+        float(gap),
+        float(deviation),
+        given_deviation=work.item.focal_deviation,
+    )
+    return result if text is None else replace(result, warnings=(*result.warnings, text))
+
+
+def focal_gaps(
+    contours: Contours, crops: EdgeCrops, cameras: Tensor, T: Tensor, crop_index: Tensor
+) -> tuple[Tensor, Tensor]:
+    """How far photographs contradict the focal lengths of fitted poses.
+
+    Args:
+        contours: of the mesh.
+        crops: of the photographs.
+        cameras: (N, 3, 3) in px of the photographs, N > 0.
+        T: (N, 4, 4) poses, fitted with these cameras.
+        crop_index: (N,) the crop of each pose.
+
+    Returns:
+        (N,) by how much the log of the focal length that a photograph shows exceeds that of its
+        camera, and (N,) its standard deviation, infinite where nobody looked further, as the first
+        step is small.
+    """
+    gap = torch.zeros(len(T), dtype=torch.float64)
+    deviation = torch.full_like(gap, torch.inf)
+    problem = ContourProblem.of(contours, crops, cameras, crop_index)
+    first, _ = focal_information(problem, problem.state(T), FULL_SIZE_RADII[0])
+    noticed = (first.step.abs() > NOTICED_STEP).nonzero()[:, 0]
+    if not len(noticed):
+        return gap, deviation
+    given = cameras[noticed]
+    index = crop_index[noticed]
+    half = ContourProblem.of(contours, crops, given, index, factor=2)
+    coarse = fit_focal_length(half, T[noticed], _no_prior(given), HALF_RADII)
+    cameras = scaled_cameras(given, coarse.log_zoom)
+    full = ContourProblem.of(contours, crops, cameras, index)
+    fine = fit_focal_length(full, coarse.state.T, _no_prior(cameras), FULL_RADII)
+    information, _ = focal_information(fine.problem, fine.state, FULL_SIZE_RADII[-1])
+    found = (REPORTED_VARIANCE * information.variance).sqrt()
+    gap = gap.index_copy(0, noticed, coarse.log_zoom + fine.log_zoom)
+    return gap, deviation.index_copy(0, noticed, found)
+
+
+def _no_prior(cameras: Tensor) -> FocalPrior:
+    nothing = torch.zeros(len(cameras), dtype=torch.float64)
+    return FocalPrior(nothing, WIDE, nothing - LARGEST_CHANGE, nothing + LARGEST_CHANGE)
+
+
+def focal_contradiction(
+    focal: float, gap: float, deviation: float, *, given_deviation: float = 0.0
+) -> str | None:
+    """What is wrong with a camera with the ``focal`` length in px, known up to
+    ``given_deviation``, if the photograph shows one whose log is larger by ``gap``, with a standard
+    ``deviation``; None if they agree, or if it is not clear.
+
+    Example:
+        >>> focal_contradiction(550.0, 0.7, 0.05)[:56]
+        'the photograph shows a focal length of about 1108 px, no'
+        >>> focal_contradiction(550.0, 0.1, 0.05) is None
+        True
+    """
+    if deviation >= CLEAR_DEVIATION:
+        return None
+    if abs(gap) <= CONTRADICTION * (deviation**2 + given_deviation**2) ** 0.5:
+        return None
+    shown = focal * torch.tensor(gap).exp().item()
+    return (
+        f"the photograph shows a focal length of about {shown:.0f} px, not the camera's "
+        f"{focal:.0f} px: the camera is of a picture of another size, or this one was cropped, "
+        f"stretched or zoomed; give its own camera, or none"
+    )
