@@ -46,8 +46,8 @@ class Refits:
         monkeypatch.setattr(refits, "evidence_of", self.measure)
         monkeypatch.setattr(refits, "with_details", self.compare)
 
-    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, again: bool) -> Poses:
-        assert again
+    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, refit: bool) -> Poses:
+        assert refit
         self.fitted.append(starts.view.tolist())
         T = starts.T.clone()
         moves = torch.tensor([view in self.new for view in starts.view.tolist()])

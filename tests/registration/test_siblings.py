@@ -107,8 +107,8 @@ class Case:
             lambda _, __, poses: evidence(*measured) if len(poses) == 3 else evidence(0.95),
         )
 
-    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, again: bool) -> Poses:
-        assert again
+    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, refit: bool) -> Poses:
+        assert refit
         self.fitted.append(starts)
         moved = starts.T.clone()
         moved[:, 0, 3] += 1e-3
