@@ -17,6 +17,7 @@ from .errors import InvalidInputError, MissingFileError
 from .evidence import EvidenceWeights
 from .features.fields import DEPTH_FIELDS, FIELDS
 from .features.learned_field import SHA256
+from .filters.curvilinear import FORMULAS
 from .geometry import ViewSphere, paper_views, sample_views, uniform_views
 from .geometry.viewpoint import DEFAULT_DISTANCE
 from .terms import TERMS, Appearance, BoxShape, Correlation, Repeatability, Term, check_box_jitter
@@ -142,7 +143,7 @@ class BankSettings:
             raise InvalidInputError(
                 f"image_size: expected at least grid = {self.grid}, got {self.image_size}"
             )
-        check_option(self.formula, ("geometric", "paper"), "formula")
+        check_option(self.formula, FORMULAS, "formula")
         check_positive(self.sigma, "sigma", zero_ok=True)
         if not 1 <= self.block <= self.grid or self.bins < 1 or not 0.0 < self.clip <= 1.0:
             raise InvalidInputError(

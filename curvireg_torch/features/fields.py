@@ -17,12 +17,18 @@ from ..filters import (
     MultiScaleCurvilinearSaliency,
     MultiScaleFocusCurves,
 )
+from ..filters.focus import PAPER_THRESHOLD
 from .learned_field import LearnedCurvilinearSaliency
 
 FIELDS: dict[str, Callable[[], nn.Module]] = {
     "learned": LearnedCurvilinearSaliency,
     "focus": MultiScaleFocusCurves,
-    "MFC": partial(MultiScaleFocusCurves, mode="reblur-saliency", saliency_weight=0.0),
+    "MFC": partial(
+        MultiScaleFocusCurves,
+        mode="reblur-saliency",
+        saliency_weight=0.0,
+        threshold=PAPER_THRESHOLD,
+    ),
     "saliency": MultiScaleCurvilinearSaliency,
     "gradient": ImageGradient,
 }

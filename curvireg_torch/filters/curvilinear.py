@@ -18,6 +18,7 @@ from ..utils.checks import (
 from . import operations as ops
 from .modules import DepthModule, FunctionModule
 
+FORMULAS = ("geometric", "paper", "paper-length")
 # of missing pixels behind the nearest visible point, in units of the visible depth range
 BACKGROUND_DEPTH = 1.25
 # of visible depths, relative to the largest; below it (8 ulp of float32) they are rounding
@@ -105,13 +106,15 @@ def depth_curvilinear_saliency(
     - ``"paper"``: :math:`|\nabla Z| \sqrt{\mathrm{tr}(M)^2 - 4\det M}` (``lambdasD``).
 
     The vector is parallel to the eigenvector of M whose eigenvalue is largest in absolute value;
-    its sign is arbitrary.
+    its sign is arbitrary. That of ``"paper"`` belongs to the largest eigenvalue, as printed there,
+    which ranks views worse (``docs/paper.md``); ``"paper-length"`` has the paper's length in the
+    direction of ``"geometric"``.
 
     Args:
         depth: (B, 1, H, W) z-depth in any unit. 0, negative, inf and NaN are background.
         mask: bool, False = background; (B, 1, H, W) or broadcastable to it.
         sigma: smoothing in px before differentiation, >= 0.
-        formula: ``"geometric"`` or ``"paper"``.
+        formula: ``"geometric"``, ``"paper"`` or ``"paper-length"``.
         depth_scale: None rescales each image's visible depth range to 1, so that vectors point
             across occluding contours (a range of at most 1e-6 of the largest depth counts as
             rounding); a number multiplies the depth (1 with depth in px gives curvature in 1/px).
@@ -126,11 +129,12 @@ def depth_curvilinear_saliency(
         >>> round(float(field[0, :, 32, 32].norm()) * 40, 2)                          # 1 / radius
         1.0
     """
-    check_option(formula, ("geometric", "paper"), "formula")
+    check_option(formula, FORMULAS, "formula")
 
     def layer(z: Tensor) -> ops.Planes:
         factor, *m = _shape_operator(z, formula)
-        vx, vy, half_gap = dominant_eigenvector(*m)
+        sign = 1.0 if formula == "paper" else None
+        vx, vy, half_gap = dominant_eigenvector(*m, sign=sign)
         return scaled_direction(factor.mul_(half_gap), vx, vy)
 
     return apply_to_depth(layer, depth, mask, sigma, depth_scale)
@@ -147,7 +151,7 @@ def _shape_operator(z: Tensor, formula: str) -> ops.Planes:
     m12 = torch.addcmul(zxy, zy, v, value=-1)
     m21 = torch.addcmul(zxy, zx, u, value=-1)
     m22 = torch.addcmul(zyy, zx, v)
-    if formula == "paper":
+    if formula != "geometric":
         return ops.safe_sqrt(ops.squared_length(zx, zy)).mul_(2.0), m11, m12, m21, m22
     # 2 alpha^3 = (c + c |grad Z|^2)^(-3/2)
     c = 2.0 ** (-2.0 / 3.0)

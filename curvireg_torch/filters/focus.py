@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..errors import InvalidInputError
 from ..utils.checks import check_integer, check_option, check_positive
 from . import operations as ops
 from .curvilinear import scaled_direction
@@ -15,8 +16,8 @@ from .modules import FunctionModule
 MODES = ("reblur-image", "reblur-saliency")
 MAX_BLUR = 1000.0  # px, reported where re-blurring does not lower the saliency
 MIN_BLUR = 0.6  # px, about that of the derivative kernel: MFC does not tell sharper edges apart
-# CS relative to the image's largest below which a pixel is noise: 3 % of the contrast
-MIN_RELATIVE_SALIENCY = 1e-3
+THRESHOLD = 0.001  # of CS, relative to the image's largest
+PAPER_THRESHOLD = math.exp(-5)  # T = e^-n of the paper, n = 5 scales, as of MCS
 
 
 def edge_blur(
@@ -113,13 +114,14 @@ def multiscale_focus_curves(
     sigma: float | Tensor = 1.0,
     mode: str = "reblur-image",
     saliency_weight: float = 1.0,
+    threshold: float = THRESHOLD,
 ) -> Tensor:
     r"""MFC (the paper's section "Multi Focus Curves"): edges in focus, the sharpest with the
     largest length.
 
     The image is re-blurred by 1, 2, ..., n-1 px. A pixel is retained where its focus :math:`1/s_i`
-    exceeds :math:`e^{-n}` at all n-1 scales and its saliency exceeds 0.1 % of the largest in the
-    image, which rejects noise in flat regions. Its value is :math:`1/\max_i s_i` (the paper's
+    exceeds :math:`e^{-n}` at all n-1 scales and its saliency exceeds ``threshold``, which rejects
+    noise in flat regions: noise is in focus. Its value is :math:`1/\max_i s_i` (the paper's
     ``ratiogradientMerge``, where arg is a misprint): at most 1/s at step edges of any direction (to
     0.5 %), where :math:`s^2` is their squared blur plus ``sigma`` squared, and 1/0.6 per px
     elsewhere.
@@ -131,6 +133,9 @@ def multiscale_focus_curves(
         mode: of :func:`edge_blur`.
         saliency_weight: p >= 0; the focus is multiplied by :math:`CS^p`. 1 ranks the views of real
             photographs best.
+        threshold: least saliency CS of an edge, as a fraction in [0, 1) of the largest in the
+            image. CS is a square: of .01, edges of a tenth of the strongest gradient remain. The
+            paper chooses it as for MCS, :math:`e^{-5}`.
 
     Returns:
         (B, 2, H, W) focus in 1/px, times CS^p in (grey levels per px)^2p, along the gradient.
@@ -143,6 +148,9 @@ def multiscale_focus_curves(
     check_integer(scales, "scales", least=2)
     power = check_positive(saliency_weight, "saliency_weight", zero_ok=True)
     checked_sigma = ops.check_scalar(sigma, "sigma", zero_ok=True)
+    least = check_positive(threshold, "threshold", zero_ok=True)
+    if least >= 1.0:
+        raise InvalidInputError(f"threshold: expected 0 <= threshold < 1, got {least}")
 
     def layer(image: Tensor) -> ops.Planes:
         x = ops.smooth(image, checked_sigma)
@@ -151,9 +159,7 @@ def multiscale_focus_curves(
         blurs = _edge_blur(x[..., 1:-1, 1:-1], gx, gy, [float(i) for i in range(1, scales)], mode)
         blur = functools.reduce(torch.maximum, blurs)
         focus = blur.clamp(min=MIN_BLUR).reciprocal()
-        retained = (focus > math.exp(-scales)) & (
-            saliency > MIN_RELATIVE_SALIENCY * ops.image_maximum(saliency)
-        )
+        retained = (focus > math.exp(-scales)) & (saliency > least * ops.image_maximum(saliency))
         weight = saliency.clamp(min=ops.safe_eps(saliency)) ** power
         return scaled_direction(focus * weight * retained, gx, gy)
 
@@ -178,5 +184,6 @@ class MultiScaleFocusCurves(FunctionModule, function=multiscale_focus_curves, le
         sigma: float = 1.0,
         mode: str = "reblur-image",
         saliency_weight: float = 1.0,
+        threshold: float = THRESHOLD,
         learnable: bool = False,
     ) -> None: ...

@@ -44,7 +44,7 @@ from .cells import Packing, packing_of_views
 from .describe import VIEW_FACES, ViewDescriber, hog_layer, view_mesh
 
 FORMAT = "curvireg_torch.ViewBank"
-FORMAT_VERSION = 10
+FORMAT_VERSION = 11
 PIXELS_AT_A_TIME = 72 * 128**2  # of views that a thread holds in memory, about 60 bytes each
 TURNS = 24  # in-plane rotations of the default views: quarter turns among them share a rendering
 VIEWS_ON_DEVICE = 480  # the same on another device than the CPU
@@ -134,13 +134,22 @@ class ViewBank:
     def whitening(self) -> Whitening:
         """By mean and shrunk covariance of the views' descriptors, for
         ``Correlation(whitening="bank")``."""
-        return Whitening(*ledoit_wolf(self.descriptors))
+        return Whitening(*ledoit_wolf(self._different_descriptors()))
 
     @cached_property
     def precision(self) -> Precision:
         """Inverse of the shrunk covariance of the views' descriptors, for
         ``Correlation(whitening="paper")``."""
-        return Precision(self.descriptors)
+        return Precision(self._different_descriptors())
+
+    def _different_descriptors(self) -> Tensor:
+        """(K, D) descriptors, one of each picture: to an orthographic camera views at several
+        distances are the same one, which counted several times would look like more data."""
+        if self.settings.camera == "perspective":
+            return self.descriptors
+        rotations = self.views.rotations.flatten(1).numpy()
+        _, first = np.unique(rotations, axis=0, return_index=True)
+        return self.descriptors[torch.from_numpy(first).to(self.device)]
 
     def points_at(self, index: Tensor | slice) -> Tensor:
         """(K, S, S) bool feature points of some views."""

@@ -75,6 +75,10 @@ STEPS = (
         lambda p, _: replace(p, views=ViewPolicy("paper")),
     ),
     Step("S_rep monotone", lambda p, _: p.with_term("repeatability", mode="monotone")),
+    Step(
+        "CS along the eigenvector of the larger \\|eigenvalue\\|, not of the larger one",
+        _bank(formula="paper-length"),
+    ),
     Step("CS = κ1 - κ2, not \\|∇Z\\| √(tr² - 4 det)", _bank(formula="geometric")),
     Step("S_hog a cosine, not (D - μ)ᵀ Σ⁻¹ D", lambda p, _: p.with_term("hog", whitening="none")),
     Step("focus curves by the exact blur, weighted by CS", lambda p, _: replace(p, field="focus")),

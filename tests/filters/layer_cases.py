@@ -91,6 +91,7 @@ PAIRS = {
 OPTIONS: dict[str, dict[str, object]] = {
     **{name: {} for name in PAIRS},
     "cs-paper": {"formula": "paper"},
+    "cs-paper-length": {"formula": "paper-length"},
     "asg-perspective": {"camera_matrix": CAMERA},
     "diffusion": {"iterations": 4},
     "diffusion-exponential": {"iterations": 4, "conductance": "exponential"},

@@ -15,7 +15,13 @@ from .layer_cases import CAMERA, PAIRS, depths, photos
 
 WRONG: list[tuple[str, dict[str, object], str]] = [
     ("cs", {"sigma": -1.0}, "sigma: expected a finite number >= 0, got -1"),
-    ("cs", {"formula": "x"}, "formula: expected one of 'geometric', 'paper', got 'x'"),
+    (
+        "cs",
+        {"formula": "x"},
+        "formula: expected one of 'geometric', 'paper', 'paper-length', got 'x'",
+    ),
+    ("mfc", {"threshold": 1.0}, "threshold: expected 0 <= threshold < 1, got 1.0"),
+    ("mfc", {"threshold": -0.1}, "threshold: expected a finite number >= 0"),
     ("asg", {"camera_matrix": torch.eye(4)}, "camera_matrix: expected shape"),
     (
         "asg",

@@ -12,7 +12,7 @@ from curvireg_torch import filters
 from curvireg_torch.filters.curvilinear import dominant_eigenvector, scaled_direction
 from curvireg_torch.filters.operations import central_derivatives, smooth
 
-from .layer_cases import photos
+from .layer_cases import depths, photos
 
 
 def _smooth(x: np.ndarray, sigma: float) -> np.ndarray:
@@ -84,10 +84,14 @@ def test_multiscale_curvilinear_saliency_against_loops() -> None:
 
 @pytest.mark.parametrize("mode", ["reblur-image", "reblur-saliency"])
 @pytest.mark.parametrize("saliency_weight", [0.0, 0.5, 1.0])
-def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float) -> None:
+@pytest.mark.parametrize("threshold", [0.0, math.exp(-5), 0.1])
+def test_multiscale_focus_curves_against_loops(
+    mode: str, saliency_weight: float, threshold: float
+) -> None:
     image = photos(1, 21, dtype=torch.float64)
     image[..., :6] = 0.5 + 0.02 * image[..., :6]  # edges that are too weak
     options = {"scales": 4, "mode": mode, "saliency_weight": saliency_weight}
+    options["threshold"] = threshold
     got = filters.multiscale_focus_curves(image, **options)[0]
     x = _smooth(image[0, 0].numpy(), 1.0)
     gx, gy = _gradient(image[0, 0].numpy(), 1.0)
@@ -106,7 +110,7 @@ def test_multiscale_focus_curves_against_loops(mode: str, saliency_weight: float
         remainder = fourth / squared + fourth / (squared + s**2)
         worst = np.maximum(worst, np.sqrt(np.clip(squared - variance - remainder, 0, 1000.0**2)))
     focus = 1 / np.maximum(worst, 0.6)
-    value = np.where((focus > math.exp(-4)) & (cs > 1e-3 * cs.max()), focus, 0)
+    value = np.where((focus > math.exp(-4)) & (cs > threshold * cs.max()), focus, 0)
     value = value * cs**saliency_weight
     want = value * np.stack([gx, gy]) / np.maximum(np.sqrt(cs), 1e-300)
     assert 0.02 < (value > 0).mean() < 0.98
@@ -166,3 +170,31 @@ def test_dominant_eigenvector_against_lapack() -> None:
     value = (rayleigh * v).sum(dim=1)
     torch.testing.assert_close(rayleigh, value[:, None] * v, atol=1e-12, rtol=1e-9)
     torch.testing.assert_close(value.abs(), values.abs().amax(dim=1))
+
+
+@pytest.mark.parametrize("formula", ["geometric", "paper", "paper-length"])
+def test_direction_of_depth_curvilinear_saliency_against_lapack(formula: str) -> None:
+    """The paper's is the eigenvector of the largest eigenvalue, ours of the largest in absolute
+    value; M is written out as adj(I_P) H_Z."""
+    depth = depths(1, 33, dtype=torch.float64)
+    field = filters.depth_curvilinear_saliency(depth, formula=formula)[0]
+    near = depth[depth > 0].min()
+    span = depth.max() - near
+    z = torch.where(depth > 0, (depth - near) / span, 1.25)
+    zx, zy, xx, yy, xy = (d[0, 0] for d in central_derivatives(smooth(z, 1.0, linear=True)))
+    hessian = torch.stack([xx, xy, xy, yy], dim=-1).unflatten(-1, (2, 2))
+    adjugate = torch.stack([1 + zy**2, -zx * zy, -zx * zy, 1 + zx**2], dim=-1)
+    values, vectors = torch.linalg.eig(adjugate.unflatten(-1, (2, 2)) @ hessian)
+    values = values.real
+    key = values if formula == "paper" else values.abs()
+    index = key.argmax(dim=-1)[..., None, None].expand(-1, -1, 2, 1)
+    v = vectors.real.gather(-1, index)[..., 0]
+    squared = zx**2 + zy**2
+    factor = (1 + squared) ** -1.5 if formula == "geometric" else squared.sqrt()
+    want = factor * (values.amax(dim=-1) - values.amin(dim=-1))
+    torch.testing.assert_close(field.norm(dim=0), want, atol=1e-9, rtol=1e-7)
+    clear = (key[..., 0] - key[..., 1]).abs() > 1e-6 * values.abs().amax(dim=-1)
+    across = field[0] * v[..., 1] - field[1] * v[..., 0]
+    assert float(across[clear].abs().max()) < 1e-7 * float(want.max())
+    negative = (values.sum(dim=-1) < 0) & (want > 0.01 * want.max())
+    assert 0.1 < float(negative.double().mean()) < 0.9  # where the two readings differ

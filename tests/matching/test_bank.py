@@ -277,3 +277,21 @@ def test_load_refuses_a_packing_of_other_views(truck, tmp_path, name, change):
     rewrite(path, tensors, checksum=tensor_checksum(tensors))
     with pytest.raises(BankError, match="packing: not of the bank's views"):
         ViewBank.load(path)
+
+
+@pytest.mark.parametrize("camera", ["orthographic", "perspective"])
+def test_the_covariance_counts_a_picture_of_an_orthographic_camera_once(truck, camera):
+    """Its views at several distances are the same picture, which are no more data."""
+    elevations = [0.0, 40.0]
+    views = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0, 5.0, 9.0])
+    once = sample_views(azimuth_step=40.0, elevations=elevations, distances=[3.0])
+    bank = build(truck, views, camera=camera)
+    same = build(truck, once, camera=camera)
+    query = torch.rand(3, bank.descriptors.shape[1], generator=torch.Generator().manual_seed(0))
+    for name in ("precision", "whitening"):
+        found = getattr(bank, name)(query)
+        agrees = bool(torch.allclose(found, getattr(same, name)(query), rtol=1e-3, atol=1e-3))
+        assert agrees == (camera == "orthographic"), name
+    assert torch.allclose(bank.precision.mean, same.precision.mean, atol=1e-5) == (
+        camera == "orthographic"
+    )

@@ -330,7 +330,7 @@ def test_the_staircase_shows_what_is_known():
     assert "| change | `lm`, N 8 |" in text
     assert "| 2. S_rep monotone | 0.62, 12° |" in text
     assert "| 0. the paper to the letter | 0.00 (0.50 to 0.75), 12° |" in text
-    assert "| 13. contour fit of five hypotheses: the default | - |" in text
+    assert "| 14. contour fit of five hypotheses: the default | - |" in text
 
 
 def test_parts_are_left_out_one_at_a_time():
