@@ -212,6 +212,10 @@ MIN_MESH_EXTENT = 1e-6
 MAX_MESH_PARTS = 10_000
 MAX_CAD_BYTES = 1 << 27  #: Bytes of a STEP, IGES or Collada file
 MAX_CAD_SECONDS = 300  #: Time in which OpenCASCADE must have made triangles of a STEP or IGES file
+#: Memory of the process in which OpenCASCADE or OpenUSD reads a file, in bytes
+MAX_CAD_MEMORY = 4 << 30
+#: Elements of an XML file, as Collada and URDF are; each takes up to 300 bytes
+MAX_XML_ELEMENTS = 5_000_000
 MAX_TEXTURE_PIXELS = 1 << 28  #: Pixels of all textures of a mesh together: 16 of 4096 x 4096
 #: Sum of squared corners of all concave faces, which bounds the time of their division: a million
 #: quads, or five faces of 2000 corners

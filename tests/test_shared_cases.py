@@ -307,6 +307,7 @@ def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
     torch.testing.assert_close(box, torch.tensor(truth["box"]).double(), atol=10.0, rtol=0)
 
 
+<<<<<<< HEAD
 def test_a_matrix_of_the_picture_at_half_size_is_named():
     camera = cr.load_camera(real_case("n73-camera-of-half-the-size") / "cam_K.txt")
     folder = real_case("lamp")
@@ -315,3 +316,67 @@ def test_a_matrix_of_the_picture_at_half_size_is_named():
     of_photograph = cr.camera_matrix(1100, 1100, 479.5, 359.5)
     item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [of_photograph])[0]
     assert not item.warnings
+=======
+def area_of_polygons(path: Path) -> float:
+    """The area of the flat polygons of an OBJ, by the cross products of their corners."""
+    lines = [line.split() for line in path.read_text().splitlines()]
+    points = np.array([line[1:4] for line in lines if line[:1] == ["v"]], float)
+    area = 0.0
+    for line in lines:
+        if line[:1] == ["f"]:
+            corners = points[[int(word.split("/")[0]) - 1 for word in line[1:]]]
+            around = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+            area += 0.5 * float(np.linalg.norm(around))
+    return area
+
+
+def test_concave_faces_have_the_area_of_their_polygons():
+    path = real_case("n40-concave-faces") / "plate.obj"
+    mesh, texts = loaded(path, unit="mm")
+    assert texts == ""
+    assert mesh.area == pytest.approx(area_of_polygons(path))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply"])
+def test_colours_of_which_one_is_above_one(suffix):
+    mesh, texts = loaded(real_case("n41-colours-above-one") / f"lamp.{suffix}", unit="mm")
+    expected, _ = loaded(real_case("lamp") / "lamp_colours.obj", unit="mm")
+    assert texts == ""
+    assert has_colours(mesh)
+    assert len(colours_of(mesh)) > 1
+    assert colours_of(mesh) >= {(60, 60, 70)}
+    np.testing.assert_allclose(mesh.extents, expected.extents, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("lines.obj", "no faces: a cloud of points, splats or lines"),
+        ("points.obj", "400 points and no faces: a cloud of points"),
+        ("points.ply", "reconstruct its surface"),
+        ("splats.ply", "reconstruct its surface"),
+        ("strips.ply", "strips of triangles, which are not read; export triangles"),
+    ],
+)
+def test_what_has_no_faces_is_named(name, words):
+    with pytest.raises(MeshError, match=words):
+        cr.load_mesh(real_case("n45-no-faces") / name)
+
+
+def test_meshes_of_a_ros_package_are_found():
+    package = real_case("n48-urdf-of-a-package") / "lamp_description"
+    mesh, texts = loaded(package / "urdf" / "lamp.urdf")
+    expected, _ = loaded(real_case("lamp") / "lamp.stl", unit="mm")
+    assert (mesh.units, texts) == ("m", "")
+    np.testing.assert_allclose(mesh.bounds, 1e-3 * expected.bounds, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "likely"),
+    [("lamp/lamp.stl", None, "mm"), ("n72-unit-forgotten/lamp.glb", "mm", "m")],
+)
+def test_the_forgotten_unit_is_proposed(name, given, likely):
+    folder, _, file = name.partition("/")
+    with pytest.warns(CurviregWarning, match=rf"if that is wrong, give the unit \({likely}\?\)"):
+        cr.load_mesh(real_case(folder) / file, unit=given)
+>>>>>>> d578b952 (Meshes: small files cannot make a reader work or hold much; what was read wrongly without a word)

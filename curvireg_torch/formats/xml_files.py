@@ -1,7 +1,9 @@
-"""XML of unknown origin: no document types, and so no entities."""
+"""XML of unknown origin: no document types, and so no entities; a bounded number of elements."""
 
 import re
 from typing import Any
+
+from ..errors import MAX_XML_ELEMENTS
 
 _DOCTYPE = re.compile(rb"<!\s*(?:DOCTYPE|ENTITY)", re.IGNORECASE)
 
@@ -10,6 +12,12 @@ def check_xml(data: bytes) -> None:
     """Refuse a document type, which may define entities; in UTF-16 too."""
     if _DOCTYPE.search(data) or (b"\0" in data[:100] and _DOCTYPE.search(data.replace(b"\0", b""))):
         raise ValueError("an XML document type, which is not read; remove it")
+
+
+def check_elements(data: bytes) -> None:
+    """Refuse XML whose tree would take much more memory than its text."""
+    if data.count(b"<") > 2 * MAX_XML_ELEMENTS:  # of most elements the start and the end
+        raise ValueError(f"more than {MAX_XML_ELEMENTS:,} elements of XML; export parts of it")
 
 
 def local_name(element: Any) -> str:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from ..matching.describe import VIEW_FACES
 from ..mesh import has_colours, mesh_unit, mesh_up, mesh_warnings
@@ -88,6 +90,23 @@ class MeshFacts:
         }
 
 
+def _convex_hull(points: NDArray[np.float64]) -> trimesh.Trimesh | None:
+    """The convex hull of points; None of flat ones."""
+    try:
+        return trimesh.convex.convex_hull(points)
+    except (QhullError, ValueError):
+        return None
+
+
+def _flat_hull_area(points: NDArray[np.float64]) -> float:
+    """The area of both sides of the convex hull of flat points."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    try:
+        return 2.0 * float(ConvexHull(points @ axes[:2].T).volume)
+    except (QhullError, ValueError):  # on a line
+        return 0.0
+
+
 def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     """Examine a clean mesh (:func:`curvireg_torch.load_mesh`).
 
@@ -98,8 +117,10 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
     """
     unit = mesh_unit(mesh)
     extents = np.ptp(mesh.vertices, axis=0)
-    hull = trimesh.convex.convex_hull(extreme_points(mesh).numpy())
-    area_of_hull = float(mesh.area / max(hull.area, 1e-300))
+    points = extreme_points(mesh).numpy()
+    hull = _convex_hull(points)
+    hull_area = _flat_hull_area(points) if hull is None else float(hull.area)
+    area_of_hull = float(mesh.area / max(hull_area, 1e-300))
     welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     welded.merge_vertices()  # files such as STL repeat the corners of each face
     rows = np.sort(welded.faces, axis=1)
@@ -143,7 +164,7 @@ def mesh_facts(mesh: trimesh.Trimesh) -> MeshFacts:
         )
     is_sphere = _is_sphere(mesh)
     is_large = unit is not None and float(np.linalg.norm(extents)) * METRES.get(unit, 1.0) > ROOM
-    is_room = is_large and looks_inwards(mesh, hull)
+    is_room = is_large and hull is not None and looks_inwards(mesh, hull)
     is_wire = area_of_hull < WIRE_AREA
     if is_sphere and not is_coloured:
         verdicts.append(

@@ -1,8 +1,6 @@
 """STEP and IGES files by cascadio, which is OpenCASCADE, and Collada files by pycollada: the extra
 ``cad``."""
 
-import subprocess
-import sys
 import tempfile
 import warnings
 import xml.etree.ElementTree as ET
@@ -12,17 +10,21 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from ..errors import (
     MAX_CAD_BYTES,
+    MAX_CAD_MEMORY,
     MAX_CAD_SECONDS,
     MAX_MESH_BYTES,
+    MAX_MESH_FACES,
     MAX_MESH_PARTS,
+    MAX_TEXTURE_PIXELS,
 )
-from ..formats.xml_files import check_xml, local_name
+from ..formats.xml_files import check_elements, check_xml, local_name
 from ..utils.choices import UNITS
 from ..utils.extras import check_extras
-from ..utils.pictures import picture_format
+from ..utils.programs import run_program
 from .gltf import read_gltf
 from .scenes import joined_scene
 from .source import MeshSource, ReadMesh, spellings
@@ -31,16 +33,7 @@ from .source import MeshSource, ReadMesh, spellings
 # cylinder 0.1 % of the radius. Tenfold finer ones change no contour of 256 px.
 LINEAR_TOLERANCE = 0.002
 ANGULAR_TOLERANCE = 0.1
-# In a process of its own: OpenCASCADE prints, and damaged files may end or stop it
-_CONVERT = f"""
-import sys
-from pathlib import Path
-import cascadio
-kind = cascadio.FileType.IGES if sys.argv[3] == "iges" else cascadio.FileType.STEP
-options = dict(tol_linear={LINEAR_TOLERANCE}, tol_angular={ANGULAR_TOLERANCE}, tol_relative=True, use_parallel=False)
-content = cascadio.to_glb_bytes(Path(sys.argv[1]).read_bytes(), kind, **options)
-Path(sys.argv[2]).write_bytes(content)
-"""  # noqa: E501
+_PROGRAM = Path(__file__).with_name("step_parts.py")
 IGES_METRES = 1e-3  # OpenCASCADE leaves the triangles of IGES files in mm
 _PREFIXES = {b".MILLI.": "mm", b".CENTI.": "cm", b".DECI.": "dm", b"$": "m"}
 _CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
@@ -76,22 +69,21 @@ def _converted(path: Path, kind: str) -> bytes:
     """The GLB of a STEP file, in metres, or of an IGES file, in millimetres."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "part.glb")
-        command = [sys.executable, "-P", "-c", _CONVERT, str(path), str(out), kind]
-        try:
-            ended = subprocess.run(
-                command, capture_output=True, timeout=MAX_CAD_SECONDS, check=False
-            )
-        except subprocess.TimeoutExpired:
-            message = (
-                f"OpenCASCADE took more than {MAX_CAD_SECONDS} seconds; export it as STL or OBJ"
-            )
-            raise ValueError(message) from None
+        tolerances = [str(LINEAR_TOLERANCE), str(ANGULAR_TOLERANCE)]
+        has_ended_well = run_program(
+            _PROGRAM,
+            [str(path), str(out), kind, *tolerances],
+            name="OpenCASCADE",
+            seconds=MAX_CAD_SECONDS,
+            memory=MAX_CAD_MEMORY,
+            advice="export it as STL or OBJ",
+        )
         size = out.stat().st_size if out.is_file() else 0
         if size > MAX_MESH_BYTES:
             raise ValueError(
                 f"its triangles take more than {MAX_MESH_BYTES:,} bytes; export it as STL or OBJ"
             )
-        if ended.returncode != 0 or size == 0:
+        if not has_ended_well or size == 0:
             raise ValueError(
                 "OpenCASCADE finds no shape in it; the file is damaged, or of another kind"
             )
@@ -149,21 +141,27 @@ def iges_unit(data: bytes) -> str | None:
 
 
 class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
-    """The pictures that a Collada file names, in the formats of photographs."""
+    """The pictures that a Collada file names, each decoded once and reduced as textures are.
+    trimesh asks for one again for each material, and keeps each answer as a picture of its own."""
 
     def __init__(self, source: MeshSource) -> None:
         self._source = source
+        self._answers: dict[str, bytes] = {}
+        self._pixels_left = MAX_TEXTURE_PIXELS
 
     def get(self, name: str) -> bytes:
-        content = self._source.read_optional("texture", *spellings(name.encode()))
-        if content is None:
+        pixels = self._source.texture_file(*spellings(name.encode(errors="surrogateescape")))
+        if pixels is None:
             raise ValueError("no such picture")
-        try:
-            picture_format(content)
-        except Exception as error:
-            self._source.warn("texture", f"the texture {name[:100]} cannot be used ({error})")
-            raise
-        return content
+        self._pixels_left -= pixels.shape[0] * pixels.shape[1]
+        if self._pixels_left < 0:
+            self._source.warn("texture", "too many materials with textures; some are left out")
+            raise ValueError("too many pictures")
+        if name not in self._answers:
+            file = BytesIO()
+            Image.fromarray(pixels).save(file, "PNG", compress_level=1)
+            self._answers[name] = file.getvalue()
+        return self._answers[name]
 
     def keys(self) -> list[str]:
         return []
@@ -180,6 +178,7 @@ def read_collada(source: MeshSource) -> ReadMesh:
     check_extras([source.path])
     data = bounded(source)
     check_xml(data)
+    check_elements(data)
     root = ET.fromstring(data)
     _check_copies(root)
     stated = {local_name(one): one for one in root.iter() if local_name(one) in ("unit", "up_axis")}
@@ -210,34 +209,65 @@ def read_collada(source: MeshSource) -> ReadMesh:
 
 
 def _check_copies(root: Any) -> None:
-    """Nodes that stand for others, which stand for others: the parts that they unfold to are
-    counted first."""
-    named = {
-        f"#{one.get('id')}": one
-        for one in root.iter()
-        if local_name(one) == "node" and one.get("id")
-    }
-    known: dict[Any, int] = {}
+    """Nodes that stand for others, which stand for others: the parts and faces that they unfold to
+    are counted first."""
+    named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
+    nodes = {url: one for url, one in named.items() if local_name(one) == "node"}
+    known: dict[Any, tuple[int, int]] = {}
+    faces_of: dict[str, int] = {}
 
-    def count(node: Any, depth: int) -> int:
+    def faces(url: str) -> int:
+        if url not in faces_of:
+            own = named.get(url, ())
+            skins = [str(one.get("source")) for one in own if local_name(one) in ("skin", "morph")]
+            shapes = [own, *(named.get(skin, ()) for skin in skins)]
+            faces_of[url] = sum(map(_most_faces, shapes))
+        return faces_of[url]
+
+    def count(node: Any, depth: int) -> tuple[int, int]:
         if node in known:
             return known[node]
         if depth > 200:
             raise ValueError("its nodes form a circle, or are too deep")
-        total = 0
+        found = []
         for child in node:
             kind = local_name(child)
+            url = str(child.get("url"))
             if kind in ("node", "visual_scene", "library_visual_scenes", "library_nodes"):
-                total += count(child, depth + 1)
-            elif kind == "instance_node" and child.get("url") in named:
-                total += count(named[child.get("url")], depth + 1)
+                found.append(count(child, depth + 1))
+            elif kind == "instance_node" and url in nodes:
+                found.append(count(nodes[url], depth + 1))
             elif kind in ("instance_geometry", "instance_controller"):
-                total += 1
-        known[node] = total
-        if total > MAX_MESH_PARTS:
+                found.append((1, faces(url)))
+        parts = sum(one[0] for one in found)
+        total = sum(one[1] for one in found)
+        known[node] = parts, total
+        if parts > MAX_MESH_PARTS:
             raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-        return total
+        if total > MAX_MESH_FACES:
+            raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+        return known[node]
 
     count(root, 0)
-    for node in named.values():
+    for node in nodes.values():
         count(node, 0)
+
+
+def _most_faces(geometry: Any) -> int:
+    """How many triangles the lists of indices of a geometry can hold."""
+    total = 0
+    for element in (below for child in geometry for below in child.iter()):
+        offsets = [
+            int(child.get("offset", "0")) for child in element if local_name(child) == "input"
+        ]
+        lists = [child.text or "" for child in element if local_name(child) == "p"]
+        if lists:
+            corners = sum(map(_word_count, lists)) // (max(offsets, default=0) + 1)
+            total += corners // 3 if local_name(element) == "triangles" else corners
+    return total
+
+
+def _word_count(text: str) -> int:
+    """``len(text.split())`` without the words, which take much more memory than the text."""
+    is_blank = np.frombuffer(text.encode(), np.uint8) <= ord(" ")
+    return int((is_blank[:-1] & ~is_blank[1:]).sum()) + int(len(is_blank) > 0 and not is_blank[0])

@@ -32,6 +32,7 @@ _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _TRIANGLES = 4
 _STRIP = 5
 _FAN = 6
+SKINNED_AT_ONCE = 100_000  # Vertices, each with a matrix of 128 bytes
 _SPECULAR = "KHR_materials_pbrSpecularGlossiness"
 _TRANSFORM = "KHR_texture_transform"
 
@@ -148,6 +149,9 @@ def _check_nodes(tree: dict[str, Any]) -> None:
     scenes = tree.get("scenes", [])
     if len(nodes) > 10 * MAX_MESH_PARTS:
         raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} nodes; join them")
+    joints = sum(len(skin["joints"]) for skin in tree.get("skins", []))
+    if joints > 10 * MAX_MESH_PARTS:
+        raise ValueError(f"more than {10 * MAX_MESH_PARTS:,} joints; export it without skins")
     named = [child for node in nodes for child in node.get("children", [])]
     named += scenes[_natural(tree.get("scene", 0))].get("nodes", []) if scenes else []
     if len(set(map(_natural, named))) < len(named) or max(named, default=-1) >= len(nodes):
@@ -163,6 +167,7 @@ class _File:
         self._source = source
         self._buffers: dict[int, bytes] = {}
         self._parts: dict[int, list[tuple[dict[str, Any], ReadMesh]]] = {}
+        self._skins: dict[int, NDArray[np.float64]] = {}
         self._places = dict(self._nodes())
 
     def mesh(self) -> ReadMesh:
@@ -187,11 +192,7 @@ class _File:
         self, index: int, attributes: dict[str, int], vertices: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Vertices moved by the joints of a skin; its node's own place does not count."""
-        skin = self._tree["skins"][_natural(index)]
-        T = np.stack([self._places.get(joint, np.eye(4)) for joint in skin["joints"]])
-        if "inverseBindMatrices" in skin:
-            inverse = self._accessor(skin["inverseBindMatrices"])
-            T = T @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(T)]
+        T = self._joints(_natural(index))
         joints = self._accessor(attributes["JOINTS_0"]).astype(np.int64)
         weights = self._accessor(attributes["WEIGHTS_0"])
         if (
@@ -202,12 +203,24 @@ class _File:
             raise ValueError("a skin does not fit its mesh")
         weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-12)
         moved = np.zeros_like(vertices)
-        for k in range(joints.shape[1]):
-            at = T[joints[:, k]]
-            moved += weights[:, k, None] * (
-                np.einsum("nij,nj->ni", at[:, :3, :3], vertices) + at[:, :3, 3]
-            )
+        for start in range(0, len(vertices), SKINNED_AT_ONCE):
+            block = slice(start, start + SKINNED_AT_ONCE)
+            for k in range(joints.shape[1]):
+                at = T[joints[block, k]]
+                turned = np.einsum("nij,nj->ni", at[:, :3, :3], vertices[block])
+                moved[block] += weights[block, k, None] * (turned + at[:, :3, 3])
         return moved
+
+    def _joints(self, index: int) -> NDArray[np.float64]:
+        """(J, 4, 4) what the joints of a skin do to a vertex that they alone move."""
+        if index not in self._skins:
+            skin = self._tree["skins"][index]
+            T = np.stack([self._places.get(joint, np.eye(4)) for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                inverse = self._accessor(skin["inverseBindMatrices"])
+                T = T @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)[: len(T)]
+            self._skins[index] = T
+        return self._skins[index]
 
     def _nodes(self) -> Iterator[tuple[int, NDArray[np.float64]]]:
         """The nodes of the scene and their places in it."""
@@ -319,10 +332,11 @@ class _File:
         image = self._tree["images"][_natural(index)]
         name = str(image.get("name", f"number {index}"))
         if "bufferView" in image:
-            return self._source.texture(index, bytes(self._view(image["bufferView"])), name)
+            view = _natural(image["bufferView"])
+            return self._source.texture(("view", view), lambda: bytes(self._view(view)), name)
         uri = str(image["uri"])
         if uri.startswith("data:"):
-            return self._source.texture(index, _data_of(uri), name)
+            return self._source.texture(("image", index), lambda: _data_of(uri), name)
         return self._source.texture_file(urllib.parse.unquote(uri))
 
     def _accessor(

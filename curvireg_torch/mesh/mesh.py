@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import wraps
 from os import PathLike
@@ -53,7 +53,8 @@ def load_mesh(
             .stp, .iges, .igs and .dae.
         unit: the file's unit of length ("m", "dm", "cm", "mm", "in", "ft"), kept in ``mesh.units``.
             None: that which the file itself states (STEP, IGES, 3MF, Collada, USD; URDF is in m),
-            else m. An object below 5 mm or above 100 m gets a warning.
+            else cm for USD, as OpenUSD does, and m for other formats. An object below 5 mm or above
+            100 m gets a warning.
         up: the axis that points up ("x", "y", "z", "-x", "-y", "-z"), kept in
             ``mesh.metadata["up"]``; None: that which the file states, else y for glTF and z for
             other formats.
@@ -107,17 +108,31 @@ def load_mesh(
     whole.metadata["colours"] = found.colours
     whole.metadata["warnings"] = tuple(source.warnings)
     mesh = as_mesh(whole, name=str(path))
-    mesh.units = unit or found.unit or "m"
+    mesh.units = unit or found.unit or found.usual_unit or "m"
     mesh.metadata.update(file_name=path.name, up=up or found.up or format_up(path.suffix))
-    size = float(np.linalg.norm(mesh.extents)) * UNITS[mesh.units]
-    if not 0.005 <= size <= 100.0:
-        advice = "" if found.unit else "; if that is wrong, give the unit (mm?)"
+    length = float(np.linalg.norm(mesh.extents))
+    size = length * UNITS[mesh.units]
+    if not _is_plausible(size):
+        likely = next((name for name in LIKELY_UNITS if _is_plausible(length * UNITS[name])), None)
+        advice = "" if found.unit else f"; if that is wrong, give the unit{_question(likely)}"
         message = f"in unit {mesh.units!r} the object is {size:g} m across{advice}"
         kind = "" if found.unit else "unit"
         warnings.warn(CurviregWarning(message, subject=path, kind=kind), stacklevel=2)
     for warning in mesh_warnings(mesh):
         warnings.warn(CurviregWarning(warning.text, subject=path), stacklevel=2)
     return mesh
+
+
+LIKELY_UNITS = ("mm", "m", "cm", "in")  # in which files are written, the most frequent first
+
+
+def _is_plausible(metres: float) -> bool:
+    """Whether an object in a photograph may be so large."""
+    return 0.005 <= metres <= 100.0
+
+
+def _question(unit: str | None) -> str:
+    return "" if unit is None else f" ({unit}?)"
 
 
 def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
@@ -142,10 +157,7 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
     elif isinstance(source, trimesh.Trimesh):
         (colours,) = colours_of_parts([source])
     if not isinstance(source, trimesh.Trimesh) or len(source.faces) == 0:
-        raise MeshError(
-            "expected a mesh with faces, got none; points and curves cannot be rendered",
-            subject=name,
-        )
+        raise MeshError(_why_no_faces(source, noticed), subject=name)
     triangles, is_degenerate = checked_triangles(source, name)
     vertices = np.asarray(source.vertices, dtype=np.float64)
     mesh = trimesh.Trimesh(vertices=vertices, faces=triangles[~is_degenerate], process=False)
@@ -170,6 +182,19 @@ def as_mesh(source: MeshLike, *, name: str = "mesh") -> trimesh.Trimesh:
     if colours is not None:
         mesh.metadata["colours"] = colours
     return mesh
+
+
+def _why_no_faces(source: object, noticed: Sequence[MeshWarning]) -> str:
+    """What a mesh without faces is instead, or what was left out of it."""
+    if noticed:
+        return f"has no faces: {noticed[0].text}"
+    points = len(source.vertices) if isinstance(source, trimesh.Trimesh) else 0
+    if points:
+        return (
+            f"has {points:,} points and no faces: a cloud of points, splats or lines, which cannot "
+            f"be rendered; reconstruct its surface, or export a mesh"
+        )
+    return "expected a mesh with faces, got none; points and curves cannot be rendered"
 
 
 def mesh_warnings(mesh: trimesh.Trimesh) -> tuple[MeshWarning, ...]:

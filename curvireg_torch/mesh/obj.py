@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 from ..errors import MAX_MESH_FACES, MAX_MESH_LINES, MAX_MESH_PARTS
 from .colours import SurfaceColours
 from .polygons import divide_faces
-from .source import MeshSource, Pixels, ReadMesh, numbers, plain_text, spellings
+from .source import (
+    MeshSource,
+    Pixels,
+    ReadMesh,
+    colour_bytes,
+    numbers,
+    plain_text,
+    spellings,
+)
 
 CHUNK = 100_000  # Lines of faces that are read at once, which bounds the memory
 # Corners of one form: v, v/vt and v/vt/vn. Possessive, so that no text takes long to be refused.
@@ -147,17 +155,20 @@ def _table(
 
 
 def _points(lines: list[bytes]) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
-    """(V, 3) coordinates, and (V, 3) colours if each line has some."""
+    """(V, 3) coordinates, and (V, 3) colours if any line has some; the others are white."""
     values, counts = _table(lines, 3, "a vertex")
     first = np.cumsum(counts) - counts
     points = values[first[:, None] + np.arange(3)]
-    if not len(counts) or counts.min() < 6:
+    weighted = (counts == 4).nonzero()[0]
+    if len(weighted):
+        weight = values[first[weighted] + 3]
+        points[weighted] /= np.where(weight == 0.0, 1.0, weight)[:, None]
+    coloured = (counts >= 6).nonzero()[0]
+    if not len(coloured):
         return points, None
-    colours = values[first[:, None] + np.arange(3, 6)]
-    if not np.isfinite(colours).all():
-        return points, None
-    colours *= 1.0 if colours.max() > 1.0 else 255.0
-    return points, np.clip(colours.round(), 0, 255).astype(np.uint8)
+    colours = np.full((len(points), 3), 255, np.uint8)
+    colours[coloured] = colour_bytes(values[first[coloured][:, None] + np.arange(3, 6)])
+    return points, colours
 
 
 def _corners(lines: _Lines) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

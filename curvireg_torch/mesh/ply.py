@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import MAX_MESH_LINES
 from .colours import SurfaceColours
 from .polygons import triangles_of_faces
-from .source import MeshSource, Pixels, ReadMesh, spellings
+from .source import MeshSource, Pixels, ReadMesh, colour_bytes, spellings
 
 MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
 _COLOURS = (
@@ -64,6 +64,8 @@ def read_ply(source: MeshSource) -> ReadMesh:
     if vertices is None:
         raise ValueError("its vertices have no x, y and z")
     polygons = _Element(elements.get("face", {}))
+    if not polygons.names and "tristrips" in elements:
+        raise ValueError("its faces are strips of triangles, which are not read; export triangles")
     if not polygons.names:
         return ReadMesh(vertices, np.zeros((0, 3), np.int64))
     lists = polygons.lists(
@@ -101,10 +103,10 @@ class _Element:
             if values is None or self._data is None:
                 continue
             stored = np.asarray(self._data[names[0]]).dtype
-            largest = values.max(initial=0.0)
-            factor = 255.0 if stored.kind == "f" and largest <= 1.0 else 1.0
-            if stored == np.uint16 and largest > 255:
-                factor = 255.0 / 65535.0
+            if stored.kind == "f":
+                return colour_bytes(values)
+            is_large = stored == np.uint16 and values.max(initial=0.0) > 255
+            factor = 255.0 / 65535.0 if is_large else 1.0
             return np.clip(np.nan_to_num(factor * values).round(), 0, 255).astype(np.uint8)
         return None
 

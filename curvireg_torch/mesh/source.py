@@ -1,8 +1,9 @@
 """What readers of mesh files share: access to the files that a mesh names, its textures, and its
 warnings."""
 
+import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,6 +16,10 @@ from .colours import SurfaceColours, texture_pixels
 
 Pixels = NDArray[np.uint8]
 MOST_WARNINGS = 5  # Of one kind
+# Bytes and parts of a file's name, and bytes of each part: no longer one is that of a file
+MAX_NAME_BYTES = 4096
+MAX_NAME_PARTS = 64
+MAX_PART_BYTES = 255
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,8 @@ class ReadMesh:
         colours: of its F faces; None without any.
         unit: the unit that the file itself states, a key of ``UNITS``.
         up: the axis that the file itself states, or its format prescribes.
+        usual_unit: the unit of files of its format that state none; None where the format says
+            nothing.
     """
 
     vertices: NDArray[np.float64]
@@ -52,6 +59,20 @@ class ReadMesh:
     colours: SurfaceColours | None = None
     unit: str | None = None
     up: str | None = None
+    usual_unit: str | None = None
+
+    def without_unused_vertices(self) -> "ReadMesh":
+        """The same faces without the vertices that none of them names, so that copies stay in
+        proportion to the faces, which are counted."""
+        if self.faces.min(initial=0) < 0:
+            raise IndexError
+        is_used = np.zeros(len(self.vertices), bool)
+        is_used[self.faces] = True
+        if is_used.all():
+            return self
+        number = np.cumsum(is_used) - 1
+        vertices = self.vertices[is_used]
+        return ReadMesh(vertices, number[self.faces], self.colours, self.unit, self.up)
 
     def transformed(self, T: NDArray[np.float64]) -> "ReadMesh":
         """The mesh at another place, by a (4, 4) affine transform; mirrored faces are turned
@@ -105,6 +126,7 @@ class MeshSource:
         self._bytes_left = MAX_MESH_BYTES
         self._pixels_left = MAX_TEXTURE_PIXELS
         self._textures: dict[object, Pixels | None] = {}
+        self._known_places: dict[str, list[Path]] = {}
         self._listings: dict[Path, dict[str, str]] = {}
 
     def data(self) -> bytes:
@@ -149,7 +171,15 @@ class MeshSource:
         return found or inside[0]
 
     def _places(self, name: str) -> list[Path]:
-        """Where in the folders a file of a name may be, existing or not."""
+        """Where in the folders a file of a name may be, existing or not; each name is looked for
+        once, and of names of strangers a bounded number."""
+        if name not in self._known_places:
+            if len(self._known_places) >= MAX_MESH_PARTS:
+                raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
+            self._known_places[name] = self._places_of(name)
+        return self._known_places[name]
+
+    def _places_of(self, name: str) -> list[Path]:
         relative = self._relative_name(name)
         if relative is None:
             return []
@@ -177,7 +207,9 @@ class MeshSource:
             if content is not None:
                 return content
         first = names[0][:100]
-        if any(self._places(name) for name in names):
+        if not any(map(is_file_name, names)):
+            self.warn(kind, f"{first} is no name of a file, and is left out")
+        elif any(self._places(name) for name in names):
             self.warn(
                 kind, f"{first} is missing beside it; the mesh is shown without these colours"
             )
@@ -186,18 +218,19 @@ class MeshSource:
             self.warn(kind, text)
         return None
 
-    def texture(self, key: object, content: bytes | None, name: str) -> Pixels | None:
-        """The pixels of a picture, decoded once for each ``key``; None, with a warning, if it
-        cannot be used."""
+    def texture(
+        self, key: object, read_content: Callable[[], bytes | None], name: str
+    ) -> Pixels | None:
+        """The pixels of a picture, read and decoded once for each ``key``; None, with a warning, if
+        it cannot be used."""
         if key not in self._textures:
+            content = read_content()
             self._textures[key] = None if content is None else self._decoded(content, name)
         return self._textures[key]
 
     def texture_file(self, *names: str) -> Pixels | None:
         """The pixels of a picture that is named in one of several spellings."""
-        if names in self._textures:
-            return self._textures[names]
-        return self.texture(names, self.read_optional("texture", *names), names[0])
+        return self.texture(names, lambda: self.read_optional("texture", *names), names[0])
 
     def _decoded(self, content: bytes, name: str) -> Pixels | None:
         try:
@@ -226,7 +259,7 @@ class MeshSource:
     def _relative_name(name: str) -> PurePosixPath | None:
         """A name as a relative path: backslashes separate folders too, and of absolute names the
         last part counts."""
-        if "://" in name or "\0" in name or not name.strip():
+        if "://" in name or not is_file_name(name):
             return None
         path = PurePosixPath(name.replace("\\", "/"))
         is_absolute = path.is_absolute() or ":" in path.parts[0]
@@ -261,6 +294,18 @@ class MeshSource:
         return self._listings[folder]
 
 
+def is_file_name(name: str) -> bool:
+    """Whether a name can be that of a file: neither empty nor longer than systems allow."""
+    try:
+        encoded = os.fsencode(name)
+    except UnicodeEncodeError:  # half of a pair of surrogates, as JSON can hold
+        return False
+    if len(encoded) > MAX_NAME_BYTES or b"\0" in encoded or not encoded.strip():
+        return False
+    parts = encoded.replace(b"\\", b"/").split(b"/")
+    return len(parts) <= MAX_NAME_PARTS and max(map(len, parts)) <= MAX_PART_BYTES
+
+
 def spellings(name: bytes) -> tuple[str, ...]:
     """A file's name in the encodings that exporters write."""
     found: list[str] = []
@@ -282,6 +327,17 @@ def plain_text(data: bytes) -> bytes:
             data = data.decode(encoding, errors="replace").encode()
     data = data.removeprefix(b"\xef\xbb\xbf")
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def colour_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours of vertices that a file writes as numbers, in 0..1 or in 0..255: whole numbers of
+    which some are above 1, or numbers that mostly are, count as the latter. Beyond the range, as
+    of highlights in linear colours, they are clipped; NaN is black."""
+    known = np.nan_to_num(colours, posinf=255.0, neginf=0.0)
+    bright = known[known > 0.0]
+    is_whole = bool((known == known.round()).all()) and bright.max(initial=0.0) > 1.0
+    is_in_bytes = is_whole or (bright.size > 0 and float(np.median(bright)) > 1.0)
+    return np.clip((known * (1.0 if is_in_bytes else 255.0)).round(), 0, 255).astype(np.uint8)
 
 
 def numbers(text: bytes) -> NDArray[np.float64]:

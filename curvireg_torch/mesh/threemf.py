@@ -4,6 +4,7 @@ and materials specifications."""
 import xml.parsers.expat
 import zipfile
 from array import array
+from collections import Counter
 from dataclasses import dataclass, field
 from io import BytesIO
 
@@ -21,7 +22,20 @@ _MODEL = "3dmodel"
 _UNREAD = ("beamlattice", "booleanshape", "displacementmesh", "levelset", "slicestack")
 """Shapes of the extensions of 3MF."""
 
+_MOST = {
+    "vertex": 3 * MAX_MESH_FACES,
+    "triangle": MAX_MESH_FACES,
+    "tex2coord": 3 * MAX_MESH_FACES,
+    "color": MAX_MESH_FACES,
+    "base": MAX_MESH_FACES,
+}
+"""Entries of one model part of the package; of objects, items and groups so many as parts."""
+
+_SUPPORTS = ("solidsupport", "support")  # Types of objects
+
 Attributes = dict[str, str]
+Item = tuple[str, str, str]
+"""Path of a model part, the object in it, and its transform."""
 
 
 @dataclass
@@ -30,6 +44,7 @@ class _Object:
 
     group: str = ""
     index: int = 0
+    kind: str = "model"
     vertices: "array[float]" = field(default_factory=lambda: array("d"))
     triangles: "array[int]" = field(default_factory=lambda: array("q"))
     properties: list[tuple[str, int, int, int] | None] = field(default_factory=list)
@@ -42,7 +57,7 @@ class _Model:
 
     unit: str = "millimeter"
     objects: dict[str, _Object] = field(default_factory=dict)
-    items: list[tuple[str, str, str]] = field(default_factory=list)
+    items: list[Item] = field(default_factory=list)
     colours: dict[str, list[tuple[int, int, int]]] = field(default_factory=dict)
     coordinates: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     texture_of: dict[str, str] = field(default_factory=dict)
@@ -62,8 +77,8 @@ def read_threemf(source: MeshSource) -> ReadMesh:
     root = package.root()
     model = package.model(root)
     parts = []
-    for path, name, transform in model.items:
-        parts += package.parts(path or root, name, _matrix(transform), 0)
+    for path, name, transform in package.items(root):
+        parts += package.parts(path, name, _matrix(transform), 0)
     mesh = ReadMesh.joined(parts)
     if model.unit == _MICRON:
         return ReadMesh(mesh.vertices * 1e-3, mesh.faces, mesh.colours, "mm", "z")
@@ -97,9 +112,31 @@ class _Package:
         if path not in self._models:
             model = _parsed(self._content(path))
             for kind in sorted(model.unread):
-                self._source.warn("parts", f"it has shapes that are not read ({kind}): left out")
+                self._source.warn("parts", f"it has parts that are not read ({kind}): left out")
             self._models[path] = model
         return self._models[path]
+
+    def items(self, root: str) -> list[Item]:
+        """What of the build is the object itself: no supports, nothing that is not printed, and of
+        copies on the plate the first."""
+        items: dict[tuple[str, str], Item] = {}
+        copies = 0
+        for path, name, transform in self.model(root).items:
+            known = self.model(path or root).objects.get(name)
+            if known is not None and known.kind in _SUPPORTS:
+                self._source.warn("parts", "supports of the print are left out")
+            elif (path or root, name) in items:
+                copies += 1
+            else:
+                items[path or root, name] = (path or root, name, transform)
+        if copies:
+            self._source.warn(
+                "parts", f"further copies of its objects on the build plate are left out ({copies})"
+            )
+        if len(items) > 1:
+            text = f"{len(items)} objects on its build plate are read as one rigid body, as they"
+            self._source.warn("parts", f"{text} lie: if they are loose, export one of them")
+        return list(items.values())
 
     def parts(self, path: str, name: str, place: NDArray[np.float64], depth: int) -> list[ReadMesh]:
         """The meshes of an object and of its components, at their places."""
@@ -132,7 +169,8 @@ class _Package:
             faces = np.array(one.triangles, np.int64).reshape(-1, 3)
             if faces.min(initial=0) < 0 or faces.max(initial=0) >= len(vertices):
                 raise IndexError
-            self._meshes[key] = ReadMesh(vertices, faces, self._colours(model, one))
+            mesh = ReadMesh(vertices, faces, self._colours(model, one))
+            self._meshes[key] = mesh.without_unused_vertices()
         return self._meshes[key]
 
     def _colours(self, model: _Model, one: _Object) -> SurfaceColours | None:
@@ -169,15 +207,16 @@ class _Package:
 
     def _texture(self, model: _Model, group: str) -> Pixels | None:
         path = model.paths.get(model.texture_of.get(group, ""), "")
-        try:
-            content = self._content(path)
-        except KeyError:
-            self._source.warn(
-                "texture",
-                f"the texture {path[:100]} is missing in it; its faces are shown in white",
-            )
-            return None
-        return self._source.texture(path, content, path)
+
+        def read_content() -> bytes | None:
+            try:
+                return self._content(path)
+            except KeyError:
+                text = f"the texture {path[:100]} is missing in it; its faces are shown in white"
+                self._source.warn("texture", text)
+                return None
+
+        return self._source.texture(path.lower(), read_content, path)
 
     def _content(self, path: str) -> bytes:
         name = self._names[path.lstrip("/").lower()]
@@ -207,10 +246,14 @@ def _parsed(data: bytes) -> _Model:
     model = _Model()
     current = _Object()
     group = ""
+    counts: Counter[str] = Counter()
 
     def start(tag: str, attributes: Attributes) -> None:
         nonlocal current, group
         kind = tag.rpartition(":")[2]
+        counts[kind] += 1
+        if counts[kind] > _MOST.get(kind, MAX_MESH_PARTS):
+            raise ValueError(f"more than {_MOST.get(kind, MAX_MESH_PARTS):,} of {kind[:50]!r}")
         plain = {name.rpartition(":")[2]: value for name, value in attributes.items()}
         if kind == "vertex":
             current.vertices.extend((float(plain["x"]), float(plain["y"]), float(plain["z"])))
@@ -219,16 +262,18 @@ def _parsed(data: bytes) -> _Model:
             current.properties.append(_property(plain, current))
         elif kind == "object":
             current = model.objects[plain["id"]] = _Object(
-                plain.get("pid", ""), int(plain.get("pindex", 0))
+                plain.get("pid", ""), int(plain.get("pindex", 0)), plain.get("type", "model")
             )
         elif kind == "component":
             current.components.append(
                 (plain.get("path", ""), plain["objectid"], plain.get("transform", ""))
             )
         elif kind == "item":
-            model.items.append(
-                (plain.get("path", ""), plain["objectid"], plain.get("transform", ""))
-            )
+            item = plain.get("path", ""), plain["objectid"], plain.get("transform", "")
+            if plain.get("printable", "1") in ("0", "false"):
+                model.unread.add("items that are not printed")
+            else:
+                model.items.append(item)
         elif kind == "model":
             model.unit = plain.get("unit", "millimeter")
             if model.unit not in (*_UNITS, _MICRON):

@@ -12,12 +12,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from ..errors import MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES
-from ..formats.xml_files import check_xml
+from ..errors import MAX_MESH_FACES, MAX_MESH_PARTS, MAX_TABLE_BYTES, MeshError
+from ..formats.xml_files import check_elements, check_xml
 from ..utils.choices import UNITS
 from .colours import SurfaceColours
-from .source import MeshSource, ReadMesh
+from .source import MeshSource, ReadMesh, is_file_name
 
+_URDF_FOLDERS = ("robots", "urdf")  # of ROS packages, beside their meshes
 ReadPart = Callable[[MeshSource], ReadMesh]
 
 
@@ -28,6 +29,7 @@ def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) 
         raise ValueError(f"larger than {MAX_TABLE_BYTES:,} bytes")
     data = source.data()
     check_xml(data)
+    check_elements(data)
     robot = ET.fromstring(data)
     if robot.tag != "robot":
         raise ValueError(
@@ -40,6 +42,11 @@ def read_urdf(source: MeshSource, read_part: ReadPart, link: str | None = None) 
     colours = {str(one.get("name")): _colour(one) for one in robot.findall("material")}
     reader = _Parts(source, read_part, colours)
     parts = [part for name, place in places.items() for part in reader.of_link(links[name], place)]
+    if reader.missing and not parts:
+        raise MeshError(
+            f"the meshes that it names are missing in its folder ({reader.missing[0][:100]}); name "
+            f"their folder (textures)"
+        )
     return ReadMesh.joined(parts, "m", "z")
 
 
@@ -114,6 +121,8 @@ class _Parts:
         self._read_part = read_part
         self._colours = colours
         self._meshes: dict[Path, ReadMesh] = {}
+        self._paths: dict[str, Path | None] = {}
+        self.missing: list[str] = []
         self._faces_left = MAX_MESH_FACES
         self._parts_left = MAX_MESH_PARTS
 
@@ -121,11 +130,11 @@ class _Parts:
         """The visible parts of a link that lies at ``place``."""
         found = []
         for visual in link.findall("visual"):
+            self._parts_left -= 1
             geometry = visual.find("geometry")
             mesh = None if geometry is None else self._mesh(geometry)
             if mesh is None:
                 continue
-            self._parts_left -= 1
             self._faces_left -= len(mesh.faces)
             if min(self._parts_left, self._faces_left) < 0:
                 raise ValueError(
@@ -162,8 +171,11 @@ class _Parts:
 
     def _file(self, shape: Any) -> ReadMesh | None:
         name = str(shape.get("filename", ""))
-        path = self._find(name)
+        if name not in self._paths:
+            self._paths[name] = self._find(name)
+        path = self._paths[name]
         if path is None:
+            self.missing.append(name)
             self._source.warn(
                 "link",
                 f"the mesh {name[:100]} is missing in its folder; name its folder (textures)",
@@ -176,6 +188,7 @@ class _Parts:
             mesh = self._read_part(part)
             for warning in part.warnings:
                 self._source.warn(warning.kind, f"{path.name}: {warning.text}")
+            mesh = mesh.without_unused_vertices()
             self._meshes[path] = replace(mesh, vertices=mesh.vertices * UNITS[mesh.unit or "m"])
         mesh = self._meshes[path]
         T = np.eye(4)
@@ -186,13 +199,23 @@ class _Parts:
         """``package://robot/meshes/a.stl`` and ``file://`` names: their ends are looked for in the
         folders."""
         scheme, _, rest = name.rpartition("://")
-        parts = Path(rest).parts
+        parts = Path(rest).parts if is_file_name(rest) else ()
+        if scheme == "package" and parts:
+            self._open_package(parts[0])
         ends = [rest] if not scheme else ["/".join(parts[k:]) for k in range(len(parts))]
         found = next((end for end in ends if self._source.has(end)), None)
         if found is None:
             self._source.find(ends[-1] if ends else name)
             return None
         return self._source.find(found)
+
+    def _open_package(self, name: str) -> None:
+        """Look for files in the ROS package too whose folder ``urdf`` this URDF lies in."""
+        folder = self._source.folder
+        package = folder.parent
+        is_package = folder.name in _URDF_FOLDERS or (package / "package.xml").is_file()
+        if is_package and package.name == name and package not in self._source.extra:
+            self._source.extra.append(package)
 
 
 def _of_trimesh(mesh: trimesh.Trimesh) -> ReadMesh:

@@ -1,8 +1,7 @@
 """USD and USDZ files by OpenUSD: the extra ``usd``."""
 
 import json
-import subprocess
-import sys
+import os
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import (
+    MAX_CAD_MEMORY,
     MAX_CAD_SECONDS,
     MAX_IMAGE_BYTES,
     MAX_MESH_BYTES,
@@ -21,6 +21,7 @@ from ..errors import (
 )
 from ..utils.choices import UNITS
 from ..utils.extras import check_extras
+from ..utils.programs import run_program
 from .cad import bounded
 from .colours import SurfaceColours
 from .gltf import srgb
@@ -28,6 +29,7 @@ from .polygons import triangles_of_faces
 from .source import MeshSource, Pixels, ReadMesh
 
 _PROGRAM = Path(__file__).with_name("usd_parts.py")
+FALLBACK_UNIT = "cm"  # OpenUSD's, of a stage that states no metersPerUnit
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -45,8 +47,8 @@ def read_usd(source: MeshSource) -> ReadMesh:
     parts = [_part(source, f"{k}.", part, arrays) for k, part in enumerate(about["parts"])]
     unit, factor = _unit(about["metres"])
     mesh = ReadMesh.joined(parts)
-    up = about["up"]
-    return ReadMesh(mesh.vertices * factor, mesh.faces, mesh.colours, unit, up)
+    vertices = mesh.vertices * factor
+    return ReadMesh(vertices, mesh.faces, mesh.colours, unit, about["up"], FALLBACK_UNIT)
 
 
 def _unit(metres: float | None) -> tuple[str | None, float]:
@@ -63,12 +65,14 @@ def _parts_of(path: Path) -> tuple[dict[str, Any], Arrays]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "parts.npz")
         bounds = [str(MAX_MESH_PARTS), str(MAX_MESH_FACES)]
-        command = [sys.executable, "-P", str(_PROGRAM), str(path), str(out), *bounds]
-        try:
-            subprocess.run(command, capture_output=True, timeout=MAX_CAD_SECONDS, check=False)
-        except subprocess.TimeoutExpired:
-            message = f"OpenUSD took more than {MAX_CAD_SECONDS} seconds; export it as OBJ or GLB"
-            raise ValueError(message) from None
+        run_program(
+            _PROGRAM,
+            [str(path), str(out), *bounds],
+            name="OpenUSD",
+            seconds=MAX_CAD_SECONDS,
+            memory=MAX_CAD_MEMORY,
+            advice="export it as OBJ or GLB",
+        )
         if not out.is_file():
             raise ValueError("OpenUSD cannot read it; it is damaged, or too large")
         if out.stat().st_size > 4 * MAX_MESH_BYTES:
@@ -128,7 +132,7 @@ def _colours(
             source.warn("texture", "a texture is made in a way that is not read; it is left out")
         pixels = _texture(source, surface) if "texture" in surface else None
         if pixels is not None:
-            tint[faces] = 255
+            tint[faces] = _tint(source, surface)
             coordinates = np.nan_to_num(arrays[f"{key}uv{number - 1}"], posinf=0.0, neginf=0.0)
             uv[faces] = coordinates[corner[faces]]
             texture[faces] = len(textures)
@@ -136,20 +140,35 @@ def _colours(
     return SurfaceColours(tint, uv, texture, tuple(textures))
 
 
+def _tint(source: MeshSource, surface: dict[str, Any]) -> NDArray[np.uint8]:
+    """(3,) what the colours of a texture are multiplied by."""
+    scale = np.array(surface.get("scale", (1.0, 1.0, 1.0)))
+    if scale.max() > 1.0 or any(surface.get("bias", ())):
+        source.warn("texture", "a texture is made brighter by scale or bias: read without")
+    return _bytes(scale)
+
+
 def _bytes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.round(255.0 * srgb(linear)).astype(np.uint8)
 
 
 def _texture(source: MeshSource, surface: dict[str, Any]) -> Pixels | None:
-    """The pixels of a texture: a file beside the mesh, or in the package that the mesh is."""
+    """The pixels of a texture: a file beside the mesh, or in a package."""
     name = str(surface["texture"])
-    if source.path.suffix.lower() != ".usdz":
-        return source.texture_file(name)
-    inner = str(surface["resolved"]).partition("[")[2].rstrip("]")
-    content = None
-    with zipfile.ZipFile(source.path) as package:
-        if inner in package.namelist() and package.getinfo(inner).file_size <= MAX_IMAGE_BYTES:
-            content = package.read(inner)
-    if content is None:
+    inner = str(surface["inner"])
+    beside = os.path.relpath(Path(surface["file"]).resolve(), source.folder)
+    if not inner:
+        names = [beside, name] if os.path.isabs(name) else [beside]
+        return source.texture_file(*names)
+    package = source.find(beside)
+
+    def read_content() -> bytes | None:
+        if package is not None and package.is_file():
+            with zipfile.ZipFile(package) as archive:
+                sizes = {one.filename: one.file_size for one in archive.infolist()}
+                if sizes.get(inner, MAX_IMAGE_BYTES + 1) <= MAX_IMAGE_BYTES:
+                    return archive.read(inner)
         source.warn("texture", f"{name[:100]} is missing in it; its faces have no colours")
-    return source.texture(inner, content, name)
+        return None
+
+    return source.texture((package, inner), read_content, name)

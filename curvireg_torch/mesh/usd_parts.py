@@ -7,7 +7,6 @@ number k are called ``k.points``, ``k.counts``, and so on. OpenUSD follows refer
 :mod:`.usd` runs this in a process that may end as it likes.
 """
 
-import contextlib
 import json
 import sys
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 from pxr import Ar, Sdf, Usd, UsdGeom, UsdShade
 
-MAX_MEMORY = 8 << 30  # bytes of this process
 MAX_PRIMS_PER_PART = 20  # groups, materials and lights beside the parts
 MAX_LAYERS = 1000
 COLOUR_NAMES = ("diffuseColor", "baseColor", "base_color")
@@ -25,10 +23,6 @@ COORDINATES = ("TexCoord2fArray", "Float2Array")
 
 def main() -> None:
     path, out, most_parts, most_faces = sys.argv[1:]
-    with contextlib.suppress(ImportError):  # as on Windows
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
     arrays: dict[str, Any] = {}
     try:
         layers = used_layers(path)
@@ -151,9 +145,10 @@ def read_mesh(mesh: Any, key: str, arrays: dict[str, Any]) -> dict[str, Any] | N
         raise ValueError("faces that do not fit their corners")
     if indices.size and not 0 <= indices.min() <= indices.max() < len(points):
         raise ValueError("a face names a vertex that does not exist")
-    arrays[key + "points"] = points
+    used, own = np.unique(indices, return_inverse=True)  # copies have only the points of faces
+    arrays[key + "points"] = points[used]
     arrays[key + "counts"] = counts
-    arrays[key + "indices"] = indices
+    arrays[key + "indices"] = own.reshape(-1)
     holes = np.array(mesh.GetHoleIndicesAttr().Get(now) or [], np.int64)
     colour = by_corner(UsdGeom.Gprim(mesh).GetDisplayColorPrimvar(), counts, indices, len(points))
     if colour is not None:
@@ -224,25 +219,44 @@ def surface_of(material: Any) -> dict[str, Any]:
 
 
 def texture_of(shader: Any) -> dict[str, Any]:
-    """The file of a texture, and the primvar of its coordinates."""
-    file = shader.GetInput("file") if shader else None
+    """The file of a texture, the factors of its colours, and the primvar of its coordinates."""
+    file = value_of(shader.GetInput("file")) if shader else None
     asset = file.Get() if file else None
     if asset is None:
         return {"unread": True}
-    found = {"texture": asset.path, "resolved": asset.resolvedPath, "coordinates": "st"}
+    found = {"texture": asset.path, **place_of(file, asset), "coordinates": "st"}
+    for name in ("scale", "bias"):
+        attribute = value_of(shader.GetInput(name))
+        value = attribute.Get() if attribute else None
+        if value is not None:
+            found[name] = [float(v) for v in value][:3]
     coordinates = shader.GetInput("st")
     source = coordinates.GetConnectedSources()[0] if coordinates else None
     if source:
         reader = UsdShade.Shader(source[0].source.GetPrim())
         if reader.GetIdAttr().Get() == "UsdTransform2d":
             return {"unread": True}
-        name = reader.GetInput("varname")
-        while name and name.GetConnectedSources()[0]:  # to an input of the material
-            above = name.GetConnectedSources()[0][0]
-            name = UsdShade.ConnectableAPI(above.source.GetPrim()).GetInput(above.sourceName)
+        name = value_of(reader.GetInput("varname"))
         value = name.Get() if name else None
         found["coordinates"] = str(value or "st")
     return found
+
+
+def value_of(entry: Any) -> Any:
+    """The attribute that holds the value of an input: its own, or one of the material that it is
+    connected to; None without one."""
+    found = entry.GetValueProducingAttributes() if entry else ()
+    return found[0] if found else None
+
+
+def place_of(attribute: Any, asset: Any) -> dict[str, str]:
+    """Where the file lies that an asset names, relative to the layer that names it, and what it is
+    within that file if that is a package."""
+    layer = attribute.GetPropertyStack(Usd.TimeCode.EarliestTime())[0].layer
+    place = asset.resolvedPath or layer.ComputeAbsolutePath(asset.path)
+    package, inner = Ar.SplitPackageRelativePathOuter(place)
+    folder = Path(Ar.SplitPackageRelativePathOuter(layer.realPath)[0]).parent
+    return {"file": str(folder / package), "inner": inner}
 
 
 if __name__ == "__main__":

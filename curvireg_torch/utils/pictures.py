@@ -32,6 +32,9 @@ _COMMENT = re.compile(rb"#[^\r\n]*")
 _NUMBER = rb"(?:\s|#[^\r\n]*[\r\n])+\d{1,10}"
 _PPM_HEADER = re.compile(rb"P(?:[14](?:%b){2}|[2356](?:%b){3})\s" % (_NUMBER, _NUMBER))
 _TOO_MANY_PIXELS = f"more than {MAX_IMAGE_PIXELS:,} pixels; scale it down"
+# Tags of TIFF
+_TILE_WIDTH = 322
+_TILE_HEIGHT = 323
 _SCAN_OF_JPEG = re.compile(rb"\xff\xda\0[\x08\x0a\x0c\x0e][\1-\4]")
 
 
@@ -78,8 +81,14 @@ def open_picture(data: bytes) -> "Image":
 
 
 def check_pixels(image: "Image") -> None:
-    """Refuse a picture of too many pixels; after each change of the page of a file with several."""
-    if image.width * image.height > MAX_IMAGE_PIXELS:
+    """Refuse a picture of too many pixels, or of TIFF's tiles, which are decoded as a whole however
+    small the picture is; after each change of the page of a file with several."""
+    tags = getattr(image, "tag_v2", {})
+    try:
+        tile = int(tags.get(_TILE_WIDTH, 0)) * int(tags.get(_TILE_HEIGHT, 0))
+    except (TypeError, ValueError) as error:  # no numbers
+        raise damaged_picture(error) from error
+    if max(image.width * image.height, tile) > MAX_IMAGE_PIXELS:
         raise ImageError(_TOO_MANY_PIXELS)
 
 

@@ -116,6 +116,18 @@ def test_unit_is_doubted_by_size(size, unit, text):
     assert text is None or text in warnings[0]
 
 
+def test_flat_meshes_have_a_flat_hull():
+    """One triangle ended in an error of Qhull."""
+    triangle = [[0, 0, 0], [100, 0, 0], [0, 80, 0]]
+    facts = mesh_facts(trimesh.Trimesh(triangle, [[0, 1, 2]], process=False))
+    assert facts.area_of_hull == pytest.approx(0.5)
+    square = [[0, 0, 1], [3, 4, 1], [-1, 7, 1], [-4, 3, 1]]
+    both = [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]]
+    assert mesh_facts(trimesh.Trimesh(square, both, process=False)).area_of_hull == pytest.approx(
+        1.0
+    )
+
+
 def test_a_sphere_and_a_wire_are_hopeless():
     assert mesh_facts(trimesh.creation.icosphere(3)).is_hopeless
     assert not mesh_facts(trimesh.creation.cylinder(1.0, 2.0)).is_hopeless

@@ -288,7 +288,7 @@ def test_threemf_names_shapes_that_are_left_out(tmp_path: Path, load: Load) -> N
     mesh, texts = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
     assert len(mesh.faces) == 12
     assert texts == [
-        f"{tmp_path / 'a.3mf'}: it has shapes that are not read (beamlattice): left out"
+        f"{tmp_path / 'a.3mf'}: it has parts that are not read (beamlattice): left out"
     ]
 
 
@@ -311,6 +311,31 @@ def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load)
     ):
         mesh, _ = load(threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>', unit=unit))
         assert (mesh.units, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
+
+
+def test_threemf_leaves_out_what_is_not_the_object(tmp_path: Path, load: Load) -> None:
+    """Supports, items that are not printed, and copies on the build plate."""
+    resources = solid(1) + solid(2).replace('type="model"', 'type="support"')
+    resources += solid(3).replace('type="model"', 'type="solidsupport"') + solid(4)
+    move = 'transform="1 0 0 0 1 0 0 0 1 {} 0 0"'
+    items = f'<item objectid="1" {move.format(50)}/>'
+    more = "".join(f'<item objectid="{k}" {move.format(500)}/>' for k in (1, 2, 3))
+    path = tmp_path / "a.3mf"
+    mesh, texts = load(threemf(path, resources, items + more))
+    assert mesh.bounds[:, 0].tolist() == [35, 65]
+    assert [text.removeprefix(f"{path}: ") for text in texts] == [
+        "supports of the print are left out",
+        "further copies of its objects on the build plate are left out (1)",
+    ]
+    for flag in ("0", "false"):
+        mesh, texts = load(
+            threemf(path, resources, items + f'<item objectid="4" printable="{flag}"/>')
+        )
+        assert len(mesh.faces) == 12
+        assert "items that are not printed" in texts[0]
+    mesh, texts = load(threemf(path, resources, items + '<item objectid="4" printable="1"/>'))
+    assert len(mesh.faces) == 24
+    assert "2 objects on its build plate are read as one rigid body" in texts[0]
 
 
 def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
@@ -463,6 +488,38 @@ def test_urdf_names_meshes_that_it_does_not_find(tmp_path: Path, load: Load) -> 
     mesh, texts = load(path, textures=tmp_path)
     assert not texts
     assert mesh.bounds[0][0] == pytest.approx(-1.5)
+
+
+@pytest.mark.parametrize(
+    ("place", "names_package", "is_found"),
+    [
+        ("arm_description/urdf", True, True),
+        ("arm_description/robots", True, True),
+        ("arm_description/robots", False, False),
+        ("arm_description/other", True, False),
+        ("arm_description/other", "package.xml", True),
+        ("other/urdf", True, False),
+    ],
+)
+def test_meshes_of_a_package_are_found_from_its_folder_urdf(
+    tmp_path: Path, load: Load, place: str, names_package: bool | str, is_found: bool
+) -> None:
+    folder = tmp_path / place
+    folder.mkdir(parents=True)
+    (folder.parent / "meshes").mkdir()
+    trimesh.creation.box((3.0, 2.0, 1.0)).export(folder.parent / "meshes" / "base.stl")
+    if names_package == "package.xml":
+        (folder.parent / "package.xml").write_text("<package/>")
+    name = "package://arm_description/meshes/base.stl" if names_package else "meshes/base.stl"
+    shape = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="r"><link name="l">{shape}</link></robot>')
+    if is_found:
+        assert load(path)[0].extents.tolist() == [3.0, 2.0, 1.0]
+        return
+    text = rf"the meshes that it names are missing in its folder \({name}\); name their folder"
+    with pytest.raises(MeshError, match=text):
+        cr.load_mesh(path)
 
 
 def test_hostile_urdf_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,7 @@ def test_places_units_axes_and_polygons(tmp_path: Path, load: Load) -> None:
     [
         ('metersPerUnit = 0.01\n    upAxis = "Y"', "cm", "y", 2.0),
         ("metersPerUnit = 0.5", "m", "y", 1.0),  # a unit without a name
-        ('upAxis = "Z"', "m", "z", 2.0),  # not stated: what the user says, or metres
+        ('upAxis = "Z"', "cm", "z", 2.0),  # not stated: OpenUSD's centimetres
     ],
 )
 def test_units_and_axes_are_those_of_the_stage(
@@ -124,6 +124,8 @@ def test_units_and_axes_are_those_of_the_stage(
     mesh, _ = load(path)
     assert (mesh.units, mesh_up(mesh)) == (unit, up)
     assert mesh.extents[0] == pytest.approx(width)
+    if "metersPerUnit" not in about:
+        assert load(path, unit="mm")[0].units == "mm"
 
 
 def test_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
@@ -161,6 +163,71 @@ def test_textures_by_the_coordinates_that_they_name(tmp_path: Path, load: Load, 
         assert any("print.png is missing" in text for text in load(path)[1])
 
 
+def painted(colour: tuple[int, int, int]) -> bytes:
+    file = BytesIO()
+    Image.new("RGB", (4, 4), colour).save(file, "PNG")
+    return file.getvalue()
+
+
+def textures_of(mesh: trimesh.Trimesh) -> list[list[int]]:
+    colours = surface_colours(mesh)
+    assert colours is not None
+    return [texture[0, 0].tolist() for texture in colours.textures]
+
+
+def test_textures_lie_beside_the_file_that_names_them(tmp_path: Path, load: Load) -> None:
+    """A file of the same name beside the first one is another texture."""
+    for folder, colour in ((".", (255, 0, 0)), ("blue", (0, 0, 255))):
+        (tmp_path / folder / "textures").mkdir(parents=True)
+        (tmp_path / folder / "textures" / "print.png").write_bytes(painted(colour))
+    about = 'defaultPrim = "part"'
+    text = stage(MATERIAL, square(MAP, BOUND), about=about)
+    (tmp_path / "blue" / "part.usda").write_text(text)
+    path = tmp_path / "all.usda"
+    path.write_text('#usda 1.0\ndef "a" (references = @blue/part.usda@)\n{\n}\n')
+    mesh, texts = load(path)
+    assert (textures_of(mesh), texts) == ([[0, 0, 255]], [])
+    (tmp_path / "blue" / "textures" / "print.png").unlink()
+    mesh, texts = load(path)
+    assert textures_of(mesh) == []
+    assert "blue/textures/print.png is missing" in texts[0]
+    packed = package(tmp_path / "p[1].usdz", text, textures__print_png=painted((0, 255, 0)))
+    for place in (packed, path):
+        path.write_text('#usda 1.0\ndef "a" (references = @p[1].usdz@)\n{\n}\n')
+        mesh, texts = load(place)
+        assert (textures_of(mesh), texts) == ([[0, 255, 0]], [])
+
+
+def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "print.png").write_bytes(painted((1, 2, 3)))
+    named = MATERIAL.replace(
+        "asset inputs:file = @textures/print.png@",
+        "asset inputs:file.connect = </part/paint.inputs:picture>",
+    )
+    surface = "        token outputs:surface.connect"
+    named = named.replace(surface, f"        asset inputs:picture = @print.png@\n{surface}", 1)
+    (tmp_path / "part.usda").write_text(stage(named, square(MAP, BOUND)))
+    assert textures_of(load(tmp_path / "part.usda")[0]) == [[1, 2, 3]]
+
+
+def test_textures_are_scaled(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "textures").mkdir()
+    (tmp_path / "textures" / "print.png").write_bytes(painted((255, 255, 255)))
+    path = tmp_path / "part.usda"
+    for more, tint, count in (
+        ("float4 inputs:scale = (0.2140411, 1, 0, 1)", [128, 255, 0], 0),
+        ("float4 inputs:scale = (2, 1, 1, 1)", [255, 255, 255], 1),
+        ("float4 inputs:bias = (0.1, 0, 0, 0)", [255, 255, 255], 1),
+    ):
+        scaled = MATERIAL.replace("asset inputs:file", f"{more}\n            asset inputs:file")
+        path.write_text(stage(scaled, square(MAP, BOUND)))
+        mesh, texts = load(path)
+        assert len(texts) == count
+        colours = surface_colours(mesh)
+        assert colours is not None
+        assert colours.corners[0, 0].tolist() == tint
+
+
 def test_references_stay_in_the_folder(tmp_path: Path, load: Load) -> None:
     (tmp_path / "in").mkdir()
     part = '#usda 1.0\n(\n    defaultPrim = "part"\n)\ndef Xform "part"\n{' + square() + "}\n"
@@ -187,7 +254,10 @@ def test_references_stay_in_the_folder(tmp_path: Path, load: Load) -> None:
         (stage(square(counts="5")), "do not fit"),
         (stage('    def PointInstancer "a" {}'), "point instancers"),
         (stage('    def "a" (clips = {}) {}'), "value clips"),
-        (stage('    def Cube "a" {}'), "without faces|got none"),
+        (
+            stage('    def Cube "a" {}'),
+            r"has no faces: parts that are no meshes are left out \(Cube\)",
+        ),
     ],
 )
 def test_what_is_not_read_is_refused(tmp_path: Path, load: Load, text: str, match: str) -> None:

@@ -3,6 +3,7 @@
 import io
 import re
 import shutil
+import struct
 from contextlib import suppress
 from pathlib import Path
 
@@ -202,3 +203,26 @@ def test_pillow_is_given_the_one_decoder_that_the_first_bytes_name(monkeypatch):
         with pytest.raises(ImageError, match=r"damaged or truncated \(damaged\)"):
             open_picture(data)
     assert asked == [["PNG"], ["BMP"], ["JPEG"]]
+
+
+def _tiled(width: int, height: int, kind: int = 4) -> bytes:
+    """A TIFF of 10 x 10 px in one tile, which libtiff decodes as a whole."""
+    values = {256: 10, 257: 10, 258: 8, 259: 5, 262: 1, 277: 1, 322: width, 323: height}
+    data = 8 + 2 + 12 * (len(values) + 2) + 4
+    values |= {324: data, 325: 64}
+    rows = [
+        struct.pack("<HHII", tag, kind if tag == 322 else 4, 1, value)
+        for tag, value in values.items()
+    ]
+    head = b"II*\0" + struct.pack("<IH", 8, len(rows))
+    return head + b"".join(rows) + bytes(4) + bytes(64)
+
+
+def test_a_small_tiff_of_a_huge_tile_is_refused_before_it_is_decoded():
+    """1 kB took 1.2 GB."""
+    with pytest.raises(ImageError, match="pixels; scale it down"):
+        open_picture(_tiled(20_000, 20_000))
+    with pytest.raises(ImageError, match="damaged or truncated"):
+        open_picture(_tiled(int.from_bytes(b"ab\0\0", "little"), 16, kind=2))
+    assert open_picture(_tiled(16, 16)).size == (10, 10)
+    assert open_picture(_tiled(9_456, 9_456)).size == (10, 10)
