@@ -132,15 +132,16 @@ class _Parts:
         for visual in link.findall("visual"):
             self._parts_left -= 1
             geometry = visual.find("geometry")
-            mesh = None if geometry is None else self._mesh(geometry)
-            if mesh is None:
-                continue
-            self._faces_left -= len(mesh.faces)
-            if min(self._parts_left, self._faces_left) < 0:
+            has_room = self._parts_left >= 0
+            mesh = self._mesh(geometry) if has_room and geometry is not None else None
+            self._faces_left -= 0 if mesh is None else len(mesh.faces)
+            if not has_room or self._faces_left < 0:
                 raise ValueError(
                     f"more than {MAX_MESH_PARTS:,} parts or {MAX_MESH_FACES:,} faces; leave some "
                     f"out"
                 )
+            if mesh is None:
+                continue
             colour = self._colour_of(visual)
             if mesh.colours is None and colour is not None:
                 mesh = replace(mesh, colours=SurfaceColours.plain(len(mesh.faces), colour))

@@ -52,7 +52,8 @@ def used_layers(path: str) -> list[str]:
                 raise ValueError("not a USD file, or damaged")
             continue  # a stage goes on without it
         layer.Traverse("/", refuse_clips(layer))
-        for name in layer.GetCompositionAssetDependencies():
+        # a part that refers to another of the same file names none
+        for name in filter(None, layer.GetCompositionAssetDependencies()):
             target = layer.ComputeAbsolutePath(name)
             package = Ar.SplitPackageRelativePathOuter(target)[0]
             if "://" in name or "`" in name or not is_inside(package, path, folder):

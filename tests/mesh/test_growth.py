@@ -357,13 +357,23 @@ def test_usd_drops_unused_points_before_they_are_copied(
 ) -> None:
     points = ", ".join(["(9, 9, 9)"] * 1000 + ["(0, 0, 0)", "(1, 0, 0)", "(0, 1, 0)"])
     text = f"""#usda 1.0
-def Xform "a" (instanceable = true) {{ def Mesh "m" {{
-    point3f[] points = [{points}]
-    int[] faceVertexCounts = [3]
-    int[] faceVertexIndices = [1000, 1001, 1002]
-}} }}
-def "b" (instanceable = true
-    references = </a>) {{}}
+def Xform "a" (
+    instanceable = true
+)
+{{
+    def Mesh "m"
+    {{
+        point3f[] points = [{points}]
+        int[] faceVertexCounts = [3]
+        int[] faceVertexIndices = [1000, 1001, 1002]
+    }}
+}}
+def "b" (
+    instanceable = true
+    references = </a>
+)
+{{
+}}
 """
     (tmp_path / "a.usda").write_text(text)
     _, arrays = usd._parts_of(tmp_path / "a.usda")

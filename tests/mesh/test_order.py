@@ -15,6 +15,7 @@ import trimesh
 from PIL import Image
 
 import curvireg_torch as cr
+from curvireg_torch.errors import CurviregWarning, MeshError
 from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
 from curvireg_torch.mesh.colours import texture_pixels
 from curvireg_torch.mesh.polygons import divide_faces, triangles_of_faces
@@ -453,12 +454,12 @@ def test_the_likely_unit_is_proposed(tmp_path: Path, suffix: str, unit: str) -> 
     path = tmp_path / f"a.{suffix}"
     box.export(path)
     given = None if suffix == "stl" else "mm"
-    with pytest.warns(cr.CurviregWarning, match=rf"give the unit \({unit}\?\)"):
+    with pytest.warns(CurviregWarning, match=rf"give the unit \({unit}\?\)"):
         assert mesh_up(cr.load_mesh(path, unit=given)) == ("z" if suffix == "stl" else "y")
     box.apply_scale(1e-9)
     box.vertices *= 1e4
     box.export(tmp_path / "b.stl")
-    with pytest.warns(cr.CurviregWarning, match=r"give the unit$"):
+    with pytest.warns(CurviregWarning, match=r"give the unit$"):
         cr.load_mesh(tmp_path / "b.stl")
 
 
@@ -477,5 +478,5 @@ def test_the_likely_unit_is_proposed(tmp_path: Path, suffix: str, unit: str) -> 
 )
 def test_what_a_mesh_without_faces_is(tmp_path: Path, name: str, text: str, match: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(cr.MeshError, match=match):
+    with pytest.raises(MeshError, match=match):
         cr.load_mesh(tmp_path / name)
