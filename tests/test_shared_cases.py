@@ -307,7 +307,6 @@ def test_a_photograph_of_a_phone_and_a_step_file_know_camera_and_unit():
     torch.testing.assert_close(box, torch.tensor(truth["box"]).double(), atol=10.0, rtol=0)
 
 
-<<<<<<< HEAD
 def test_a_matrix_of_the_picture_at_half_size_is_named():
     camera = cr.load_camera(real_case("n73-camera-of-half-the-size") / "cam_K.txt")
     folder = real_case("lamp")
@@ -316,7 +315,8 @@ def test_a_matrix_of_the_picture_at_half_size_is_named():
     of_photograph = cr.camera_matrix(1100, 1100, 479.5, 359.5)
     item = image_items([folder / "photo.jpg"], [[334, 146, 711, 573.5]], [of_photograph])[0]
     assert not item.warnings
-=======
+
+
 def area_of_polygons(path: Path) -> float:
     """The area of the flat polygons of an OBJ, by the cross products of their corners."""
     lines = [line.split() for line in path.read_text().splitlines()]
@@ -379,4 +379,3 @@ def test_the_forgotten_unit_is_proposed(name, given, likely):
     folder, _, file = name.partition("/")
     with pytest.warns(CurviregWarning, match=rf"if that is wrong, give the unit \({likely}\?\)"):
         cr.load_mesh(real_case(folder) / file, unit=given)
->>>>>>> d578b952 (Meshes: small files cannot make a reader work or hold much; what was read wrongly without a word)
