@@ -15,7 +15,8 @@ import curvireg_torch as cr
 from curvireg_torch.cli import main
 from curvireg_torch.data.images import read_photo
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError, MeshError
-from curvireg_torch.jobs.lists import find_photographs
+from curvireg_torch.jobs.lists import find_photographs, read_list
+from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.mesh import has_colours, mesh_symmetries, mesh_warnings
 from curvireg_torch.registration.inputs import FRACTIONS, image_items
 from curvireg_torch.registration.starts import why_outside
@@ -379,3 +380,55 @@ def test_the_forgotten_unit_is_proposed(name, given, likely):
     folder, _, file = name.partition("/")
     with pytest.warns(CurviregWarning, match=rf"if that is wrong, give the unit \({likely}\?\)"):
         cr.load_mesh(real_case(folder) / file, unit=given)
+
+
+def test_a_calibration_of_the_turned_phone_is_refused():
+    camera = cr.load_camera(real_case("n61-calibration-of-the-turned-phone") / "portrait.json")
+    photo = read_photo(real_case("lamp") / "photo.jpg")
+    with pytest.raises(InvalidInputError, match="turn the photograph by 90 degrees"):
+        camera.at(tuple(photo.image.shape[-2:]))
+
+
+def test_a_cmyk_photograph_is_not_inverted():
+    photo = read_photo(real_case("n30-cmyk-jpeg") / "photo.jpg")
+    plain = read_photo(real_case("lamp") / "photo.jpg")
+    assert "CMYK converted to RGB without a colour profile" in photo.notes
+    assert float((photo.image.int() - plain.image.int()).abs().float().mean()) < 4
+
+
+def test_animations_are_named():
+    folder = real_case("n32-animated")
+    assert "one of several pictures" in read_photo(folder / "photo.webp").notes
+    with pytest.raises(CurviregError, match="not an image that is read"):
+        read_photo(folder / "photo.gif")
+
+
+def test_a_digital_zoom_is_a_note_and_a_larger_deviation():
+    """Of 20 mm without the zoom of 2; 39.7 mm are right."""
+    photo = read_photo(real_case("n35-digital-zoom") / "photo.jpg")
+    camera = photo.camera()
+    assert camera is not None
+    assert any("digital zoom 2" in note for note in photo.notes)
+    right = 1100.0 / float(camera.matrix[0, 0])
+    assert abs(np.log(right)) <= camera.focal_deviation
+
+
+@pytest.mark.parametrize("name", ["list.csv", "list_tab.csv"])
+def test_lists_of_spreadsheets_are_read(name):
+    options = RegisterOptions(meshes=(real_case("lamp") / "lamp.stl",))
+    (entry,) = read_list(real_case("n56-semicolon-list") / name, options)
+    assert (entry.error, entry.box) == ("", (334.0, 146.0, 711.0, 573.5))
+    if entry.camera is not None:
+        torch.testing.assert_close(
+            entry.camera.matrix, cr.camera_matrix(1100, 1100, 479.5, 359.5).double()
+        )
+
+
+def test_sets_of_blenderproc_are_read_and_their_splits_named():
+    folder = real_case("n67-bop-of-blenderproc") / "bop_data"
+    with pytest.raises(CurviregError, match="the set has train_pbr: choose it as split"):
+        cr.data.BOPDataset(folder)
+    (sample,) = cr.data.BOPDataset(folder, "train_pbr")
+    torch.testing.assert_close(
+        sample["box"], torch.tensor([334.0, 146.0, 711.0, 573.5]), atol=1.5, rtol=0
+    )

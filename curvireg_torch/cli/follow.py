@@ -336,6 +336,7 @@ def _camera(options: "RegisterOptions", image: "Tensor") -> "Camera | None":
 def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
     """The frames of a video or a folder, their number, and frames per second."""
     from ..data import Video, read_photo
+    from ..data.images import ANIMATED
     from ..jobs.lists import find_photographs, is_video
 
     if is_video(path):
@@ -348,11 +349,14 @@ def _frames(path: Path) -> tuple[Iterator["Frame"], int, float]:
     photos = find_photographs(path)
 
     def read() -> Iterator["Frame"]:
-        for photo in photos:
+        for name in photos:
             try:
-                yield str(photo), read_photo(photo).image
+                photo = read_photo(name)
+                if len(photos) == 1 and ANIMATED in photo.notes:
+                    raise ImageError("an animation; save it as MP4, or its pictures in a folder")
+                yield str(name), photo.image
             except (CurviregError, OSError) as error:
-                yield str(photo), ImageError(str(error))
+                yield str(name), ImageError(str(error))
 
     return read(), len(photos), FOLDER_FPS
 

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from .bop_models import BOPModels
 from .calibrations.record import flattened
 
 _README = "datasets/bop/README.md"
+_TRUTH = "scene_gt"
 _UNKNOWN_BOX = (math.nan,) * 4
 MAX_DIAMETERS = 20.0  # of a mesh over its distance: beyond, it is in mm and the poses in metres
 
@@ -80,7 +81,7 @@ class BOPDataset(ObjectDataset):
         self.split = split
         scenes = self.root / split
         if not is_plain_name(split) or not scenes.is_dir():
-            raise MissingFileError(f"no such folder; {_README} shows the layout", subject=scenes)
+            raise _missing_split(self.root, scenes)
         if not is_plain_name(models):
             raise MissingFileError(
                 f"no such folder; {_README} shows the layout", subject=self.root / models
@@ -98,6 +99,7 @@ class BOPDataset(ObjectDataset):
                 f"no scene, which is a folder with a number as 000001; {_README} shows the layout",
                 subject=scenes,
             )
+        _check_sensors(scenes, numbered)
         for folder in numbered:
             self._index(folder, counts)
         self._check_unit()
@@ -233,6 +235,35 @@ class BOPDataset(ObjectDataset):
             projected_boxes(hull, transform(R.view(3, 3), t), K.view(3, 3)).tolist()
         )
         return box
+
+
+def _missing_split(root: Path, scenes: Path) -> MissingFileError:
+    """The error about a split that is not there: it names those that are."""
+    found = {file.parents[1] for file in root.glob(f"*/*/{_TRUTH}*.json")}
+    # one level below, where the folder of all sets was given
+    below = {file.parents[2] for file in root.glob(f"*/*/*/{_TRUTH}*.json")}
+    advice = ""
+    if found:
+        names = ", ".join(sorted(folder.name for folder in found))
+        advice = f"the set has {names}: choose {'it' if len(found) == 1 else 'one'} as split; "
+    elif below:
+        advice = f"give the folder of one set: {', '.join(sorted(map(str, below)))}; "
+    return MissingFileError(f"no such folder; {advice}{_README} shows the layout", subject=scenes)
+
+
+def _check_sensors(scenes: Path, numbered: Sequence[Path]) -> None:
+    """Refuse scenes of several cameras, whose files are called by the camera."""
+    if any((folder / f"{_TRUTH}.json").is_file() for folder in numbered):
+        return
+    files = [file for folder in numbered for file in folder.glob(f"{_TRUTH}_*.json")]
+    names = {file.stem.removeprefix(f"{_TRUTH}_") for file in files}
+    sensors = sorted(name for name in names if not name.startswith(("info", "coco")))
+    if sensors:
+        message = (
+            f"scenes of several cameras: {', '.join(sensors)}; copy the files of one, such as "
+            f"{_TRUTH}_{sensors[0]}.json and rgb_{sensors[0]}, to {_TRUTH}.json and rgb"
+        )
+        raise InvalidInputError(message, subject=scenes)
 
 
 def images_by_number(scene: Path) -> dict[int, Path]:

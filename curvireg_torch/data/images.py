@@ -38,6 +38,7 @@ _EXIF_DIRECTORY = 0x8769
 _FOCAL_35MM = 0xA405
 _FOCAL = 0x920A  # in mm, of the lens itself
 # EXIF pixels per unit of length of the sensor, and the unit: 2 = inch, 3 = cm, 4 = mm, 5 = um
+_DIGITAL_ZOOM = 0xA404
 _SENSOR_X = 0xA20E
 _SENSOR_Y = 0xA20F
 _SENSOR_UNIT = 0xA210
@@ -58,6 +59,18 @@ and stabilisers cut the border off, and some cameras mean the width by it, not t
 estimate, not measured."""
 
 
+ANIMATED = "one of several pictures"
+"""Note about the first picture of an animation, or of a file of several."""
+
+MAX_DIGITAL_ZOOM = 200.0  # of telephones; larger values of EXIF are mistakes
+# Longer side over the shorter one beyond which a picture is a panorama, or a strip of another one
+PANORAMA_PROPORTIONS = 2.5
+_PANORAMA = re.compile(
+    rb"GPano:ProjectionType"
+)  # in XMP, of a telephone or a camera of 360 degrees
+MAX_METADATA_BYTES = 1 << 17  # at the start of a file, in which XMP is looked for
+
+
 @dataclass(frozen=True)
 class Photo:
     """A photograph as viewers show it, and the metadata of its file.
@@ -70,6 +83,9 @@ class Photo:
         notes: changes to the pixels, in words.
         taken_size: EXIF (H, W) in px of the picture that the camera took, before orientation; None
             if it is not known.
+        digital_zoom: EXIF factor by which the picture was enlarged, where ``focal_35mm`` may be
+            without it; 1 if there is none, or the focal length has it.
+        is_stitched: whether the file says that it is a panorama.
 
     Example:
         >>> photo = Photo(torch.zeros(3, 48, 64, dtype=torch.uint8), 1, 28.0, ())
@@ -82,6 +98,17 @@ class Photo:
     focal_35mm: float | None
     notes: tuple[str, ...]
     taken_size: tuple[int, int] | None = None
+    digital_zoom: float = 1.0
+    is_stitched: bool = False
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether no pinhole camera with its axis in the middle shows the picture: the file says
+        so, or it has a camera's focal length and no camera's proportions."""
+        H, W = self.image.shape[-2:]
+        is_strip = max(H, W) > PANORAMA_PROPORTIONS * min(H, W)
+        is_of_camera = self.focal_35mm is not None and not self.is_cropped
+        return self.is_stitched or (is_strip and is_of_camera)
 
     @property
     def is_cropped(self) -> bool:
@@ -101,9 +128,10 @@ class Photo:
         The focal length is relative to the diagonal of the picture that the camera took. A picture
         of its proportions is taken for a resized one, with the principal point in its centre. One
         of other proportions is taken for a part of it at full size, which is as large; None if it
-        is larger.
+        is larger, and of a panorama. With a digital zoom that the focal length may lack it is the
+        mean, by ratio, of both.
         """
-        if self.focal_35mm is None:
+        if self.focal_35mm is None or self.is_panorama:
             return None
         H, W = self.image.shape[-2:]
         taken = (H, W)
@@ -111,13 +139,15 @@ class Photo:
             taken = self.taken_size
             if max(H, W) > max(taken) or min(H, W) > min(taken):
                 return None
-        focal = self.focal_35mm * math.hypot(*taken) / _DIAGONAL_35MM
+        focal = self.focal_35mm * math.sqrt(self.digital_zoom)
+        focal *= math.hypot(*taken) / _DIAGONAL_35MM
         return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
     def camera(self) -> Camera | None:
         """Return the camera of :meth:`guessed_camera_matrix`, or None."""
         K = self.guessed_camera_matrix()
-        return None if K is None else Camera(K, focal_deviation=EXIF_DEVIATION, source="exif")
+        deviation = math.hypot(EXIF_DEVIATION, math.log(self.digital_zoom) / 2)
+        return None if K is None else Camera(K, focal_deviation=deviation, source="exif")
 
     def facts(self) -> dict[str, Any]:
         """Return all but the pixels, as plain JSON."""
@@ -181,8 +211,18 @@ def _photo(
     orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
         notes = (f"EXIF orientation {orientation} applied", *notes)
+    if exif.digital_zoom > 1.0:
+        notes = (*notes, f"digital zoom {exif.digital_zoom:.3g}: perhaps not in the focal length")
     pixels = torch.from_numpy(np.array(oriented(rgb, orientation).transpose(2, 0, 1), order="C"))
-    return Photo(pixels, orientation, exif.focal_35mm, notes, exif.taken_size)
+    return Photo(
+        pixels,
+        orientation,
+        exif.focal_35mm,
+        notes,
+        taken_size=exif.taken_size,
+        digital_zoom=exif.digital_zoom,
+        is_stitched=exif.is_stitched,
+    )
 
 
 def read_image(path: str | os.PathLike[str]) -> Tensor:
@@ -225,6 +265,8 @@ class _Exif(NamedTuple):
     orientation: int
     focal_35mm: float | None
     taken_size: tuple[int, int] | None
+    digital_zoom: float
+    is_stitched: bool
 
 
 def _decode(path: Path) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
@@ -234,7 +276,7 @@ def _decode(path: Path) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
 
 def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
     notes = _notes(image)
-    exif = _exif(image)
+    exif = _exif(image, data)
     rgb, stretched = _rgb_pixels(image, data)
     return as_in_file(rgb, image, exif.orientation), exif, (*notes, *stretched)
 
@@ -285,10 +327,11 @@ def _seek_full_image(image: "Image") -> None:
         raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
 
 
-def _exif(image: "Image") -> _Exif:
+def _exif(image: "Image", data: bytes = b"") -> _Exif:
     """The metadata of a picture; what is damaged gives orientation 1, and None."""
     orientation = 1
     focal = 0.0
+    zoom = 1.0
     width = height = 0
     with suppress(Exception):
         exif = image.getexif()
@@ -297,15 +340,26 @@ def _exif(image: "Image") -> _Exif:
         focal = float(directory.get(_FOCAL_35MM, 0))
         width = int(directory.get(_TAKEN_WIDTH, 0))
         height = int(directory.get(_TAKEN_HEIGHT, 0))
+        stated = float(directory.get(_DIGITAL_ZOOM, 0))
+        zoom = stated if 1.0 < stated <= MAX_DIGITAL_ZOOM else 1.0
         if focal == 0.0:
             size = (width, height) if width > 0 and height > 0 else image.size
-            focal = _focal_by_sensor(directory, size)
+            focal = zoom * _focal_by_sensor(directory, size)
+            zoom = 1.0
     valid = isinstance(orientation, int) and orientation in range(1, 9)
     return _Exif(
         orientation if valid else 1,
         focal if 0 < focal < math.inf else None,
         (height, width) if width > 0 and height > 0 else None,
+        zoom if focal > 0 else 1.0,
+        any(_PANORAMA.search(part) for part in (data[:MAX_METADATA_BYTES], _xmp(image))),
     )
+
+
+def _xmp(image: "Image") -> bytes:
+    """The XMP of a picture that Pillow has found."""
+    found = image.info.get("xmp", b"")
+    return found if isinstance(found, bytes) else str(found).encode()
 
 
 def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
@@ -399,7 +453,7 @@ def _notes(image: "Image") -> tuple[str, ...]:
         "CMYK converted to RGB without a colour profile": image.mode == "CMYK",
         "alpha channel dropped": image.has_transparency_data,
         # previews of phones
-        "one of several pictures": getattr(image, "is_animated", False) and image.format != "MPO",
+        ANIMATED: getattr(image, "is_animated", False) and image.format != "MPO",
     }
     return tuple(text for text, applies in notes.items() if applies)
 

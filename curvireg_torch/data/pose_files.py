@@ -26,6 +26,8 @@ _MATRICES |= {
     plain(name)
     for name in ("T", "pose", "matrix", "transform", "transform_matrix", "ob_in_cam", "K")
 }
+# frames of ROS in which no camera looks along z: the world's, and bodies, whose x points forward
+_OTHER_FRAMES = re.compile(r"(^|/)(world|map|odom|base\w*|earth|\w*_link)$")
 FORMATS = (
     "JSON with rotation and translation, or T_cam_from_model; 4 x 4 numbers; TWO of MegaPose; "
     "scene_gt.json:IMAGE_ID "
@@ -227,7 +229,14 @@ def _megapose(content: Mapping[str, Any]) -> PoseFile:
 
 
 def _ros(content: Mapping[str, Any]) -> PoseFile:
-    """A PoseStamped, as ``--format ros`` writes it: metres."""
+    """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
+    header = content.get("header")
+    frame = str(header.get("frame_id") or "") if isinstance(header, dict) else ""
+    if _OTHER_FRAMES.search(frame):
+        raise InvalidInputError(
+            f"frame_id {frame!r:.60} is not the camera's optical frame (x right, y down, z "
+            f"forward); transform the pose into that, as tf2 does"
+        )
     pose = content.get("pose")
     while isinstance(pose, dict) and "pose" in pose:  # with a covariance beside it
         pose = pose["pose"]

@@ -37,22 +37,22 @@ def rotation_from_viewpoint(
     equation.
 
     Args:
-        azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...).
+        azimuth, elevation, theta: degrees, numbers or tensors of broadcastable shapes (...); of
+            numbers alone the result is float64.
 
     Example:
         >>> R = rotation_from_viewpoint(0.0, 0.0, 0.0)      # camera on the -y axis, model's z up
-        >>> [round(v) for v in (R @ torch.tensor([0.0, 0.0, 1.0])).tolist()]
+        >>> [round(v) for v in R[:, 2].tolist()]
         [0, -1, 0]
     """
     angles = azimuth, elevation, theta
-    # of the tensors, for plain numbers
-    device = next((v.device for v in angles if isinstance(v, Tensor)), None)
-    tensors = [
-        v if isinstance(v, Tensor) else torch.tensor(float(v), device=device) for v in angles
-    ]
-    tensors = [v if v.is_floating_point() else v.to(torch.get_default_dtype()) for v in tensors]
-    dtype = reduce(torch.promote_types, (v.dtype for v in tensors))
-    a, e, t = (torch.deg2rad(v) for v in torch.broadcast_tensors(*(v.to(dtype) for v in tensors)))
+    given = [v for v in angles if isinstance(v, Tensor)]
+    # plain numbers take the type of the tensors; alone they are float64, as poses are
+    device = given[0].device if given else None
+    kinds = [v.dtype if v.is_floating_point() else torch.get_default_dtype() for v in given]
+    dtype = reduce(torch.promote_types, kinds) if kinds else torch.float64
+    tensors = [torch.as_tensor(v, dtype=dtype, device=device) for v in angles]
+    a, e, t = (torch.deg2rad(v) for v in torch.broadcast_tensors(*tensors))
     ca = a.cos()
     sa = a.sin()
     ce = e.cos()

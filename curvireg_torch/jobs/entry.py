@@ -151,6 +151,13 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     if given not in (None, "exif"):
         H, W = photo.image.shape[-2:]
         return Camera(camera_of_view(float(given), (H, W)), focal_deviation=VIEW_DEVIATION), "fov"
+    if photo.is_panorama and not entry.as_stored:
+        raise InvalidInputError(
+            "a panorama, or a strip of another picture, which is no pinhole camera with its axis "
+            "in the middle; take an ordinary photograph, or give the camera of this part",
+            subject=entry.name,
+            kind="camera",
+        )
     # boxes of datasets come with what is to be known
     camera = None if entry.as_stored else photo.camera()
     if camera is not None:

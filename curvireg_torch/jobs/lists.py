@@ -16,7 +16,7 @@ from ..data.frames import FrameReader, VideoFrame
 from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera, camera_matrix
 from ..registration.words import two_decimals, verdict_counts
-from ..utils.choices import IMAGES, VIDEOS, is_pattern
+from ..utils.choices import IMAGES, VIDEOS, pattern_of
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from .entry import Entry, entry_of
@@ -166,9 +166,10 @@ def video_frames(path: Path, every: int) -> Iterator[tuple[str, VideoFrame]]:
 def find_photographs(path: Path) -> list[Path]:
     """The photographs in a folder or of a pattern such as ``shots/*.jpg``, frame-2 before frame-10;
     or ``path``."""
-    if not (path.is_dir() or is_pattern(path)):
+    pattern = pattern_of(path)
+    if not (path.is_dir() or pattern):
         return [path]
-    inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path), recursive=True))
+    inside = map(Path, glob.glob(pattern, recursive=True)) if pattern else path.iterdir()
     photographs = [found for found in inside if found.suffix.lower() in IMAGES and found.is_file()]
     if not photographs:
         raise MissingFileError(f"{path}: no photographs ({', '.join(IMAGES)}); check the path")
@@ -195,7 +196,7 @@ def read_list(path: Path, options: RegisterOptions) -> list[Entry]:
     if missing := [required for required in _REQUIRED if required not in names]:
         raise InvalidInputError(
             f"{path}: no column {', '.join(missing)} in its header {','.join(header)[:80]!r}; "
-            f"separate columns by commas and call them {','.join(_REQUIRED)}"
+            f"separate columns by commas, semicolons or tabs, and call them {','.join(_REQUIRED)}"
         )
     if len(names) > MAX_LIST_COLUMNS:
         raise InvalidInputError(f"{path}: more than {MAX_LIST_COLUMNS:,} columns; leave some out")

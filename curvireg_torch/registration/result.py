@@ -3,7 +3,7 @@
 import html
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Generic, Self, TypeVar, overload
 
 import torch
@@ -442,8 +442,9 @@ class FailedRegistration:
         return verdict_of_error(self.error)
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
+        of_pose = {field.name for field in fields(Registration)} | vars(Registration).keys()
+        if name.startswith("_") or name not in of_pose:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise self.error
 
 

@@ -2,6 +2,7 @@
 imported."""
 
 import glob
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -88,7 +89,22 @@ _ORDER = "the photograph comes first, the mesh last"
 
 def is_pattern(path: Path) -> bool:
     """Whether a path is a pattern of several, such as ``shots/*.jpg``."""
-    return glob.has_magic(str(path)) and not path.exists()
+    return bool(pattern_of(path))
+
+
+def pattern_of(path: Path) -> str:
+    """The pattern of :func:`glob.glob` for a path with wildcards beyond the folders that exist;
+    "" without any, as of a file in a folder called ``part [1]``.
+
+    Example:
+        >>> pattern_of(Path("shots/a.jpg")), pattern_of(Path("shots-of-nobody/*.jpg"))
+        ('', './shots-of-nobody/*.jpg')
+    """
+    existing = next((part for part in (path, *path.parents) if os.path.exists(part)), Path())
+    rest = os.path.relpath(path, existing) if path.is_absolute() else path.relative_to(existing)
+    if not glob.has_magic(str(rest)):
+        return ""
+    return f"{glob.escape(str(existing))}/{rest}"
 
 
 def is_one_photograph(paths: Sequence[Path]) -> bool:

@@ -244,18 +244,36 @@ def split_name(path: str | os.PathLike[str]) -> tuple[Path, str]:
 
 
 def read_csv(path: Path) -> list[list[str]]:
-    """The rows of a CSV file in UTF-8 that are not blank."""
+    """The rows of a CSV file in UTF-8 that are not blank.
+
+    Columns are separated by commas, or by semicolons or tabs, as spreadsheets write them; then
+    numbers may have decimal commas, which are read as points.
+    """
     check_table_size(path)
     try:
-        table = csv.reader(
-            io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), strict=True
-        )
-        return [cells for cells in table if any(map(str.strip, cells))]
+        text = path.read_text(encoding="utf-8-sig")
+        if named := _SEPARATOR_LINE.match(text):
+            text = text[named.end() :]
+        first = next(filter(str.strip, text.splitlines()), "")
+        separator = named[1] if named else max(",;\t", key=first.count)
+        table = csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator)
+        rows = [cells for cells in table if any(map(str.strip, cells))]
+        if separator == ",":
+            return rows
+        return [[_with_decimal_points(cell) for cell in cells] for cells in rows]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidInputError(
             f"not CSV in UTF-8 ({error}); save it as CSV in UTF-8", subject=path
         ) from error
 
+
+def _with_decimal_points(cell: str) -> str:
+    """A cell of numbers with decimal commas, with points; any other one as it is."""
+    return cell.replace(",", ".") if _DECIMAL_COMMAS.fullmatch(cell) else cell
+
+
+_SEPARATOR_LINE = re.compile(r"sep=([,;\t])\r?\n")  # the first one, of Excel
+_DECIMAL_COMMAS = re.compile(r"\s*[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?(?:\s+[-+]?\d+(?:,\d+)?)*\s*")
 
 _FOREIGN = {
     re.compile(rb"version https://git-lfs"): "a pointer of Git LFS, not the file; run git lfs pull",

@@ -5,6 +5,7 @@ import shutil
 
 import cv2
 import pytest
+from PIL import Image
 
 from curvireg_torch.cli import main
 from curvireg_torch.cli.follow import Tally
@@ -103,6 +104,14 @@ def test_follow_reads_a_video_keeps_its_rate_and_prints_poses(
         "overlay.mp4",
         "results.csv",
     ]
+
+
+def test_an_animation_is_no_video(follow, tmp_path, capsys):
+    """Of which one picture would be followed."""
+    frames = [Image.new("RGB", (64, 48), (80 * k, 90, 90)) for k in range(3)]
+    frames[0].save(tmp_path / "turn.webp", save_all=True, append_images=frames[1:])
+    assert follow("--json", source=tmp_path / "turn.webp", box=False) != 0
+    assert "an animation; save it as MP4" in capsys.readouterr().err
 
 
 def test_follow_takes_the_boxes_of_a_detector_by_frame(frames, follow, tmp_path, monkeypatch):

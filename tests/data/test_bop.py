@@ -99,6 +99,32 @@ def test_other_splits_have_no_targets_by_default(tree):
     assert len(BOPDataset(tree[0], "train_pbr")) == 4
 
 
+def test_a_missing_split_names_those_that_are_there(tree):
+    (tree[0] / "test").rename(tree[0] / "train_pbr")
+    with pytest.raises(MissingFileError, match="the set has train_pbr: choose it as split"):
+        BOPDataset(tree[0])
+    with pytest.raises(MissingFileError, match=r"give the folder of one set: .*") as error:
+        BOPDataset(tree[0].parent)
+    assert str(tree[0]) in str(error.value)
+
+
+def test_scenes_of_several_cameras_are_named(tree):
+    for scene in (tree[0] / "test").iterdir():
+        if (scene / "scene_gt.json").is_file():
+            for camera in ("cam2", "cam1"):
+                for name in ("scene_gt", "scene_gt_info"):
+                    (scene / f"{name}_{camera}.json").write_text("{}")
+            (scene / "scene_gt_coco_cam3.json").write_text("{}")
+    assert len(BOPDataset(tree[0], targets=False)) == 4, "files without a camera go first"
+    for file in (tree[0] / "test").glob("*/scene_gt.json"):
+        file.unlink()
+    with pytest.raises(InvalidInputError, match="several cameras: cam1, cam2; copy the files of"):
+        BOPDataset(tree[0])
+    for file in (tree[0] / "test").glob("*/scene_gt_cam*.json"):
+        file.unlink()
+    assert BOPDataset(tree[0]).skipped["missing_annotation"], "not those of boxes alone"
+
+
 def test_bop_dataset_refuses_missing_files_with_advice_and_damaged_target_lists(tree, tmp_path):
     for root, split in ((tmp_path / "nothing", "test"), (tree[0], "train"), (tree[0], "../test")):
         with pytest.raises(MissingFileError, match=r"datasets/bop/README\.md"):

@@ -265,3 +265,51 @@ def test_what_a_download_leaves_in_place_of_a_calibration_is_named(tmp_path):
     file.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
     with pytest.raises(InvalidInputError, match="a pointer of Git LFS"):
         load_camera(file)
+
+
+MATLAB = {
+    "FocalLength": [520.5, 522.0],
+    "PrincipalPoint": [322.25, 239.5],
+    "ImageSize": [480, 640],
+    "RadialDistortion": [-0.31, 0.12],
+    "TangentialDistortion": [0.001, -0.002],
+    "Skew": 0,
+}
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        {},
+        {"IntrinsicMatrix": [[520.5, 0, 0], [0, 522.0, 0], [322.25, 239.5, 1]]},
+        {"K": [[520.5, 0, 322.25], [0, 522.0, 239.5], [0, 0, 1]]},
+    ],
+    ids=["lengths", "transposed", "K"],
+)
+def test_matlab_counts_from_one_and_has_rows_first(tmp_path, matrix):
+    file = tmp_path / "camera.json"
+    file.write_text(json.dumps({**MATLAB, **matrix}))
+    check_camera(load_camera(file), LENS, VGA)
+    turned = {**MATLAB, "ImageSize": [640, 480], **matrix}
+    file.write_text(json.dumps(turned))
+    assert load_camera(file).size == (640, 480), "whatever lies nearer to the principal point"
+    check_refused(tmp_path, {**MATLAB, "Skew": 0.5}, "'Skew': looks like distortion")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ({"cameraFocalLength": 24.0, "cameraAperture": [20.9, 11.8]}, "Isaac Sim; write fx = wid"),
+        (
+            {"intrinsics": [{"width": "640", "pxFocalLength": "520", "type": "radial3"}]},
+            "Meshroom; export them as COLMAP",
+        ),
+        (
+            {"android.lens.intrinsicCalibration": [520.5, 522, 321, 238, 0]},
+            r"Camera2; write .* \(a, b, c, d, e\) as distortion_coefficients: \[a, b, d, e, c\]",
+        ),
+    ],
+    ids=["isaac", "meshroom", "camera2"],
+)
+def test_cameras_that_are_not_read_say_how_to_write_them(tmp_path, content, words):
+    check_refused(tmp_path, content, words)

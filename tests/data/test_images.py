@@ -129,6 +129,61 @@ def test_the_size_of_the_sensor_gives_the_focal_length(tmp_path, tags, focal_35m
         assert photo.camera().source == "exif"
 
 
+@pytest.mark.parametrize(
+    ("tags", "zoom", "focal", "deviation"),
+    [
+        ({}, 1.0, 79.3, 0.05),
+        ({0xA404: 2.0}, 1.0, 2 * 79.3, 0.05),  # the size of the sensor gave the focal length
+        ({0xA404: 2.0, 0xA405: 40}, 2.0, 40 * 2**0.5, 0.35),  # which the camera may have included
+        ({0xA404: 1.5, 0xA405: 40}, 1.5, 40 * 1.5**0.5, 0.21),
+        ({0xA404: 1.0, 0xA405: 40}, 1.0, 40.0, 0.05),
+        ({0xA404: 0.0, 0xA405: 40}, 1.0, 40.0, 0.05),  # not used, as EXIF says
+        ({0xA404: 1000.0, 0xA405: 40}, 1.0, 40.0, 0.05),
+        ({0xA404: 2.0, 0xA405: 0, 0xA20E: 1.0, 0xA20F: 1.0}, 1.0, None, None),
+    ],
+)
+def test_a_digital_zoom_counts_or_makes_the_focal_length_uncertain(
+    tmp_path, tags, zoom, focal, deviation
+):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0xA210: 2} | EOS | tags)
+    Image.new("RGB", (648, 432)).save(tmp_path / "a.jpg", exif=exif)
+    photo = read_photo(tmp_path / "a.jpg")
+    assert photo.digital_zoom == zoom
+    assert any("perhaps not in the focal" in note for note in photo.notes) == (zoom > 1)
+    camera = photo.camera()
+    if focal is None:
+        assert camera is None
+        return
+    diagonal = (648**2 + 432**2) ** 0.5
+    assert float(camera.matrix[0, 0]) == pytest.approx(focal * diagonal / 43.27, rel=5e-3)
+    assert camera.focal_deviation == pytest.approx(deviation, abs=0.005)
+
+
+def test_panoramas_have_no_pinhole_camera(tmp_path):
+    tags = Image.Exif()
+    tags.get_ifd(0x8769).update({0xA405: 26})
+    xmp = b'<x:xmpmeta><rdf:Description GPano:ProjectionType="cylindrical"/></x:xmpmeta>'
+    for name, size, more, is_panorama in (
+        ("a.jpg", (640, 480), {"xmp": xmp}, True),
+        ("a.webp", (640, 480), {"xmp": xmp}, True),
+        ("b.jpg", (640, 480), {"xmp": xmp.replace(b"GPano", b"Other")}, False),
+        ("c.jpg", (640, 256), {}, False),
+        ("d.jpg", (641, 256), {}, True),
+        ("e.jpg", (256, 641), {}, True),
+        ("f.jpg", (640, 270), {}, False),  # 21 : 9
+    ):
+        Image.new("RGB", size).save(tmp_path / name, exif=tags, **more)
+        photo = read_photo(tmp_path / name)
+        assert photo.is_panorama == is_panorama
+        assert (photo.camera() is None) == is_panorama
+    Image.new("RGB", (641, 256)).save(tmp_path / "g.png")  # of whatever camera
+    assert not read_photo(tmp_path / "g.png").is_panorama
+    tags.get_ifd(0x8769).update({0xA002: 800, 0xA003: 600})
+    Image.new("RGB", (641, 200)).save(tmp_path / "h.jpg", exif=tags)  # cut out of a picture
+    assert not read_photo(tmp_path / "h.jpg").is_panorama
+
+
 def test_read_photo_rounds_16_bits_converts_cmyk_and_notes_changes_of_channels(tmp_path):
     cv2.imwrite(str(tmp_path / "b.png"), np.array([[0, 128, 129, 65535]], np.uint16))
     assert read_photo(tmp_path / "b.png").image[0].tolist() == [[0, 0, 1, 255]]

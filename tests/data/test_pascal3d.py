@@ -65,7 +65,9 @@ def test_pascal3d_returns_documented_samples(tree):
     assert sample["box"].tolist() == [10, 5, 70, 55], "boxes of the release count from 1"
     assert sample["camera_matrix"].tolist() == [[3000, 0, 40], [0, 3000, 30], [0, 0, 1]]
     assert sample["viewpoint"].tolist() == [30, 10, -5]
-    torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
+    torch.testing.assert_close(
+        sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0).float()
+    )
     assert sample["translation"].tolist() == [0, 0, 40]
     assert (sample["category"], sample["cad_index"], sample["image_id"]) == (
         "car",

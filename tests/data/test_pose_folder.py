@@ -24,7 +24,9 @@ def test_pose_folder_counts_skipped_items_and_returns_documented_samples(tree):
     )
     assert (set(sample), sample["image"].shape) == (set(names.split()), (3, 60, 80))
     assert (sample["box"].tolist(), sample["viewpoint"].tolist()) == ([10, 5, 70, 55], [30, 10, -5])
-    torch.testing.assert_close(sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0))
+    torch.testing.assert_close(
+        sample["rotation"], rotation_from_viewpoint(30.0, 10.0, -5.0).float()
+    )
     assert (sample["distance"], sample["category"]) == (3, "cup")
     assert sample["mesh_path"].endswith("mesh.off")
     assert unknown["viewpoint"].isnan().all()

@@ -449,7 +449,9 @@ def test_a_fit_begins_around_its_start_and_farther_away_if_it_is_a_second_one(mo
     angles = []
     turned = contour_fit._rotated
     monkeypatch.setattr(
-        contour_fit, "_rotated", lambda T, c, a, **k: angles.append(tuple(a)) or turned(T, c, a, **k)
+        contour_fit,
+        "_rotated",
+        lambda T, c, a, **k: angles.append(tuple(a)) or turned(T, c, a, **k),
     )
     crops = EdgeCrops.cut([silhouette(cube(), CUBE_POSE)], BOX[None], 0.1)
     for again in (False, True):

@@ -19,6 +19,24 @@ from curvireg_torch.geometry.viewpoint import angles_between
 from curvireg_torch.utils.choices import UP_AXES
 
 
+@pytest.mark.parametrize(
+    ("angles", "dtype"),
+    [
+        ((30, 20.0, 0), torch.float64),
+        ((torch.tensor(30.0), 20.0, 0), torch.float32),
+        ((torch.tensor(30.0, dtype=torch.float64), 20.0, 0), torch.float64),
+        ((torch.tensor(30), 20.0, 0), torch.float32),
+        ((torch.tensor(30.0), torch.tensor(20.0, dtype=torch.float64), 0), torch.float64),
+        ((30, torch.tensor(20.0, dtype=torch.float16), 0.5), torch.float16),
+    ],
+)
+def test_rotations_have_the_type_of_the_tensors_and_of_numbers_alone_float64(angles, dtype):
+    R = g.rotation_from_viewpoint(*angles)
+    assert R.dtype == dtype
+    exact = g.rotation_from_viewpoint(*map(float, angles))
+    torch.testing.assert_close(R.double(), exact, rtol=0, atol=4 * torch.finfo(dtype).eps)
+
+
 def test_viewpoint_from_rotation_inverts_rotation_from_viewpoint() -> None:
     R = torch.from_numpy(Rotation.random(500, random_state=0).as_matrix())
     a, e, t = g.viewpoint_from_rotation(R)

@@ -122,6 +122,66 @@ def test_empty_columns_of_a_spreadsheet_do_not_count(tmp_path):
     assert read_list(path, options)[0].box == (1.0, 2.0, 30.0, 40.0)
 
 
+def test_a_panorama_needs_its_camera(entry):
+    wide = replace(read_photo(entry.photo), is_stitched=True)
+    for camera in (None, "exif"):
+        with pytest.raises(InvalidInputError, match=r"a panorama, .* ordinary photograph") as e:
+            camera_of(replace(entry, camera=camera), wide)
+        assert e.value.kind == "camera"
+    assert camera_of(replace(entry, camera=CAMERA), wide)[0] is CAMERA
+    assert camera_of(replace(entry, camera=50.0), wide)[1] == "fov"
+    assert camera_of(replace(entry, as_stored=True), wide) == (None, None)  # of a dataset
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeffphoto;x0;y0;x1;y1;fx;fy;cx;cy\r\na.png;1,5;2;30;4e1;110;110;47,5;35,5\r\n",
+        "photo\tx0\ty0\tx1\ty1\tfx\tfy\tcx\tcy\na.png\t1,5\t2\t30\t40\t110\t110\t47,5\t35,5\n",
+        "photo\tx0\ty0\tx1\ty1\tfx\tfy\tcx\tcy\na.png\t1.5\t2\t30\t40\t110\t110\t47.5\t35.5\n",
+        "sep=;\nphoto;x0;y0;x1;y1;fx;fy;cx;cy\na.png;1,5;2;30;40;110;110;47,5;35,5\n",
+        "sep=,\nphoto,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1.5,2,30,40,110,110,47.5,35.5\n",
+        "photo,x0,y0,x1,y1,fx,fy,cx,cy\na.png,1.5,2,30,40,110,110,47.5,35.5\n",
+    ],
+    ids=["semicolon", "tab", "tab, points", "sep=;", "sep=,", "comma"],
+)
+def test_lists_of_spreadsheets_have_other_separators_and_decimal_commas(tmp_path, text):
+    path = tmp_path / "list.csv"
+    path.write_text(text, newline="")
+    (entry,) = read_list(path, RegisterOptions(meshes=(tmp_path / "part.stl",)))
+    assert entry.error == ""
+    assert entry.box == (1.5, 2.0, 30.0, 40.0)
+    assert entry.camera.matrix.tolist() == camera_matrix(110, 110, 47.5, 35.5).double().tolist()
+
+
+def test_names_with_commas_and_semicolons_stay_as_they_are(tmp_path):
+    path = tmp_path / "list.csv"
+    options = RegisterOptions(meshes=(tmp_path / "part.stl",))
+    path.write_text("photo;x0;y0;x1;y1;note\na,1.png;1;2;30;40;1,5 mm\n")
+    (entry,) = read_list(path, options)
+    assert (entry.name, entry.cells["note"]) == ("a,1.png", "1,5 mm")
+    path.write_text('photo,x0,y0,x1,y1,note\n"a;1.png",1,2,30,40,"1,5"\n')
+    (entry,) = read_list(path, options)
+    assert (entry.name, entry.cells["note"]) == ("a;1.png", "1,5")
+
+
+def test_patterns_within_folders_with_brackets(tmp_path, monkeypatch):
+    folder = tmp_path / "part [1]*"
+    folder.mkdir()
+    for name in ("a.png", "b.png", "c[2].png"):
+        (folder / name).write_bytes(b"")
+    monkeypatch.chdir(tmp_path)
+    for start in (folder, folder.relative_to(tmp_path)):
+        found = find_photographs(start / "[ab]*.png")
+        assert found == [start / "a.png", start / "b.png"]
+        assert len(find_photographs(start)) == 3
+        assert find_photographs(start / "c[2].png") == [start / "c[2].png"]
+        assert len(find_photographs(tmp_path / "pa*" / "*.png")) == 3
+        assert find_photographs(start / "lost.png") == [start / "lost.png"]
+    monkeypatch.chdir(folder)
+    assert find_photographs(tmp_path.relative_to(tmp_path) / "*.png")[0].name == "a.png"
+
+
 FILES = [(replace(CAMERA, size=SIZE), "file"), (LENS, "file")]
 
 

@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from curvireg_torch.data.pose_files import read_pose
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import rotation_from_axis_angle
 from curvireg_torch.jobs.ros import FILES, ros_covariance, time_stamp, write_ros
 
@@ -83,3 +84,30 @@ def test_stamps_are_seconds(text):
     assert time_stamp("1700000000.123456789") == (1700000000, 123456789)
     with pytest.raises(argparse.ArgumentTypeError, match="seconds since 1970"):
         time_stamp(text)
+
+
+@pytest.mark.parametrize(
+    ("frame", "is_optical"),
+    [
+        ("camera_optical_frame", True),
+        ("cam: 1", True),
+        ("linked", True),
+        ("world", False),
+        ("robot/map", False),
+        ("camera_link", False),
+        ("base_footprint", False),
+    ],
+)
+def test_a_start_in_another_frame_than_the_optical_one_is_refused(tmp_path, frame, is_optical):
+    write_ros(tmp_path, DOCUMENT, frame=frame)
+    if is_optical:
+        assert read_pose(tmp_path / "pose.yaml").T[:3, 3].tolist() == [1.0, -2.0, 0.5]
+        return
+    with pytest.raises(InvalidInputError, match=f"frame_id '{frame}' is not the camera's optical"):
+        read_pose(tmp_path / "pose.yaml")
+
+
+def test_a_start_of_our_own_rigs_is_in_the_world(tmp_path):
+    write_ros(tmp_path, {**DOCUMENT, "frame": "world"})
+    with pytest.raises(InvalidInputError, match="frame_id 'world' is not"):
+        read_pose(tmp_path / "pose.yaml")

@@ -50,6 +50,18 @@ def test_photographs_without_a_pose_have_a_verdict_too():
     assert (lost.verdict, failed.verdict) == ("lost", "failed")
 
 
+def test_what_no_registration_has_a_photograph_without_a_pose_has_neither():
+    lost = FailedRegistration(LostObjectError("not found"))
+    assert not hasattr(lost, "foo")
+    assert getattr(lost, "foo", 7) == 7
+    assert not hasattr(lost, "_repr_html_"), "notebooks ask for it"
+    with pytest.raises(AttributeError, match="'FailedRegistration' object has no attribute 'foo'"):
+        lost.foo  # noqa: B018
+    for name in ("rotation", "confidence", "reliable", "to_dict"):
+        with pytest.raises(LostObjectError, match="not found"):
+            getattr(lost, name)
+
+
 def test_the_confidence_is_shown_rounded_down():
     assert "confidence 0.89" in repr(registration(confidence=0.897))
 

@@ -95,7 +95,7 @@ class TwoPeaks(Peak):
 
     def scores(self, views: Any) -> Tensor:
         farther = rotation_from_viewpoint(10.0, 0.0) @ rotation_from_viewpoint(0.0, 0.0).T
-        angle = rotation_error(views.rotations, farther @ self.truth.float())
+        angle = rotation_error(views.rotations, (farther @ self.truth).float())
         second = -(angle.square()) / 100.0 - (views.distance - self.distance).square() - 0.01
         return torch.maximum(super().scores(views), second)
 

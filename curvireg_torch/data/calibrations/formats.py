@@ -356,6 +356,20 @@ def _has_pair_of_sides(record: Record) -> bool:
 _PLAIN_SIZES = {plain(name) for name in SIZES}
 
 
+def _is_matlab(record: Record) -> bool:
+    """By the case of its names, which others write with underscores."""
+    return {"ImageSize", "FocalLength", "PrincipalPoint"} <= record.values.keys()
+
+
+def _matlab(record: Record) -> Camera:
+    """The properties of a ``cameraIntrinsics``: pixels count from 1, and the size is rows,
+    columns."""
+    camera = plain_camera(record)
+    matrix = camera.matrix.clone()
+    matrix[:2, 2] -= 1.0
+    return replace(camera, matrix=matrix, size=camera.size and camera.size[::-1])
+
+
 def _own_result(record: Record) -> Camera:
     """The object "camera" of result.json: its size is height, width. A focal length that was
     estimated remains as uncertain as it was."""
@@ -539,7 +553,38 @@ def _mei(record: Record) -> Camera:
     raise InvalidInputError(f"camera model 'MEI' is not supported; choose from {KNOWN_MODELS}")
 
 
+UNREAD = {
+    "cameraAperture cameraFocalLength": (
+        "camera_params of Isaac Sim; write fx = width * cameraFocalLength / cameraAperture[0], fy "
+        "= height * cameraFocalLength / cameraAperture[1], cx = (width - 1) / 2 and cy = (height - "
+        "1) / 2"
+    ),
+    "pxFocalLength sensorWidth": (
+        "cameras of Meshroom; export them as COLMAP, or write fx = fy = width * focalLength / "
+        "sensorWidth, cx = width / 2 + principalPoint[0] - 0.5 and cy = height / 2 + "
+        "principalPoint[1] - 0.5"
+    ),
+    "android.lens.intrinsicCalibration LENS_INTRINSIC_CALIBRATION intrinsicCalibration": (
+        "a calibration of Android's Camera2; write its first four numbers as fx, fy, cx, cy, its "
+        "lens distortion (a, b, c, d, e) as distortion_coefficients: [a, b, d, e, c], and the "
+        "size of the pre-correction active array as width and height"
+    ),
+}
+"""Keys of cameras that are not read, and how to write those."""
+
+
+def _unread(keys: str, sentence: str) -> Format:
+    """A format that is refused with a sentence that says how to write the camera."""
+
+    def refuse(_: Record) -> Camera:
+        raise InvalidInputError(sentence)
+
+    names = keys.split()
+    return Format(keys, lambda record: record.has(*names), refuse)
+
+
 FORMATS = (
+    *(_unread(keys, sentence) for keys, sentence in UNREAD.items()),
     Format("COLMAP", lambda record: "colmap" in record.values, _colmap),
     Format("KITTI", lambda record: "kitti" in record.values, _kitti),
     Format(
@@ -581,6 +626,7 @@ FORMATS = (
         lambda record: record.has("matrix") and record.get("model") in CAMERA_MODELS,
         _own_result,
     ),
+    Format("MATLAB", _is_matlab, _matlab),
     Format("MegaPose", _has_pair_of_sides, _unknown_order),
     Format("OpenCV", is_plain, plain_camera),
 )
