@@ -7,6 +7,7 @@ imports heavy modules, so that help and mistakes in options appear at once, and 
 
 import argparse
 import errno
+import io
 import os
 import sys
 import warnings
@@ -16,7 +17,7 @@ from typing import Any
 
 from ..errors import CurviregError, CurviregWarning
 from ..jobs.options import with_advice
-from ..utils.files import terminable
+from ..utils.files import as_stored, terminable
 from ..version import __version__
 from . import commands, compare, follow, inspect, register
 from .options import Parser, ignored_option, join_numbers
@@ -37,6 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         try:
+            if isinstance(sys.stdout, io.TextIOWrapper):  # a file's name may be no text
+                sys.stdout.reconfigure(errors="backslashreplace")
             words = sys.argv[1:] if argv is None else argv
             if not words:
                 build_parser().print_help()
@@ -89,7 +92,11 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
         arguments.paths += map(Path, rest)
     elif rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    arguments.argv = list(argv)
+    for name, value in vars(arguments).items():
+        if isinstance(value, Path):
+            setattr(arguments, name, as_stored(value))
+        elif isinstance(value, list) and all(isinstance(path, Path) for path in value):
+            setattr(arguments, name, [as_stored(path) for path in value])
     if hasattr(arguments, "paths") and (problem := register.complete(arguments)):
         parser.error(f"register: {problem}")
     if problem := ignored_option(arguments):

@@ -22,6 +22,7 @@ from .options import (
     add_command,
     add_limits,
     add_options,
+    add_workers,
     input_files,
     register_options,
 )
@@ -154,8 +155,7 @@ def add_evaluate(commands: Any) -> None:
         protocol = f"{PROTOCOL} (default: cad=annotated pose={kind.pose} box=annotated)"
         add("--protocol", nargs="+", default=[], metavar="KEY=VALUE", help=protocol)
         add_options(dataset, "preset", "pipeline", "renderer", "progress")
-        jobs = "processes that share the objects (default: 1)"
-        add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
+        add_workers(dataset, "that share the objects")
         add(
             "--limit",
             type=whole_number(1),
@@ -179,7 +179,7 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
         )
     from ..evaluation.datasets import evaluate
     from ..evaluation.protocol import Protocol
-    from ..jobs.store import run_processes
+    from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
 
     kind = DATASETS[arguments.dataset]
@@ -187,8 +187,6 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
     options = register_options(arguments)
     protocol = Protocol.parse(arguments.protocol, pose=kind.pose)
     pipeline = options.open_pipeline()
-    if run_processes(arguments.jobs, arguments.argv):
-        return
     benchmark = kind.scored(kind.open(arguments.root, **kind.chosen(arguments)), protocol)
     check_writable(out)
     how: dict[str, Any] = {
@@ -196,10 +194,11 @@ def run_evaluation(arguments: argparse.Namespace) -> None:
         "renderer": options.renderer,
         "progress": options.progress,
     }
-    with one_torch_thread():
-        summary = evaluate(benchmark, out, pipeline=pipeline, **how)
-    if summary is None:  # another process writes it
-        return
+    with (
+        one_torch_thread(),
+        opened_workers(arguments.jobs, arguments.scheduler) as workers,
+    ):
+        summary = evaluate(benchmark, out, pipeline=pipeline, workers=workers, **how)
     if summary["n"] == 0:
         skipped = ", ".join(f"{count} {reason}" for reason, count in summary["skipped"].items())
         reasons = skipped or "no object is annotated"

@@ -230,8 +230,6 @@ def _follow(
                     **_document(result),
                 }
                 if table is not None:
-                    if not tally.frames:  # an older one does not belong to these poses
-                        (table.path.parent / "overlay.mp4").unlink(missing_ok=True)
                     table.add(_cells(pose))
                 tally.add(pose, took)
                 tally.camera = tally.camera or _camera_in_words(result)

@@ -16,6 +16,7 @@ from ..jobs.options import (
     check_camera,
     limits_from_options,
     prior_from_limits,
+    whole_number,
 )
 
 FIELDS = {
@@ -75,6 +76,18 @@ def add_limits(parser: Any) -> None:
     add_options(
         parser.add_argument_group("what is known about the pose", f"{text} these names"),
         *PRIOR_OPTIONS,
+    )
+
+
+def add_workers(parser: Any, what: str) -> None:
+    """Add the options that share ``what`` among processes."""
+    jobs = f"processes {what} (default: 1)"
+    parser.add_argument("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help=f"of a Dask cluster, whose workers are used {what}, instead of --jobs; they read "
+        "files by the same paths",
     )
 
 
@@ -141,6 +154,11 @@ def ignored_option(arguments: argparse.Namespace) -> str | None:
         arguments.box or getattr(arguments, "list", None)
     ):
         return "--box-format: of --box or the boxes of a list; give them too"
+    if getattr(arguments, "scheduler", None) is not None and arguments.jobs > 1:
+        return "expected one of --jobs and --scheduler"
+    on_gpu = getattr(arguments, "device", None) not in (None, "cpu")
+    if on_gpu and getattr(arguments, "jobs", 1) > 1:
+        return "--jobs: processes are for the CPU; a GPU registers photographs together"
     given = [name for name in PRIOR_OPTIONS if getattr(arguments, name, None) is not None]
     if given == ["front"] and getattr(arguments, "list", None) is None:
         return "--front limits nothing by itself; give --azimuth, for instance"

@@ -1,18 +1,17 @@
 """``curvireg register PHOTO... MESH``."""
 
 import argparse
-import json
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInputError, LostObjectError
+from ..errors import CurviregError, InvalidInputError, LostObjectError
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
 from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
@@ -23,6 +22,7 @@ from .options import (
     add_command,
     add_limits,
     add_options,
+    add_workers,
     input_files,
     numbers_among,
     register_options,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ..jobs.lists import Counts
     from ..jobs.options import RegisterOptions
     from ..registration import Registrar
+    from ..utils.executors import Workers
 
 # photographs of a list that could not be registered, of which the command prints the reason
 MAX_FAILURES = 10
@@ -125,8 +126,7 @@ def add_register(commands: Any) -> None:
         "refine",
     )
     add_limits(parser)
-    jobs = "processes for several photographs (default: 1)"
-    add("--jobs", type=whole_number(1), default=1, metavar="N", help=jobs)
+    add_workers(parser, "for several photographs")
     strict = (
         f"exit code {NONE_RELIABLE} if no result is reliable, else {SOME_FAILED} if some "
         f"photographs failed"
@@ -165,8 +165,6 @@ def complete(arguments: argparse.Namespace) -> str | None:
         return "expected PHOTO MESH, PHOTO ... --mesh MESH, or --list FILE MESH"
     if arguments.out is None and not arguments.json:
         return "expected --out DIR, or --json"
-    if arguments.out is None and arguments.jobs > 1:
-        return "--jobs: several processes need --out DIR, where their results meet"
     if rig is not None and (arguments.list or arguments.start or not arguments.meshes):
         return "--views takes one or several meshes, and neither --list nor --start"
     if listed and len(arguments.paths) > 1:
@@ -182,8 +180,9 @@ def complete(arguments: argparse.Namespace) -> str | None:
     if arguments.hypotheses is not None and arguments.start:
         return "--start refines one pose; leave --hypotheses out"
     alone = rig is not None or (not listed and is_one_photograph(arguments.photos))
-    if alone and arguments.jobs > 1:
-        return "--jobs: several processes share several photographs; leave it out for one result"
+    if alone and (arguments.jobs > 1 or arguments.scheduler is not None):
+        given = "--jobs" if arguments.scheduler is None else "--scheduler"
+        return f"{given}: several processes share several photographs; leave it out for one result"
     if arguments.every > 1 and not any(
         photo.suffix.lower() in VIDEOS for photo in arguments.photos
     ):
@@ -223,27 +222,22 @@ def complete(arguments: argparse.Namespace) -> str | None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Register one photograph, or several; returns the exit code."""
-    check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
-    load_libraries()
-    from ..jobs.store import STARTED, run_processes
+    if arguments.views is not None or (
+        arguments.list is None and is_one_photograph(arguments.photos)
+    ):
+        with _one_result(arguments):
+            reliable = _register_alone(arguments)
+        return NONE_RELIABLE if arguments.strict and not reliable else 0
+    options = _checked_options(arguments)
+    from ..utils.executors import opened_workers
     from ..utils.threads import one_torch_thread
 
-    options = register_options(arguments, arguments.photos, arguments.meshes)
-    # errors in options come before any photograph is read
-    _ = options.open_pipeline(), options.network
-    if arguments.views is not None or (
-        arguments.list is None and is_one_photograph(options.photos)
+    with (
+        one_torch_thread(),
+        _output(arguments) as out,
+        opened_workers(arguments.jobs, arguments.scheduler) as workers,
     ):
-        with one_torch_thread():
-            register = _register_one if arguments.views is None else _register_rig
-            reliable = register(options, arguments)
-        return NONE_RELIABLE if arguments.strict and not reliable else 0
-    if run_processes(arguments.jobs, arguments.argv):
-        return _strict_code(*_counted(arguments.out)) if arguments.strict else 0
-    with one_torch_thread(), _output(arguments) as out:
-        counts = _register_several(options, arguments, out)
-        if counts is None:  # another process writes the tables
-            return 0
+        counts = _register_several(options, arguments, out, workers)
         if arguments.json:
             print((out / "results.jsonl").read_text(encoding="utf-8"), end="")
     notes = sys.stderr if arguments.json else sys.stdout
@@ -256,9 +250,26 @@ def run(arguments: argparse.Namespace) -> int:
     if not counts.posed:
         message = "no photograph could be registered; the message of each gives the reason"
         raise InvalidInputError(message, subject=arguments.list or "")
-    if not arguments.strict or STARTED in os.environ:  # the process that started this one reports
-        return 0
-    return _strict_code(counts.reliable, len(counts.failures))
+    return _strict_code(counts.reliable, len(counts.failures)) if arguments.strict else 0
+
+
+def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
+    """The options; errors in them come before any photograph is read."""
+    check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
+    load_libraries()
+    options = register_options(arguments, arguments.photos, arguments.meshes)
+    _ = options.open_pipeline(), options.network
+    return options
+
+
+def _register_alone(arguments: argparse.Namespace) -> bool:
+    """Register one photograph or rig; returns whether the result is reliable."""
+    options = _checked_options(arguments)
+    from ..utils.threads import one_torch_thread
+
+    with one_torch_thread():
+        register = _register_one if arguments.views is None else _register_rig
+        return register(options, arguments)
 
 
 def _strict_code(reliable: int, failed: int) -> int:
@@ -266,16 +277,6 @@ def _strict_code(reliable: int, failed: int) -> int:
     if not reliable:
         return NONE_RELIABLE
     return SOME_FAILED if failed else 0
-
-
-def _counted(out: Path) -> tuple[int, int]:
-    """Numbers of reliable and of failed photographs among results that other processes wrote."""
-    from ..jobs.store import has_pose
-
-    lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
-    rows = [json.loads(line) for line in lines]
-    reliable = sum(bool(row.get("reliable")) for row in rows)
-    return reliable, sum(not has_pose(row) for row in rows)
 
 
 @contextmanager
@@ -289,15 +290,27 @@ def _output(arguments: argparse.Namespace) -> Iterator[Path]:
 
 
 @contextmanager
-def _one_result(arguments: argparse.Namespace, *inputs: Path) -> Iterator[None]:
-    """Context in which the files of one result may be written."""
+def _one_result(arguments: argparse.Namespace) -> Iterator[None]:
+    """Context in which the files of one result may be written; an older one goes first."""
     if arguments.out is None:
         yield
         return
     from ..jobs.outputs import output_folder
 
-    with output_folder(arguments.out, "register", inputs=input_files(arguments, *inputs)):
+    named = input_files(arguments, *arguments.photos, *arguments.meshes)
+    inputs = chain(named, _photographs_of_rig(arguments))
+    with output_folder(arguments.out, "register", inputs=inputs):
         yield
+
+
+def _photographs_of_rig(arguments: argparse.Namespace) -> Iterator[Path]:
+    """The photographs of a rig that can be read."""
+    if arguments.views is None:
+        return
+    from ..jobs.rigs import read_rig
+
+    with suppress(CurviregError):  # that the registration reports
+        yield from (view.photo for view in read_rig(arguments.views, arguments.meshes[0]))
 
 
 def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> bool:
@@ -315,22 +328,21 @@ def _register_one(options: "RegisterOptions", arguments: argparse.Namespace) -> 
     photo = read_photo(path)
     entry = entry_of(path, options)
     observation = observe(entry, photo)
-    with _one_result(arguments, *entry.files):
-        if options.progress and not (options.box or options.boxes or options.mask or options.start):
-            print(
-                f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable",
-                file=sys.stderr,
-            )
-        with opened_registrar(options) as (registrar, seconds):
-            try:
-                found = register_observation(observation, registrar, bank_seconds=seconds)
-            except LostObjectError as error:
-                if out is not None:
-                    write_lost(out, str(error))
-                raise
-        if out is not None:
-            found.write(out)
-        _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
+    if options.progress and not (options.box or options.boxes or options.mask or options.start):
+        print(
+            f"{path}: detecting the object; --box X0 Y0 X1 Y1 is faster and more reliable",
+            file=sys.stderr,
+        )
+    with opened_registrar(options) as (registrar, seconds):
+        try:
+            found = register_observation(observation, registrar, bank_seconds=seconds)
+        except LostObjectError as error:
+            if out is not None:
+                write_lost(out, str(error))
+            raise
+    if out is not None:
+        found.write(out)
+    _write_pose(arguments, found.document, found.registrar.of_mesh(found.mesh_index))
     for warning in found.warnings:
         print(f"curvireg: warning: {path}: {warning}", file=sys.stderr)
     remarks = [*photo.notes, *camera_in_words(found.document)]
@@ -357,15 +369,14 @@ def _register_rig(options: "RegisterOptions", arguments: argparse.Namespace) -> 
 
     out = arguments.out
     rig = read_rig(arguments.views, options.meshes[0])
-    with _one_result(arguments, *options.meshes, *(view.photo for view in rig)):
-        with opened_registrar(options) as (registrar, seconds):
-            result, document, photographs = register_rig(
-                arguments.views, rig, registrar, bank_seconds=seconds
-            )
-        document["mesh"] = str(options.meshes[result.mesh_index])
-        if out is not None:
-            write_views(out, document, registrar, result, photographs)
-        _write_pose(arguments, document, registrar.of_mesh(result.mesh_index))
+    with opened_registrar(options) as (registrar, seconds):
+        result, document, photographs = register_rig(
+            arguments.views, rig, registrar, bank_seconds=seconds
+        )
+    document["mesh"] = str(options.meshes[result.mesh_index])
+    if out is not None:
+        write_views(out, document, registrar, result, photographs)
+    _write_pose(arguments, document, registrar.of_mesh(result.mesh_index))
     if not arguments.json:
         print("pose in the world (model to world)")
         for view in document["photographs"]:
@@ -403,8 +414,8 @@ def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
 
 
 def _register_several(
-    options: "RegisterOptions", arguments: argparse.Namespace, out: Path
-) -> "Counts | None":
+    options: "RegisterOptions", arguments: argparse.Namespace, out: Path, workers: "Workers"
+) -> "Counts":
     """Register photographs that are named one by one, or by a list."""
     from ..jobs.lists import list_photographs, read_list, register_list
     from ..jobs.opening import open_registrar
@@ -435,10 +446,15 @@ def _register_several(
     settings = {
         "pipeline": options.open_pipeline().describe(),
         "field": None if options.network is None else field_digest(options.network),
-        "textures": None if options.textures is None else str(options.textures),
         **{name: getattr(options, name) for name in names},
     }
-    how: dict[str, Any] = {"settings": settings, "progress": options.progress, "source": source}
+    how: dict[str, Any] = {
+        "settings": settings,
+        "textures": [] if options.textures is None else [options.textures],
+        "progress": options.progress,
+        "source": source,
+        "workers": workers,
+    }
     return register_list(
         photos, out, partial(open_registrar, options), inputs=input_files(arguments), **how
     )

@@ -1,6 +1,7 @@
 """Frames of a video by their number, without a copy of each on disk."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from ..errors import ImageError
 from ..utils.threads import MAX_THREADS
 from .images import Video
 
+MAX_SHARED = 4  # videos that a process of workers keeps open
 KEPT = MAX_THREADS + 1  # frames in memory: more than there are threads that ask for them
 
 
@@ -42,6 +44,10 @@ class FrameReader:
         self._next = 0
         self._error: ImageError | None = None
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """A process decodes each video once, whatever number of frames it gets of it."""
+        return _shared_reader, (self.path, self.every)
+
     def read(self, number: int) -> Tensor:
         """(3, H, W) uint8 RGB of a frame; :class:`ImageError` if it cannot be decoded."""
         with self._lock:
@@ -66,6 +72,11 @@ class FrameReader:
             self._error = error
             raise
         raise ImageError(f"no frame {number}", subject=self.path)
+
+
+@lru_cache(MAX_SHARED)
+def _shared_reader(path: Path, every: int) -> FrameReader:
+    return FrameReader(path, every=every)
 
 
 class VideoFrame(NamedTuple):

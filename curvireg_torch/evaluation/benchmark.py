@@ -39,7 +39,6 @@ class Benchmark(ABC):
         thresholds: degrees of the accuracies in the summary.
         groups: name of the groups that are scored by themselves, and key of the group in a sample.
         columns: of the table of predictions.
-        reports: names of the files that are written from all results.
         page_error: name of the error by which the page of the best and the worst marks an object:
             that up to symmetries, where they are known.
         measures: scores that are means over the objects: name of the error, and thresholds below
@@ -61,12 +60,6 @@ class Benchmark(ABC):
     thresholds: ClassVar[Mapping[str, float]] = {"acc_15_deg": 15.0, "acc_30_deg": 30.0}
     groups: ClassVar[tuple[str, str]] = ("per_object", "category")
     columns: ClassVar[Sequence[str]] = ()
-    reports: ClassVar[Sequence[str]] = (
-        "summary.json",
-        "predictions.csv",
-        "errors.csv",
-        "index.html",
-    )
     page_error: ClassVar[str] = "error_deg"
     measures: ClassVar[Mapping[str, tuple[str, Sequence[float]]]] = {
         "acc_15_deg": ("error_deg", (15.0,)),

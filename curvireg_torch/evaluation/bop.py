@@ -27,9 +27,6 @@ from .protocol import Protocol, random_numbers
 UNOCCLUDED = 0.95  # visible fraction from which an object of a BOP set counts as whole
 
 
-RESULTS_OF_BOP = "curvireg-*_*-*.csv"  # results by the name that bop_toolkit asks for
-
-
 NO_VSD = (
     "BOP's AR is the mean of VSD, MSSD and MSPD; VSD needs depth images, which are not used "
     "here: "
@@ -51,7 +48,6 @@ class BOPBenchmark(Benchmark):
     gives_camera = True
     groups = ("per_object", "obj_id")
     label = "{scene_id}/{image_id}/{instance_index}"
-    reports = (*Benchmark.reports, RESULTS_OF_BOP)
     page_error = "rotation"
     measures: ClassVar = {
         "acc_15_deg": ("rotation", (15.0,)),

@@ -4,6 +4,7 @@ import math
 import platform
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from ..pipeline import DEFAULT, PRESETS, Pipeline
 from ..registration import Registrar
 from ..registration.words import two_decimals
 from ..utils.checks import check_positive
+from ..utils.executors import Workers
 from ..utils.files import write_file
 from ..version import __version__
 from ..visualization.sheet import SheetEntry, write_sheet
@@ -44,12 +46,13 @@ def evaluate(
     limit: int | None = None,
     renderer: str = "auto",
     progress: bool = True,
-) -> Row | None:
+    workers: Workers | None = None,
+) -> Row:
     """Register the objects of a benchmark and score the results.
 
     ``out`` gets ``results.jsonl``, ``predictions.csv``, ``errors.csv``, ``summary.json`` and
     ``index.html``. A second call registers only what is new, or depends on files or settings that
-    have changed. Under ``torchrun``, each process registers a part of the objects.
+    have changed.
 
     Args:
         benchmark, out: the objects, and the folder for the results.
@@ -57,9 +60,10 @@ def evaluate(
         limit: register only this many objects, spread evenly over the dataset.
         renderer: of the views.
         progress: show a bar.
+        workers: that register the objects; by default this process does.
 
     Returns:
-        The summary, as written to ``summary.json``; None in processes that do not write it.
+        The summary, as written to ``summary.json``.
 
     Raises:
         InvalidInputError: a bad limit, or a folder that holds the results of a list.
@@ -91,16 +95,10 @@ def evaluate(
         "code": results_digest(),
     }
 
-    def open_registrar(meshes: tuple[Path, ...]) -> Registrar:
-        loaded = [load_mesh(path, unit=benchmark.unit) for path in meshes]
-        banks = [
-            cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False)
-            for mesh in loaded
-        ]
-        # Without cameras, the datasets have meshes of similar objects.
-        mesh_is = "exact" if benchmark.gives_camera else "similar"
-        return Registrar(banks, pipeline=pipeline, renderer=renderer, mesh_is=mesh_is)
-
+    # Without cameras, the datasets have meshes of similar objects.
+    mesh_is = "exact" if benchmark.gives_camera else "similar"
+    opened: Row = {"pipeline": pipeline, "renderer": renderer, "mesh_is": mesh_is}
+    open_registrar = partial(_open_registrar, unit=benchmark.unit, **opened)
     entries = [
         entry for i in benchmark.selection(limit) if not (entry := benchmark.entries[i]).error
     ]
@@ -108,13 +106,24 @@ def evaluate(
         "settings": settings,
         "label": benchmark.name,
         "progress": progress,
-        "reports": benchmark.reports,
+        "workers": workers,
     }
     files = chain.from_iterable(entry.files for entry in entries)
     source = ["{dataset} {root} {split}".format_map(settings)]
     with output_folder(out, "evaluate", inputs=files, source=source):
         store = run_entries(entries, out, open_registrar, **how)
-        return None if store is None else report(benchmark, store, settings, limit)
+        store.sort([entry.key for entry in entries])
+        return report(benchmark, store, settings, limit)
+
+
+def _open_registrar(
+    meshes: tuple[Path, ...], *, unit: str, pipeline: Pipeline, renderer: str, mesh_is: str
+) -> Registrar:
+    loaded = [load_mesh(path, unit=unit) for path in meshes]
+    banks = [
+        cached_bank(mesh, pipeline=pipeline, renderer=renderer, progress=False) for mesh in loaded
+    ]
+    return Registrar(banks, pipeline=pipeline, renderer=renderer, mesh_is=mesh_is)
 
 
 def report(

@@ -2,6 +2,7 @@
 
 import glob
 import re
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +14,17 @@ from typing import Any
 from ..data import Video
 from ..data.calibrations import Calibrations
 from ..data.frames import FrameReader, VideoFrame
-from ..errors import MAX_LIST_COLUMNS, CurviregError, InvalidInputError, MissingFileError
+from ..errors import (
+    MAX_LIST_COLUMNS,
+    CurviregError,
+    CurviregWarning,
+    InvalidInputError,
+    MissingFileError,
+)
 from ..geometry import Camera, camera_matrix
 from ..registration.words import two_decimals, verdict_counts
 from ..utils.choices import IMAGES, VIDEOS, pattern_of
+from ..utils.executors import Workers
 from ..utils.files import FindFile, found_in, read_csv, write_csv
 from ..visualization.sheet import SheetEntry, write_sheet
 from .entry import Entry, entry_of
@@ -38,8 +46,6 @@ POSE_COLUMNS = (
 
 RESULT_COLUMNS = ("verdict", "message", "confidence", "reliable", *POSE_COLUMNS)
 """Columns of ``results.csv`` after those of the list."""
-
-REPORTS = ("results.csv", "index.html")  # written from all results at the end
 
 BEST_MESH = "found_mesh"  # a last column, if rows have several meshes: the best of them
 INSTANCE_COLUMNS = ("instance", "found_x0", "found_y0", "found_x1", "found_y1")
@@ -255,17 +261,18 @@ def register_list(
     open_registrar: OpenRegistrar,
     *,
     settings: Mapping[str, Any],
+    textures: Sequence[Path] = (),
     progress: bool = True,
     inputs: Sequence[Path] = (),
     source: Sequence[str] = (),
-) -> Counts | None:
+    workers: Workers | None = None,
+) -> Counts:
     """Register the photographs of a list; ``out`` gets ``results.jsonl``, ``results.csv`` and
     ``index.html``.
 
     A second call registers only what is new or has changed, see :func:`.runner.run_entries`, whose
     arguments and errors are the same. ``inputs`` are files besides those of the entries, and
-    ``source`` is what the entries are of, see :func:`.outputs.output_folder`. Returns None in
-    processes that do not write the tables.
+    ``source`` is what the entries are of, see :func:`.outputs.output_folder`.
     """
     usable = list({entry.key: entry for entry in entries if not entry.error}.values())
     if (out / "summary.json").exists():
@@ -275,13 +282,17 @@ def register_list(
     files = chain(inputs, chain.from_iterable(entry.files for entry in usable))
     how: dict[str, Any] = {
         "settings": settings,
+        "textures": textures,
         "label": "register",
         "progress": progress,
-        "reports": REPORTS,
+        "workers": workers,
     }
     with output_folder(out, "register several", inputs=files, source=source):
         store = run_entries(usable, out, open_registrar, **how)
-        return None if store is None else _write_tables(entries, out, store)
+        if removed := len(store) - len(usable):
+            text = f"{out}: {removed} results of photographs that are not asked for any more go"
+            warnings.warn(text, CurviregWarning, stacklevel=2)
+        return _write_tables(entries, out, store)
 
 
 def _write_tables(entries: Sequence[Entry], out: Path, store: ResultStore) -> Counts:

@@ -2,13 +2,15 @@
 
 No input is ever written or removed, and a command replaces only what it wrote itself: the file
 ``.curvireg.json`` in the folder of the results says which command wrote what. Anything else in the
-way of a result is an error that names it, before any work.
+way of a result is an error that names it, before any work. One run at a time writes into a folder.
+What an earlier run left goes before the work begins, but for the rows that are resumed: a run that
+fails leaves no result of another photograph.
 """
 
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,11 @@ from typing import Any
 from ..errors import InvalidInputError, OutputError
 from ..utils.files import check_writable, read_json, write_file
 from . import ros
-from .store import is_one_of_several
+
+try:
+    import fcntl
+except ImportError:  # no locks on Windows
+    fcntl = None  # type: ignore[assignment]
 
 MARKER = ".curvireg.json"
 
@@ -29,7 +35,8 @@ VISP_FILES = ("object.cao", "object.init", "object.pos")
 
 FOR_TOOLS = (*ros.FILES, *M3T_FILES, *VISP_FILES)
 ONE_RESULT = ("result.json", "overlay.png", "pose.glb", *FOR_TOOLS)
-ROWS = ("results.jsonl", "results.*-of-*.jsonl", "index.html", "thumbnails")
+RESUMED = ("results.jsonl", "thumbnails")
+ROWS = (*RESUMED, "index.html")
 FILES: dict[str, tuple[str, ...]] = {
     "register": ONE_RESULT,
     "demo": (*ONE_RESULT, "mesh.ply", "photo.png"),
@@ -64,35 +71,70 @@ def output_folder(
 
     Raises:
         InvalidInputError: a file in the way that is an input, or that this command did not write;
-            or results of another source.
+            results of another source; or another run that writes here.
         OutputError: the folder cannot be written to.
-
-    Of several processes that share the results, the first one checks.
     """
-    if is_one_of_several() and os.environ.get("RANK") != "0":
-        yield
-        return
     names = (*FILES[command], *more)
-    written = _read(folder)
-    before = written.get(command, {})
     in_the_way = _existing(folder, names)
     _check_inputs(in_the_way, inputs)
+    written = _read(folder)
     for path in in_the_way:
         _check_owner(path, command, written)
+    check_writable(folder)
+    with _locked(folder):
+        before = _read(folder).get(command, {})
+        _check_source(folder, before, source, _existing(folder, names))
+        kept = list(source or before.get("source", ()))
+        _mark(folder, command, names, kept)
+        for path in _existing(folder, names):
+            if path.name not in RESUMED:
+                path.unlink()
+        try:
+            yield
+        finally:
+            with suppress(OutputError):  # an error of the command itself counts more
+                _mark(folder, command, [path.name for path in _existing(folder, names)], kept)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Context in which no other run writes into a folder; the lock ends with the process, however
+    that ends."""
+    with ExitStack() as stack:
+        if fcntl is not None:
+            place = os.open(folder, os.O_RDONLY)
+            stack.callback(os.close, place)
+            try:
+                fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InvalidInputError(
+                    f"{folder}: another run is writing its results here; wait for it, or "
+                    f"{ELSEWHERE}",
+                    kind="out",
+                ) from None
+            except OSError:  # some network file systems lock no folders
+                pass
+        yield
+
+
+def _check_source(
+    folder: Path, before: Mapping[str, Any], source: Sequence[str], in_the_way: Sequence[Path]
+) -> None:
+    """Refuse a run whose results would replace those of another source, or of a run of it that was
+    stopped."""
     lost = [name for name in before.get("source", ()) if name not in source]
-    if lost and source and in_the_way:
+    if not (lost and source):
+        return
+    if in_the_way:
         raise InvalidInputError(
             f"{in_the_way[0]}: holds results of {lost[0]}, which would be lost; {ELSEWHERE}",
             kind="out",
         )
-    check_writable(folder)
-    kept = list(source or before.get("source", ()))
-    _mark(folder, command, names, kept)
-    try:
-        yield
-    finally:
-        with suppress(OutputError):  # an error of the command itself counts more
-            _mark(folder, command, [path.name for path in _existing(folder, names)], kept)
+    if before["files"]:
+        raise InvalidInputError(
+            f"{folder}: a run of {lost[0]} was stopped here; {ELSEWHERE}, or remove {MARKER} in it",
+            kind="out",
+        )
 
 
 def check_output_file(path: Path, inputs: Iterable[Path], *, mark: bytes) -> None:

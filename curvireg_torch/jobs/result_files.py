@@ -14,7 +14,6 @@ from ..visualization import pose_glb, registration_sheet
 from ..visualization.encoding import png
 from ..visualization.overlay import views_sheet
 from ..visualization.pose_glb import scene_glb
-from .outputs import FOR_TOOLS
 from .store import to_json
 from .views import View
 
@@ -32,8 +31,8 @@ def write_result(
     *,
     copies: Sequence[Registration] = (),
 ) -> None:
-    """Write the files of a result into the folder ``out``; ``document`` is the content of
-    ``result.json``.
+    """Write the files of a result into the folder ``out``, which :func:`.outputs.output_folder` has
+    emptied of older ones; ``document`` is the content of ``result.json``.
 
     The other arguments are those of :func:`curvireg_torch.visualization.registration_sheet`.
     :class:`OutputError` if a file cannot be written.
@@ -95,7 +94,6 @@ def _write(
     scene: Callable[[], bytes],
 ) -> None:
     """Write ``result.json``, then the picture and the scene, drawn beside each other."""
-    _remove(out)
     # first: no failure to draw it loses the result
     write_file(out / "result.json", to_json(document).encode())
     files = [("overlay.png", overlay), *([("pose.glb", scene)] if faces <= MAX_GLB_FACES else [])]
@@ -114,14 +112,7 @@ def _write(
 
 def write_lost(out: Path, message: str) -> None:
     """Write the ``result.json`` of a refinement that lost the object."""
-    _remove(out)
     write_file(
         out / "result.json",
         to_json({"schema": SCHEMA, "verdict": "lost", "message": message}).encode(),
     )
-
-
-def _remove(out: Path) -> None:
-    """Remove an older result: none of its files may stay beside those of a new one."""
-    for name in ("result.json", "pose.glb", "overlay.png", *FOR_TOOLS):
-        (out / name).unlink(missing_ok=True)

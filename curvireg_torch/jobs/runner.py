@@ -2,13 +2,12 @@
 
 import gc
 import json
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tqdm import tqdm
@@ -20,12 +19,14 @@ from ..errors import (
     LostObjectError,
     MeshError,
     MissingFileError,
+    WorkerError,
 )
 from ..mesh.files import mesh_digest
 from ..registration import Registrar
 from ..registration.documents import SCHEMA, line_document, places_document
 from ..registration.result import verdict_of_error
 from ..utils.company import map_in_company
+from ..utils.executors import Workers
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
 from ..utils.threads import map_on_threads
@@ -34,21 +35,37 @@ from ..visualization.sheet import thumbnail
 from .entry import Entry, observe
 from .options import with_advice
 from .photograph import register_observation
-from .store import ResultStore, Row, has_pose, workers
+from .store import ResultStore, Row, has_pose
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
 """Parts of the package that no stored result depends on."""
 
-REPORTS = ("summary.json", "predictions.csv", "results.csv", "index.html")
-"""Files that are written from all results at the end; older ones would not match newer results."""
+OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]
+"""Opens the registrar of some mesh files; it is sent to workers by pickle."""
 
-OpenRegistrar = Callable[[tuple[Path, ...]], Registrar]  # opens the registrar of some mesh files
+BLOCK = 8  # photographs on a CPU that a worker gets, and whose rows it returns, at a time
+GPU_BLOCK = 64
 
 
 def results_digest() -> str:
     """16 hexadecimal digits of the code that results depend on: rows of another one are not
     current."""
     return package_digest(without=NOT_IN_RESULTS)
+
+
+class Task(NamedTuple):
+    """An entry that is to be registered, and the digest of all that its result depends on besides
+    the content of its photographs."""
+
+    entry: Entry
+    request: str
+
+
+class Finished(NamedTuple):
+    """The row of an entry, and its thumbnail, a JPEG, if it has a pose."""
+
+    row: Row
+    picture: bytes | None
 
 
 def run_entries(
@@ -58,115 +75,136 @@ def run_entries(
     *,
     settings: Mapping[str, Any],
     label: str,
+    textures: Sequence[Path] = (),
     progress: bool = True,
-    reports: Sequence[str] = REPORTS,
-) -> ResultStore | None:
+    workers: Workers | None = None,
+) -> ResultStore:
     """Register the entries, without ``error`` and of different keys, whose results ``out`` does not
     hold yet.
 
     A stored row counts if its digests are the same: that of the photograph's content, and that of
     the request, which covers ``settings`` (all that every result depends on), the code of this
-    library, the entry's own request and every file of its meshes. Entries of the same meshes follow
-    each other, so that only one bank is in memory, and are registered side by side on torch's
-    threads; each row is on disk as soon as it is known. An input that cannot be used makes a row
-    with ``failed`` as ``verdict`` and does not stop the others. ``reports``, files that are written
-    from all results, are removed first.
+    library, the entry's own request and every file of its meshes, also in folders of ``textures``.
+    Entries of the same meshes follow each other, so that a worker has only one bank in memory. The
+    ``workers``, by default this process, take blocks of them; this process alone writes: each row
+    is on disk as soon as its block is done. An input that cannot be used makes a row with
+    ``failed`` as ``verdict`` and does not stop the others.
 
     Returns:
-        The store, which holds all entries; None in processes that leave the report to the first
-        one.
+        The store, which holds all entries.
     """
+    workers = workers or Workers()
+    store = ResultStore(out)
     common = json.dumps([dict(settings), results_digest()], sort_keys=True)
-    photo_digest = cache(file_digest)
-    digest_of_mesh = cache(mesh_digest)
+    digest_of_mesh = cache(partial(mesh_digest, textures=textures))
 
-    def digests(entry: Entry) -> dict[str, str]:
+    def request_of(entry: Entry) -> str:
         meshes = [(path.name, digest_of_mesh(path)) for path in entry.meshes]
-        request = text_digest(json.dumps([common, entry.request(), meshes]))
-        photos = [
-            photo_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))
-        ]
-        return {"request": request, "photo": "-".join(photos) if all(photos) else ""}
+        return text_digest(json.dumps([common, entry.request(), meshes]))
 
-    with workers() as group:
-        if group.rank == 0:
-            for name in reports:
-                for path in out.glob(name):
-                    path.unlink()
-        group.wait()
-        store = ResultStore(out, group)
-        order = {
-            meshes: place
-            for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))
-        }
-        part = group.part(sorted(entries, key=lambda entry: order[entry.meshes]))
-        todo = [
-            (entry, found)
-            for entry in part
-            if not store.is_current(entry.key, found := digests(entry))
-        ]
-        with tqdm(
-            desc=label, unit="photo", total=len(part), disable=not (progress and group.rank == 0)
-        ) as bar:
-            bar.update(len(part) - len(todo))
-            for meshes, same in groupby(todo, key=lambda pair: pair[0].meshes):
-                _register_some(list(same), meshes, store, open_registrar, bar)
-                # meshes are in cycles, and too few objects for the collector to look soon
-                gc.collect(1)
-        group.wait()
-        if group.rank:
-            return None
-        if not store.is_complete({entry.key: digests(entry) for entry in entries}):
-            raise InvalidInputError(
-                f"{out}: a photograph or mesh changed meanwhile; run the same command again"
-            )
-        store.merge()
-        return store
+    order = {
+        meshes: place
+        for place, meshes in enumerate(dict.fromkeys(entry.meshes for entry in entries))
+    }
+    in_order = sorted(entries, key=lambda entry: order[entry.meshes])
+    most = GPU_BLOCK if settings.get("device", "cpu") != "cpu" else BLOCK
+    size = max(1, min(most, len(entries) // (2 * workers.count)))
+    with tqdm(desc=label, unit="photo", total=len(entries), disable=not progress) as bar:
 
+        def blocks() -> Iterator[list[Task]]:
+            for _, same in groupby(in_order, key=lambda entry: entry.meshes):
+                block: list[Task] = []
+                for entry in same:
+                    request = request_of(entry)
+                    if store.is_current(entry.key, request, partial(photo_digest, entry)):
+                        bar.update()
+                        continue
+                    block.append(Task(entry, request))
+                    if len(block) == size:
+                        yield block
+                        block = []
+                if block:
+                    yield block
 
-def _register_some(
-    pairs: Sequence[tuple[Entry, dict[str, str]]],
-    meshes: tuple[Path, ...],
-    store: ResultStore,
-    open_registrar: OpenRegistrar,
-    bar: "tqdm[Any]",
-) -> None:
-    """Register entries of the same meshes."""
-    lock = threading.Lock()
-    start = time.perf_counter()
-    registrar: Registrar | Exception
-    try:
-        registrar = open_registrar(meshes)
-    except (MeshError, BankError, MissingFileError, OSError) as error:
-        registrar = error
-    seconds = time.perf_counter() - start
-
-    def register_one(k: int) -> None:
-        entry, digests = pairs[k]
-        picture = thumbnail_path(store.folder, digests)
-        row = _row(entry, registrar, picture, bank_seconds=0.0 if k else seconds)
-        with lock:
-            store.append({"key": entry.key, "digests": digests, **row})
+        state = _OpenedRegistrar(open_registrar, results_digest())
+        for task, finished in workers.map(_register_block, state, blocks()):
+            if isinstance(finished, WorkerError):
+                # without the photograph's digest: the next run tries it again
+                digests = {"request": task.request, "photo": ""}
+                finished = Finished({"digests": digests, **failed_row(finished)}, None)
+            if finished.picture is not None:
+                write_file(thumbnail_path(out, finished.row["digests"]), finished.picture)
+            store.append({"key": task.entry.key, **finished.row})
             bar.update()
+    return store
+
+
+def photo_digest(entry: Entry) -> str:
+    """Digests of the photographs of an entry; "" if one cannot be read."""
+    photos = [file_digest(path) for path in (entry.photo, *(view.photo for view in entry.views))]
+    return "-".join(photos) if all(photos) else ""
+
+
+class _OpenedRegistrar:
+    """The registrar of the meshes that a worker had last.
+
+    Args:
+        open_registrar: opens it.
+        code: :func:`results_digest` of the process that asks for results.
+    """
+
+    def __init__(self, open_registrar: OpenRegistrar, code: str) -> None:
+        self._open = open_registrar
+        self._code = code
+        self._meshes: tuple[Path, ...] | None = None
+        self._registrar: Registrar | Exception | None = None
+
+    def of(self, meshes: tuple[Path, ...]) -> tuple[Registrar | Exception, float]:
+        """The registrar, or why there is none, and the seconds that it took to open now."""
+        if self._registrar is not None and meshes == self._meshes:
+            return self._registrar, 0.0
+        if self._code != results_digest():
+            raise InvalidInputError("a worker has another version of curvireg_torch; install one")
+        if self._registrar is not None:
+            self._registrar = None
+            gc.collect()  # meshes are in cycles, and too few objects for it to be called soon
+        start = time.perf_counter()
+        try:
+            self._registrar = self._open(meshes)
+        except (MeshError, BankError, MissingFileError, OSError) as error:
+            self._registrar = error
+        self._meshes = meshes
+        return self._registrar, time.perf_counter() - start
+
+
+def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Finished]:
+    """Register entries of the same meshes; the first pays for the bank."""
+    registrar, seconds = opened.of(tasks[0].entry.meshes)
+
+    def register_one(number: int) -> Finished:
+        task = tasks[number]
+        # before the photograph is read: one that changes meanwhile is registered again
+        digests = {"request": task.request, "photo": photo_digest(task.entry)}
+        row, picture = _row(task.entry, registrar, bank_seconds=0.0 if number else seconds)
+        return Finished({"digests": digests, **row}, picture)
 
     device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
     if torch.device(device).type == "cpu":
-        map_on_threads(register_one, range(len(pairs)))
-    else:
-        map_in_company(register_one, range(len(pairs)))
+        return map_on_threads(register_one, range(len(tasks)))
+    return map_in_company(register_one, range(len(tasks)))
 
 
 def _row(
-    entry: Entry, registrar: Registrar | Exception, picture: Path, *, bank_seconds: float
-) -> Row:
-    """The result of an entry; its thumbnail is on disk before."""
+    entry: Entry, registrar: Registrar | Exception, *, bank_seconds: float
+) -> tuple[Row, bytes | None]:
+    """The result of an entry, and its thumbnail."""
     start = time.perf_counter()
     try:
         photo = entry.read()
     except (CurviregError, OSError) as error:
-        return failed_row(error, skipped="unreadable_image")
+        return failed_row(error, skipped="unreadable_image"), None
     if isinstance(registrar, Exception):
-        return failed_row(registrar, skipped="unreadable_mesh")
+        return failed_row(registrar, skipped="unreadable_mesh"), None
     try:
         observation = observe(entry, photo)
         found = register_observation(observation, registrar, bank_seconds=bank_seconds)
@@ -178,12 +216,12 @@ def _row(
                 "detection": places_document(error.detection),
                 "inputs": {"picture": photo.facts()},
             }
-        return failed_row(error, seconds=seconds, **places)
+        return failed_row(error, seconds=seconds, **places), None
     describer = registrar.of_mesh(found.mesh_index).describer
     box = found.box.tolist()
     copies = drawn_copies(registrar, found.copies)
-    write_file(picture, thumbnail(describer, found.projection, found.image, box, copies))
-    return {"message": "", **line_document(found.document)}
+    picture = thumbnail(describer, found.projection, found.image, box, copies)
+    return {"message": "", **line_document(found.document)}, picture
 
 
 def failed_row(error: Exception | str, **values: Any) -> Row:

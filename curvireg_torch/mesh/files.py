@@ -44,7 +44,8 @@ def mesh_files(path: Path, *, textures: Iterable[Path] = ()) -> list[Path]:
     if path.suffix.lower() in _WITH_COMPANIONS and path.is_file():
         with contextlib.suppress(CurviregError):  # reported where the mesh is loaded
             read_source(source)
-    return [path, *sorted(source.requested)]
+    # by name: the order in which they are digested is the same in folders of other names
+    return [path, *sorted(source.requested, key=lambda file: (file.name, file))]
 
 
 def mesh_digest(path: Path, *, textures: Iterable[Path] = ()) -> str:

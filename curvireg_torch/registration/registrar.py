@@ -1,9 +1,9 @@
 """The entry point: photographs, boxes and a mesh in; poses out."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
 from typing import Any, TypeAlias
 
 import torch
@@ -17,6 +17,7 @@ from ..pipeline import BankSettings, Pipeline
 from ..rendering import DepthRenderer
 from ..utils.checks import check_device, check_integer, check_option, check_symmetries
 from ..utils.choices import MESH_KINDS
+from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
 from ..utils.threads import map_on_threads
@@ -29,7 +30,7 @@ from .result import FailedRegistration, Registration
 from .several import register_views
 from .target import Target
 from .work import map_items
-from .workers import Workers
+from .workers import register_by_workers
 
 __all__ = ["Registrar"]
 
@@ -66,6 +67,8 @@ class Registrar(Target):
         workers: processes that register photographs side by side on a CPU, from the first call on;
             1: this one, on several threads, which share Python's interpreter lock. A script starts
             processes within ``if __name__ == "__main__":``. They show no progress.
+        executor: of other workers, such as ``distributed.Client(address).get_executor()`` of a Dask
+            cluster.
         progress: True shows bars. A callback gets (stage, done, total), with the stages "detection"
             (without a box), "bank", "ranking", "search" and "contours"; to cancel, it may raise
             what is no :class:`CurviregError`. On a CPU photographs are registered in parallel:
@@ -97,6 +100,7 @@ class Registrar(Target):
         symmetries: Tensor | None = None,
         device: torch.device | str | None = None,
         workers: int = 1,
+        executor: Executor | None = None,
         progress: bool | Callable[[str, int, int], object] = False,
     ) -> None:
         check_integer(workers, "workers")
@@ -156,8 +160,8 @@ class Registrar(Target):
             # Built on one thread, so that rounding does not depend on the number of threads.
             matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
         super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
-        self.workers = workers
-        if workers > 1 and self.bank.device.type != "cpu":
+        self.workers = Workers(workers, executor) if workers > 1 or executor is not None else None
+        if self.workers is not None and self.bank.device.type != "cpu":
             raise InvalidInputError(
                 "workers: processes are for the CPU; a GPU registers photographs together"
             )
@@ -210,10 +214,8 @@ class Registrar(Target):
 
         :meta private:
         """
-        if self.workers > 1 and len(items) > 1:
-            if not self._workers.are_open:
-                del self._workers
-            return self._workers.register(items, detects=detects)
+        if self.workers is not None and len(items) > 1:
+            return register_by_workers(self, self.workers, items, detects=detects)
         for other in self.others:
             other.share()
 
@@ -229,10 +231,6 @@ class Registrar(Target):
                 _ = target.detector  # created once, before threads use it
         results: Results = map_items(self, items, register)
         return results
-
-    @cached_property
-    def _workers(self) -> Workers:
-        return Workers(self, self.workers)
 
     def _result_of(
         self, item: ImageItem, index: int, *, detects: bool

@@ -1,17 +1,12 @@
-"""Photographs registered by several processes, which do not share Python's interpreter lock."""
+"""Photographs registered by the workers of an executor, which do not share Python's interpreter
+lock."""
 
-import multiprocessing
-import pickle
-import weakref
 from collections.abc import Sequence
 from copy import copy
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
-from typing import Any, Protocol, TypeVar
-
-import torch
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from ..errors import CurviregError, WorkerError
+from ..utils.executors import Workers
 from .inputs import ImageItem
 from .result import FailedRegistration, Registration
 
@@ -23,19 +18,14 @@ COMPUTED = (
     "telling_symmetries",
     "_keypoints",
     "_mirror_image",
-    "_workers",
 )
-SECONDS_TO_END = 20.0  # within which a process stores the features of views that it has described
-ENDED = (
-    "workers: a process ended, perhaps for lack of memory; use fewer, and start them within "
-    "'if __name__ == \"__main__\":'"
-)
+MAX_BLOCK = 8  # photographs that a worker gets at a time
 
 Results = list[Registration | FailedRegistration]
 
 
 class RegistersItems(Protocol):
-    """What a process needs of a :class:`.Registrar`."""
+    """What a worker needs of a :class:`.Registrar`."""
 
     @property
     def others(self) -> Sequence[Any]:
@@ -50,83 +40,45 @@ class RegistersItems(Protocol):
 Copied = TypeVar("Copied", bound=RegistersItems)
 
 
-class Workers:
-    """Processes that hold a copy of a registrar each, until they are closed or forgotten.
+class _Task(NamedTuple):
+    """A photograph, by its number in the call."""
 
-    They are spawned, as threads and GPUs ask for: a script that starts them must do so within ``if
-    __name__ == "__main__":``. Inputs and results travel by pickle, as bytes.
-
-    Args:
-        registrar: what is copied to each process.
-        count: of processes.
-    """
-
-    def __init__(self, registrar: RegistersItems, count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        content = pickle.dumps(_without_renderers(registrar))
-        self._connections: list[Connection] = []
-        processes: list[BaseProcess] = []
-        self.close = weakref.finalize(self, _end, processes, self._connections)
-        for _ in range(count):
-            here, there = context.Pipe()
-            process = context.Process(target=_work, args=(there,), daemon=True)
-            process.start()
-            there.close()
-            processes.append(process)
-            self._connections.append(here)
-        for connection in self._connections:
-            _send(connection, content)
-
-    @property
-    def are_open(self) -> bool:
-        """Whether the processes were not closed, by an error or by :attr:`close`."""
-        return bool(self.close.alive)
-
-    def register(self, items: Sequence[ImageItem | CurviregError], *, detects: bool) -> Results:
-        """:meth:`.Registrar.register_items`; each process has one photograph at a time."""
-        results: dict[int, Any] = {}
-        waiting = list(range(len(items)))[::-1]
-        working: dict[Connection, int] = {}
-        idle = list(self._connections)
-        try:
-            while waiting or working:
-                while waiting and idle:
-                    index = waiting.pop()
-                    connection = idle.pop()
-                    _send(connection, pickle.dumps((items[index], index, detects)))
-                    working[connection] = index
-                for ready in wait(list(working)):
-                    assert isinstance(ready, Connection)
-                    result = pickle.loads(ready.recv_bytes())
-                    results[working.pop(ready)] = result
-                    idle.append(ready)
-        except EOFError as error:
-            self.close()
-            raise WorkerError(ENDED) from error
-        except BaseException:  # what they are still working on belongs to no later call
-            self.close()
-            raise
-        for result in results.values():
-            if isinstance(result, BaseException):
-                raise result
-        return [results[index] for index in range(len(items))]
+    number: int
+    item: ImageItem | CurviregError
+    detects: bool
 
 
-def _send(connection: Connection, content: bytes) -> None:
-    try:
-        connection.send_bytes(content)
-    except OSError as error:  # the other end is closed
-        raise WorkerError(ENDED) from error
+def register_by_workers(
+    registrar: RegistersItems,
+    workers: Workers,
+    items: Sequence[ImageItem | CurviregError],
+    *,
+    detects: bool,
+) -> Results:
+    """:meth:`.Registrar.register_items` by workers, which get a copy of the registrar each; a
+    photograph that ends them fails."""
+    tasks = [_Task(number, item, detects) for number, item in enumerate(items)]
+    size = max(1, min(MAX_BLOCK, len(tasks) // (2 * workers.count)))
+    blocks = (tasks[start : start + size] for start in range(0, len(tasks), size))
+    found: dict[int, Registration | FailedRegistration] = {}
+    for task, result in workers.map(_register_block, _without_renderers(registrar), blocks):
+        if isinstance(result, WorkerError):
+            found[task.number] = FailedRegistration(result.of_image(task.number))
+        else:
+            found[task.number] = result
+    return [found[number] for number in range(len(items))]
 
 
-def _end(processes: Sequence[BaseProcess], connections: Sequence[Connection]) -> None:
-    """Let processes end by themselves, or end them."""
-    for connection in connections:
-        connection.close()
-    for process in processes:
-        process.join(SECONDS_TO_END)
-        if process.is_alive():
-            process.terminate()
+def _register_block(registrar: RegistersItems, tasks: Sequence[_Task]) -> Results:
+    """The results of a block, whose errors name the number of the photograph in the call."""
+    items = [task.item for task in tasks]
+    results = registrar.register_items(items, detects=tasks[0].detects)
+    return [
+        FailedRegistration(result.error.of_image(task.number))
+        if isinstance(result, FailedRegistration) and isinstance(task.item, ImageItem)
+        else result
+        for task, result in zip(tasks, results, strict=True)
+    ]
 
 
 def _without_renderers(registrar: Copied) -> Copied:
@@ -135,31 +87,7 @@ def _without_renderers(registrar: Copied) -> Copied:
     for name in COMPUTED:
         other.__dict__.pop(name, None)
     other.progress = False
-    other.workers = 1
+    other.workers = None
     other.others = [_without_renderers(one) for one in registrar.others]
     copied: Copied = other
     return copied
-
-
-def _work(connection: Connection) -> None:
-    """Register photographs until the connection is closed."""
-    torch.set_num_threads(1)
-    try:
-        registrar: RegistersItems = pickle.loads(connection.recv_bytes())
-        while True:
-            item, index, detects = pickle.loads(connection.recv_bytes())
-            connection.send_bytes(pickle.dumps(_result(registrar, item, index, detects)))
-    except (EOFError, OSError):  # no more photographs
-        return
-
-
-def _result(
-    registrar: RegistersItems, item: ImageItem | CurviregError, index: int, detects: bool
-) -> Registration | FailedRegistration | Exception:
-    try:
-        result = registrar.register_items([item], detects=detects)[0]
-    except Exception as error:  # raised where the photographs came from
-        return error
-    if isinstance(result, FailedRegistration) and isinstance(item, ImageItem):
-        return FailedRegistration(result.error.of_image(index))
-    return result

@@ -9,6 +9,7 @@ from ..errors import MissingDependencyError
 EXTRAS = {
     "cascadio": "cad",
     "collada": "cad",
+    "distributed": "cluster",
     "matplotlib": "plot",
     "nicegui": "viewer",
     "pi_heif": "heic",

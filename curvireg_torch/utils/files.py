@@ -14,6 +14,7 @@ import signal
 import sys
 import tempfile
 import threading
+import unicodedata
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -317,9 +318,31 @@ def found_in(folder: Path) -> FindFile:
     def find(name: str) -> Path:
         path = folder / name
         is_posix = "\\" not in name or os.path.exists(path)
-        return path if is_posix else folder.joinpath(*PureWindowsPath(name).parts)
+        return as_stored(path if is_posix else folder.joinpath(*PureWindowsPath(name).parts))
 
     return find
+
+
+def as_stored(path: Path) -> Path:
+    """The path of the file that is meant, where its accents are stored in another form: keyboards
+    type them composed (NFC), while macOS stored them decomposed (NFD); systems take these for two
+    names. A path without such a file stays as it is."""
+    if str(path).isascii() or os.path.lexists(path):
+        return path
+    found = Path(path.anchor)
+    for part in path.relative_to(path.anchor).parts:
+        if not os.path.lexists(found / part):
+            wanted = unicodedata.normalize("NFC", part)
+            try:
+                names = sorted(os.listdir(found))
+            except OSError:
+                return path
+            same = [name for name in names if unicodedata.normalize("NFC", name) == wanted]
+            if not same:
+                return path
+            part = same[0]
+        found = found / part
+    return found
 
 
 def only_in(folder: Path) -> FindFile:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..errors import OutputError
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.words import two_decimals
 from .contours import draw_window
@@ -50,6 +51,7 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         self.fps = fps
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
+        self._count = 0
         self._waiting: list[Registration | FailedRegistration] = []
 
     def add(self, image: Tensor | None, result: Registration | FailedRegistration) -> None:
@@ -70,6 +72,7 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         if picture.shape[1::-1] != self._size:
             picture = np.asarray(cv2.resize(picture, self._size, interpolation=cv2.INTER_AREA))
         self._writer.write(picture[..., ::-1])
+        self._count += 1
 
     def _open(self, picture: np.ndarray) -> cv2.VideoWriter:
         # the codec needs even numbers
@@ -83,12 +86,38 @@ class OverlayVideo(AbstractContextManager["OverlayVideo"]):
         return writer
 
     def close(self) -> None:
-        """Finish the file. Nothing is written if there was no frame."""
-        if self._writer is not None:
-            self._writer.release()
+        """Finish the file. Nothing is written if there was no frame.
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        Raises:
+            OutputError: the file is not whole, as on a full disk.
+        """
+        if self._writer is None:
+            return
+        is_opened = self._writer.isOpened()
+        self._writer.release()
+        self._writer = None
+        if is_opened and (readable := _frames_in(self.path)) != self._count:
+            raise OutputError(
+                f"cannot be written whole ({readable} of {self._count} frames can be read); make "
+                f"room",
+                subject=self.path,
+            )
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.close()
+        except OutputError:
+            if kind in (None, KeyboardInterrupt):  # another error counts more
+                raise
+
+
+def _frames_in(path: Path) -> int:
+    """The number of frames that a video has by its index; 0 of a file that cannot be read."""
+    video = cv2.VideoCapture(str(path))
+    try:
+        return int(video.get(cv2.CAP_PROP_FRAME_COUNT)) if video.isOpened() else 0
+    finally:
+        video.release()
 
 
 def annotated_frame(

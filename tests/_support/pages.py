@@ -16,10 +16,10 @@ PAGES = sorted(
     ]
 )
 
-PROGRAM = r" *(?:\S*/)?(?:curvireg|python|torchrun|pip|git|apt-get|\w+\.sh) "
+PROGRAM = r" *(?:\S*/)?(?:curvireg|python|pip|git|apt-get|\w+\.sh) "
 STEP = re.compile(
     r"^(?P<indent> *)```(?P<kind>\w*)\n(?P<code>.*?)^ *```"
-    r"|`(?P<inline>(?:(?:curvireg|torchrun) (?=[^`\n|]* --out )|python )[^`\n|]+)`",
+    r"|`(?P<inline>(?:curvireg (?=[^`\n|]* --out )|python )[^`\n|]+)`",
     flags=re.DOTALL | re.MULTILINE,
 )
 

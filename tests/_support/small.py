@@ -51,8 +51,10 @@ def kill_in_write(count: int) -> None:
     os.fsync = sync_or_die
 
 
-if __name__ == "__main__":
+if __name__ in ("__main__", "__mp_main__"):  # the second is that of its workers
     PRESETS[DEFAULT] = SMALL
+
+if __name__ == "__main__":
     if "CURVIREG_TEST_KILL" in os.environ:
         kill_in_write(int(os.environ["CURVIREG_TEST_KILL"]))
     sys.exit(main([*sys.argv[1:], "--quiet"]))

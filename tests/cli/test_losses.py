@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
+from curvireg_torch.jobs.outputs import MARKER
 from curvireg_torch.jobs.ros import FILES
 from tests._support.lists import CAMERA, box_of, lines, table, written
 from tests._support.scenes import scene
@@ -177,3 +178,27 @@ def test_demo_plot_and_bank_overwrite_no_file_of_others(folder, refused, tmp_pat
     assert {path.read_text() for path in tmp_path.glob("[bp]*") if path.name != "mine.png"} == {
         "of others"
     }
+
+
+FAILURES = {
+    "unreadable photograph": ["text.jpg", "truck.safetensors"],
+    "missing photograph": ["missing.png", "truck.safetensors"],
+    "one colour": ["flat.png", "truck.safetensors"],
+    "missing mesh": ["photos/1.png", "missing.ply"],
+    "missing camera": ["photos/1.png", "truck.safetensors", "--camera", "missing.yaml"],
+}
+
+
+@pytest.mark.parametrize("words", FAILURES.values(), ids=FAILURES.keys())
+def test_a_photograph_that_fails_leaves_no_result_of_another(folder, register, tmp_path, words):
+    """A robot would read the old pose."""
+    given = ["--box", *box_of(0), "--format", "ros"]
+    camera = ["--camera", *CAMERA]
+    first = [folder / "photos" / "0.png", folder / "truck.safetensors"]
+    assert register(*first, *given, *camera) == 0
+    out = tmp_path / "out"
+    names = {path.name for path in out.iterdir()}
+    assert names >= {"result.json", "overlay.png", "pose.glb", "pose.yaml", "tf.yaml"}
+    photo, mesh, *options = words
+    assert register(folder / photo, folder / mesh, *given, *(options or camera)) == 2
+    assert {path.name for path in out.iterdir()} == {MARKER}

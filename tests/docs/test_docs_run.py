@@ -131,11 +131,12 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
     program = Path(words[0]).name
     if "--jobs" in words:  # tests/jobs/test_processes.py starts several
         words[words.index("--jobs") + 1] = "1"
+    if "--scheduler" in words:  # tests/utils/test_executors.py starts a cluster
+        place = words.index("--scheduler")
+        words = words[:place] + words[place + 2 :]
     if program == "demo.sh":
         last = (ROOT / words[0]).read_text("utf-8").splitlines()[-1]
         words = split_command(last.replace('"$venv/bin/curvireg"', "curvireg").replace('"$@"', ""))
-    if program == "torchrun":
-        words = words[words.index("-m") + 1 :]
     if program == "python":
         monkeypatch.setattr(sys, "argv", words[1:])
         try:

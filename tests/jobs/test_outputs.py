@@ -45,15 +45,62 @@ def test_own_files_are_replaced_and_others_beside_them_do_not_matter(tmp_path):
         pytest.fail("work began")
 
 
+def killed(folder, command, name, **how):
+    """A process that is killed while ``command`` writes; it has written the file ``name``."""
+    child = os.fork()
+    if not child:
+        context = output_folder(folder, command, **how)
+        context.__enter__()
+        if name:
+            (folder / name).write_text("")
+        os._exit(0)
+    os.waitpid(child, 0)
+
+
 def test_a_command_that_was_killed_may_go_on(tmp_path):
     """The marker is written before the files."""
-    context = output_folder(tmp_path, "register several")
-    context.__enter__()
-    (tmp_path / "results.0-of-2.jsonl").write_text("")
+    killed(tmp_path, "register several", "results.jsonl")
     marker = (tmp_path / MARKER).stat().st_mtime_ns
-    again = output_folder(tmp_path, "register several")
-    again.__enter__()
-    assert (tmp_path / MARKER).stat().st_mtime_ns == marker, "it is not written again"
+    with output_folder(tmp_path, "register several"):
+        assert (tmp_path / MARKER).stat().st_mtime_ns == marker, "it is not written again"
+        assert (tmp_path / "results.jsonl").exists(), "rows are resumed"
+
+
+@pytest.mark.parametrize("source", [["a.csv"], ["b.csv"]])
+def test_of_two_runs_at_a_time_the_second_is_refused(tmp_path, source):
+    with output_folder(tmp_path, "register several", source=["a.csv"]):
+        marker = (tmp_path / MARKER).read_bytes()
+        second = output_folder(tmp_path, "register several", source=source)
+        with pytest.raises(InvalidInputError, match="another run is writing its results here"):
+            second.__enter__()
+        assert (tmp_path / MARKER).read_bytes() == marker
+    with output_folder(tmp_path, "register several", source=source):
+        pass
+
+
+def test_a_run_of_another_source_that_was_stopped_is_not_taken_over(tmp_path):
+    """Even before it has a result: who started it resumes it."""
+    killed(tmp_path, "register several", None, source=["a.csv"])
+    marker = (tmp_path / MARKER).read_bytes()
+    with pytest.raises(InvalidInputError, match=r"a run of a\.csv was stopped here"):
+        output_folder(tmp_path, "register several", source=["b.csv"]).__enter__()
+    assert (tmp_path / MARKER).read_bytes() == marker
+    with output_folder(tmp_path, "register several", source=["a.csv"]):
+        pass
+    with output_folder(tmp_path, "register several", source=["b.csv"]):
+        pass
+
+
+@pytest.mark.parametrize("command", FILES)
+def test_what_an_earlier_run_left_goes_first_but_for_rows_that_are_resumed(tmp_path, command):
+    names = [name.replace("*", "1") for name in FILES[command]]
+    with output_folder(tmp_path, command):
+        for name in names:
+            (tmp_path / name).write_text("of the first photograph")
+    with pytest.raises(OSError, match="unreadable"), output_folder(tmp_path, command):
+        raise OSError("unreadable")
+    left = {path.name for path in tmp_path.iterdir()} - {MARKER}
+    assert left == {"results.jsonl", "thumbnails"} & {*names}
 
 
 def test_an_error_of_the_command_keeps_its_files(tmp_path):
@@ -139,20 +186,3 @@ def test_files_that_are_named_are_replaced_only_with_our_mark(tmp_path):
     check_output_file(file, [], mark=b"curvireg")
     with pytest.raises(InvalidInputError, match=r"overlay\.png: an input"):
         check_output_file(file, [file], mark=b"curvireg")
-
-
-@pytest.mark.parametrize(("rank", "checks"), [(None, True), ("0", True), ("1", False)])
-def test_the_first_of_several_processes_checks(tmp_path, monkeypatch, rank, checks):
-    """The others find files of the first one, which has begun."""
-    if rank is not None:
-        monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
-        monkeypatch.setenv("RANK", rank)
-    (tmp_path / "results.csv").write_text("of others")
-    context = output_folder(tmp_path, "register several")
-    if checks:
-        with pytest.raises(InvalidInputError, match="not written by this command"):
-            context.__enter__()
-    else:
-        with context:
-            pass
-    assert not (tmp_path / MARKER).exists()

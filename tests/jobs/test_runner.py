@@ -1,7 +1,6 @@
 """The loop over entries, with a function in place of the registration."""
 
 import weakref
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -11,13 +10,13 @@ import torch
 
 from curvireg_torch import Camera, PosePrior
 from curvireg_torch.data.pose_files import PoseFile
-from curvireg_torch.errors import InvalidInputError, MeshError
+from curvireg_torch.errors import MeshError, WorkerError
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry
 from curvireg_torch.jobs.runner import run_entries
-from curvireg_torch.jobs.store import Workers, run_processes
 from curvireg_torch.jobs.views import View
 from curvireg_torch.utils import sources
+from curvireg_torch.utils.executors import Workers
 from curvireg_torch.utils.files import write_file
 
 
@@ -41,20 +40,20 @@ def entries(tmp_path, threads):
     ]
 
 
-def registered(entries, folder, *, settings=None, workers=None, stop_after=None):
+def registered(entries, folder, *, settings=None, stop_after=None, **how):
     """The labels of the entries that a run registers, in their order; Ctrl-C after ``stop_after``
     of them."""
     labels = []
     opened = []
 
-    def register(entry, registrar, _, *, bank_seconds):
+    def register(entry, registrar, *, bank_seconds):
         if len(labels) == stop_after:
             raise KeyboardInterrupt
         labels.append(entry.label)
         assert str(registrar) == entry.meshes[0].name
         first = sum(label[1] == entry.label[1] for label in labels) == 1
         assert (bank_seconds > 0) == first, "the first pays for the bank"
-        return {"verdict": "reliable"}
+        return {"verdict": "reliable"}, None
 
     def open_registrar(meshes):
         assert not any(reference() for reference in opened), (
@@ -64,12 +63,9 @@ def registered(entries, folder, *, settings=None, workers=None, stop_after=None)
         opened.append(weakref.ref(error))
         raise error
 
-    options = {"settings": settings or {}, "label": "", "progress": False}
+    options = {"settings": settings or {}, "label": "", "progress": False, **how}
     try:
-        with (
-            patch.object(runner, "workers", lambda: nullcontext(workers or Workers())),
-            patch.object(runner, "_row", register),
-        ):
+        with patch.object(runner, "_row", register):
             registered.store = run_entries(entries, folder, open_registrar, **options)
     except KeyboardInterrupt:
         assert stop_after is not None
@@ -80,10 +76,6 @@ def test_entries_of_one_mesh_follow_each_other(entries, tmp_path):
     assert registered(entries, tmp_path / "out") == ["0a", "1a", "0b", "1b"]
     assert registered(entries, tmp_path / "out") == []
     assert registered(entries[::-1], tmp_path / "out") == [], "in any order"
-    for size in (2, 8):
-        parts = [Workers(rank, size).part(["0a", "1a", "0b", "1b"]) for rank in range(size)]
-        assert [label for part in parts for label in part] == ["0a", "1a", "0b", "1b"]
-        assert size == 8 or len(parts[0]) == 2
 
 
 AGAIN = {
@@ -146,11 +138,70 @@ def test_missing_photographs_are_tried_again(entries, tmp_path):
 
 
 def test_interrupted_run_keeps_what_is_done(entries, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "summary.json").write_text("of other results")
     assert registered(entries, tmp_path / "out", stop_after=2) == ["0a", "1a"]
-    assert not (tmp_path / "out" / "summary.json").exists()
     assert registered(entries, tmp_path / "out") == ["0b", "1b"]
+
+
+def test_textures_of_another_folder_are_digested(entries, tmp_path):
+    """``--textures``: what is read counts, whatever names it, and not the name of its folder."""
+    (tmp_path / "skin.png").rename(tmp_path / "moved.png")
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "skin.png").write_text("red")
+    one, two = ([tmp_path / name] for name in ("one", "two"))
+    out = tmp_path / "out"
+    assert len(registered(entries, out, textures=one)) == 4
+    assert registered(entries, out, textures=two) == []
+    (tmp_path / "one" / "skin.png").write_text("blue")
+    assert registered(entries, out, textures=one) == ["0b", "1b"]
+    assert registered(entries, out, textures=one) == []
+
+
+def test_only_photographs_with_a_row_are_digested_before_they_are_registered(
+    entries, tmp_path, monkeypatch
+):
+    """The first of a long list does not wait for the digests of all."""
+    digested = []
+
+    def digest(path):
+        digested.append(path.name)
+        return path.name
+
+    def register(_, tasks):
+        before.append(list(digested))
+        return [
+            runner.Finished(
+                {
+                    "digests": {"request": task.request, "photo": runner.photo_digest(task.entry)},
+                    "verdict": "reliable",
+                },
+                None,
+            )
+            for task in tasks
+        ]
+
+    monkeypatch.setattr(runner, "file_digest", digest)
+    monkeypatch.setattr(runner, "_register_block", register)
+    how = {"settings": {}, "label": "", "progress": False}
+    for expected in ([[], ["0.png", "1.png"]], []):
+        before = []
+        run_entries(entries, tmp_path / "out", None, **how)
+        assert before == expected
+
+
+def test_a_photograph_that_ends_its_worker_fails_and_is_tried_again(entries, tmp_path):
+    """The others keep their rows."""
+
+    class OneLost(Workers):
+        def map(self, function, state, blocks):
+            for task, result in super().map(function, state, blocks):
+                is_lost = task.entry.label == "1a"
+                yield task, WorkerError("workers: a process ended") if is_lost else result
+
+    assert len(registered(entries, tmp_path / "out", workers=OneLost())) == 4
+    row = registered.store.read("1a")
+    assert (row["verdict"], row["message"]) == ("failed", "workers: a process ended")
+    assert registered(entries, tmp_path / "out") == ["1a"]
 
 
 CAMERA = Camera(torch.eye(3))
@@ -197,16 +248,3 @@ def test_request_covers_every_option_and_other_views():
         assert replace(ENTRY, views=(other,)).request() != replace(ENTRY, views=VIEWS).request(), (
             name
         )
-
-
-def test_run_processes(monkeypatch, capfd):
-    assert not run_processes(1, ["evaluate"])
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "x")
-    assert not run_processes(2, ["evaluate"])
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID")
-    with pytest.raises(InvalidInputError, match="a process ended with 1"):
-        run_processes(2, ["nonsense"])
-    printed = capfd.readouterr().err
-    assert "nonsense" in printed
-    assert "Traceback" not in printed
-    assert "torch" not in printed

@@ -1,9 +1,10 @@
+import json
 from unittest.mock import Mock
 
 import pytest
 
 from curvireg_torch.errors import InvalidInputError, OutputError
-from curvireg_torch.jobs.store import ResultStore, Workers
+from curvireg_torch.jobs.store import ResultStore
 
 DIGESTS = {"request": "a", "photo": "b"}
 
@@ -22,26 +23,35 @@ def test_rows_are_read_again(tmp_path):
     for again in (store, ResultStore(tmp_path / "new")):
         expected = [row(key, i=i, value=None, values=[None, 1.5]) for i, key in enumerate(keys)]
         assert [again.read(key) for key in keys] == expected
-        assert again.is_complete(dict.fromkeys(keys, DIGESTS))
-        assert not again.is_complete(dict.fromkeys([*keys, "b"], DIGESTS))
-        assert not again.is_complete({key: {**DIGESTS, "photo": "c"} for key in keys})
+        assert all(again.is_current(key, "a", lambda: "b") for key in keys)
+        assert not again.is_current("b", "a", lambda: "b")
+        assert not again.is_current("é", "a", lambda: "c")
+        assert len(again) == 4
 
 
-@pytest.mark.parametrize("workers", [None, Workers(1, 2)])
-def test_rows_replace_older_ones(tmp_path, workers):
-    """Those of other digests, also in the file of another process that sorts later; of the same
-    digests, the last."""
-    ResultStore(tmp_path, Workers(2, 3)).append(
-        {**row("a", i=0), "digests": {"request": "a", "photo": "old"}}
-    )
-    for i in (1, 2):
-        store = ResultStore(tmp_path, workers)
-        store.append(row("a", i=i))
-        assert store.is_complete({"a": DIGESTS})
-        assert store.read("a")["i"] == i
-    store.merge()
-    assert [path.name for path in tmp_path.iterdir()] == ["results.jsonl"]
-    assert store.read("a") == ResultStore(tmp_path).read("a") == row("a", i=2)
+def test_a_photograph_is_digested_only_where_all_else_is_the_same(tmp_path):
+    store = ResultStore(tmp_path)
+    store.append(row("a"))
+    store.append({**row("unreadable"), "digests": {"request": "a", "photo": ""}})
+    digest = Mock(return_value="")
+    assert not store.is_current("b", "a", digest)
+    assert not store.is_current("a", "other", digest)
+    assert not store.is_current("unreadable", "a", digest)
+    digest.assert_not_called()
+    assert not store.is_current("a", "a", digest)
+    digest.assert_called_once_with()
+
+
+def test_rows_replace_older_ones_and_are_sorted(tmp_path):
+    ResultStore(tmp_path).append({**row("a", i=0), "digests": {"request": "a", "photo": "old"}})
+    for i, key in enumerate("abca", start=1):
+        store = ResultStore(tmp_path)
+        store.append(row(key, i=i))
+        assert store.is_current(key, "a", lambda: "b")
+        assert store.read(key)["i"] == i
+    store.sort(["c", "a"])
+    assert [json.loads(line)["key"] for line in store.path.read_text().splitlines()] == [*"cab"]
+    assert store.read("a") == ResultStore(tmp_path).read("a") == row("a", i=4)
 
 
 @pytest.mark.parametrize("cut", [1, 20, -1])
@@ -54,7 +64,7 @@ def test_cut_line_is_removed(tmp_path, cut):
     store.path.write_bytes(whole[: whole.rindex(b'{"key"')] + last)
     reader = ResultStore(tmp_path)
     store = ResultStore(tmp_path)
-    assert [reader.is_current(key, DIGESTS) for key in "abc"] == [True, True, False]
+    assert [reader.is_current(key, "a", lambda: "b") for key in "abc"] == [True, True, False]
     store.append(row("c"))
     assert (store.path.read_bytes(), store.read("c")) == (whole, row("c"))
 

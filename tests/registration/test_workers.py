@@ -7,6 +7,7 @@ import torch
 from curvireg_torch import Registrar
 from curvireg_torch.errors import CurviregError, InvalidInputError, WorkerError
 from curvireg_torch.registration import workers
+from curvireg_torch.utils.executors import Workers
 from tests._support.scenes import CAMERA, scene, truck_bank
 
 
@@ -37,14 +38,14 @@ def test_a_process_that_ends_is_an_error():
     registrar = Registrar(truck_bank(), workers=2)
     items = [EndsItsProcess(), EndsItsProcess()]
     with pytest.raises(WorkerError, match="a process ended"):
-        registrar._workers.register(items, detects=False)
+        registrar.register_items(items)
     images = [scene(0)[0]] * 2
     results = registrar(images, scene(0)[1].expand(2, 4), CAMERA)  # by new processes
     assert all(result.ok for result in results)
 
 
 def test_one_photograph_needs_no_process(monkeypatch):
-    monkeypatch.setattr(workers.Workers, "register", None)  # would fail
+    monkeypatch.setattr(Workers, "map", None)  # would fail
     registrar = Registrar(truck_bank(), workers=2)
     assert registrar([scene(0)[0]], scene(0)[1][None], CAMERA)[0].ok
 

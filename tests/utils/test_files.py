@@ -2,8 +2,10 @@ import csv
 import os
 import signal
 import sys
+import unicodedata
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 from curvireg_torch.cli import main
 from curvireg_torch.errors import CurviregError, InvalidInputError, MissingFileError, OutputError
 from curvireg_torch.utils import files
-from curvireg_torch.utils.files import file_name, only_in
+from curvireg_torch.utils.files import as_stored, file_name, found_in, only_in
 
 OLD = b"a" * 1000
 NEW = b"b" * 5_000_000
@@ -211,3 +213,33 @@ def test_a_csv_file_that_grows_has_each_row_at_once_and_begins_anew(tmp_path):
     assert path.read_text().splitlines()[1:] == ['"\'=a,b",1.5', "c,"]
     with pytest.raises(OutputError, match=r"none.x\.csv: cannot be written"):
         files.CsvFile(tmp_path / "none" / "x.csv", ["name"]).add(["a"])
+
+
+@pytest.mark.parametrize("stored", ["NFC", "NFD"])
+def test_a_name_is_found_however_its_accents_are_stored(tmp_path: Path, stored: Any) -> None:
+    folder = tmp_path / unicodedata.normalize("NFD", "Möbel")
+    folder.mkdir()
+    file = folder / unicodedata.normalize(stored, "Stühle.png")
+    file.write_text("")
+    forms: list[Any] = ["NFC", "NFD"]
+    for form in forms:
+        typed = (
+            tmp_path
+            / unicodedata.normalize(form, "Möbel")
+            / unicodedata.normalize(form, "Stühle.png")
+        )
+        assert as_stored(typed) == file
+        assert found_in(tmp_path)(str(typed.relative_to(tmp_path))) == file
+        other = typed.with_name("Stuhle.png")
+        assert as_stored(other) == other
+        missing = typed.with_name(unicodedata.normalize(form, "Tür.png"))
+        assert as_stored(missing) == missing
+
+
+def test_of_two_names_that_differ_in_form_alone_the_typed_one_is_taken(tmp_path: Path) -> None:
+    names = [unicodedata.normalize("NFC", "ü.png"), unicodedata.normalize("NFD", "ü.png")]
+    for name in names:
+        (tmp_path / name).write_text("")
+    if len(list(tmp_path.iterdir())) < 2:
+        pytest.skip("this file system takes them for one name")
+    assert [as_stored(tmp_path / name).name for name in names] == names

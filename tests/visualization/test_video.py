@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from curvireg_torch.data import Video
-from curvireg_torch.errors import InvalidInputError, LostObjectError
+from curvireg_torch.errors import InvalidInputError, LostObjectError, OutputError
 from curvireg_torch.registration import FailedRegistration
 from curvireg_torch.visualization import OverlayVideo
 from curvireg_torch.visualization.video import annotated_frame, caption
@@ -61,3 +61,38 @@ def test_overlay_video_warns_without_an_encoder(registered, tmp_path, monkeypatc
             video.add(image, result)
         video.add(image, LOST)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_overlay_video_that_cannot_be_finished_is_an_error(registered, tmp_path):
+    """The disk is full: OpenCV says nothing."""
+    image, found = registered
+    resource = pytest.importorskip("resource", reason="no limits of files on this system")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def write():
+        with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0) as video:
+            for _ in range(3):
+                video.add(image, found)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20, before[1]))
+
+    try:
+        with pytest.raises(OutputError, match=r"overlay\.mp4: cannot be written whole \(0 of 3"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"), [(KeyboardInterrupt, OutputError), (RuntimeError, RuntimeError)]
+)
+def test_which_error_of_a_video_counts_more(registered, tmp_path, monkeypatch, error, raised):
+    image, found = registered
+    monkeypatch.setattr("curvireg_torch.visualization.video._frames_in", lambda _: 0)
+
+    def write():
+        with OverlayVideo(tmp_path / "overlay.mp4", truck_registrar(), fps=7.0) as video:
+            video.add(image, found)
+            raise error
+
+    with pytest.raises(raised):
+        write()
