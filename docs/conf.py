@@ -35,7 +35,6 @@ nitpick_ignore = [  # types of annotations without a page
     ("py:class", "curvireg_torch.matching.cells.Packing"),
     ("py:class", "curvireg_torch.registration.framing.CropFrame"),
     ("py:class", "curvireg_torch.registration.shape_symmetries.TellingSymmetries"),
-    ("py:class", "curvireg_torch.rendering.contours.Contours"),
     ("py:class", "curvireg_torch.rendering.contours._Level"),
 ]
 html_math_renderer = "mathml"  # nothing is fetched from elsewhere

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ..errors import InvalidInputError
 from ..pipeline import FitSettings
-from ..rendering.contours import Contours
+from ..rendering.contours import MeshContours
 from ..utils.checks import (
     as_boxes,
     as_numbers,
@@ -35,7 +35,7 @@ SAME_POSE_SHIFT = 0.5
 
 @torch.no_grad()
 def fit_contours(
-    contours: Contours,
+    contours: MeshContours,
     images: Tensor | Sequence[Tensor],
     boxes: BoxesLike,
     camera_matrices: CameraLike,
@@ -121,7 +121,7 @@ def fit_contours(
 
 
 def fit_to_edges(
-    contours: Contours,
+    contours: MeshContours,
     crops: EdgeCrops,
     K: Tensor,
     T0: Tensor,
@@ -203,7 +203,7 @@ def fit_to_edges(
 
 @torch.no_grad()
 def short_fit(
-    contours: Contours,
+    contours: MeshContours,
     crops: EdgeCrops,
     K: Tensor,
     T: Tensor,

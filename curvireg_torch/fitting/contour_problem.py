@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..rendering.contours import ContourPoints, Contours
+from ..rendering.contours import ContourPoints, MeshContours
 from ..utils.rows import Rows
 from .edges import CROP_SIZE, EdgeCrops, EdgeField, ObjectMask
 from .least_squares import (
@@ -52,7 +52,7 @@ class ContourProblem(Rows):
     """N poses of a mesh, fitted to ``edges`` of crops of ``size`` px with indices (N,) and cameras
     ``K`` (N, 3, 3); a ``mask`` weights the edges."""
 
-    contours: Contours
+    contours: MeshContours
     edges: EdgeField
     image_index: Tensor
     K: Tensor
@@ -63,7 +63,7 @@ class ContourProblem(Rows):
     @classmethod
     def of(
         cls,
-        contours: Contours,
+        contours: MeshContours,
         crops: EdgeCrops,
         K: Tensor,
         image_index: Tensor | None = None,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..rendering.contours import Contours
+from ..rendering.contours import MeshContours
 from .contour_problem import ContourProblem
 from .edges import EdgeCrops
 from .least_squares import pixels
@@ -19,7 +19,7 @@ DETAILS_WEIGHT = 10.0  # Score of a contour that is there, in the units of edge 
 
 
 def compare_details(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """How far the contours that only one of two poses predicts speak for it: those that are in the
     photograph count for the pose, those that are not count against it.
@@ -51,7 +51,7 @@ class ContourDetails:
 
 
 def contour_details(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> ContourDetails:
     """What :func:`compare_details` compares."""
     problem = ContourProblem.of(contours, crops, K, image_index)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..rendering.contours import Contours
+from ..rendering.contours import MeshContours
 from ..utils.rows import Rows
 from .contour_problem import ContourProblem, ContourState
 from .edges import EdgeCrops
@@ -80,7 +80,7 @@ def measured_fit(
 
 @torch.no_grad()
 def measure_contours(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> ContourFit:
     """What :func:`fit_to_edges` returns for poses ``T`` (N, 4, 4) that are right already: they stay
     as they are."""
@@ -92,7 +92,7 @@ def measure_contours(
 
 @torch.no_grad()
 def contour_support(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """(N,) edge support of poses that are not fitted, as :attr:`ContourFit.edge_support` is of
     fitted ones."""
@@ -102,7 +102,7 @@ def contour_support(
 
 @torch.no_grad()
 def contour_evidence(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """How far the edges under the contours of poses exceed what chance puts there.
 

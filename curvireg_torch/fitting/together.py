@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..rendering.contours import Contours
+from ..rendering.contours import MeshContours
 from ..utils.company import by_key, compute_together
 from .contour_fit import fit_to_edges, short_fit
 from .details import ContourDetails, compared, contour_details
@@ -27,7 +27,7 @@ class FitRequest:
         options: of the fit; tensors have a row for each pose.
     """
 
-    contours: Contours
+    contours: MeshContours
     crops: EdgeCrops
     K: Tensor
     T: Tensor
@@ -104,7 +104,7 @@ def _computed(
 
 
 def fit_together(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor, **options: Any
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor, **options: Any
 ) -> ContourFit:
     """:func:`.fit_to_edges`, on the device of the contours; the result is on the CPU."""
     return ContourFit(
@@ -121,7 +121,7 @@ def _fits(requests: Sequence[FitRequest]) -> list[Tensors]:
 
 
 def short_fit_together(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """:func:`.short_fit`, on the device of the contours; the result is on the CPU."""
     T, support = compute_together(_short_fits, FitRequest(contours, crops, K, T, image_index, {}))
@@ -133,7 +133,7 @@ def _short_fits(requests: Sequence[FitRequest]) -> list[Tensors]:
 
 
 def support_together(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """:func:`.contour_support`, on the device of the contours; the result is on the CPU."""
     return compute_together(_supports, FitRequest(contours, crops, K, T, image_index, {}))[0]
@@ -144,7 +144,7 @@ def _supports(requests: Sequence[FitRequest]) -> list[Tensors]:
 
 
 def evidence_together(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> Tensor:
     """:func:`.contour_evidence`, on the device of the contours; the result is on the CPU."""
     return compute_together(_evidence, FitRequest(contours, crops, K, T, image_index, {}))[0]
@@ -155,7 +155,7 @@ def _evidence(requests: Sequence[FitRequest]) -> list[Tensors]:
 
 
 def details_together(
-    contours: Contours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """:func:`.compare_details`, with contours on their device; the result is on the CPU."""
     request = FitRequest(contours, crops, K, T, image_index, {})

@@ -16,8 +16,7 @@ from ..mesh.edges import simplified
 from ..mesh.mesh import cached_in_mesh, extreme_points, mesh_centre, mesh_radius
 from ..pipeline import DEPTH_FIELDS, BankSettings
 from ..rendering import DepthRenderer, make_renderer, render_colour, shade
-from ..rendering.contours import LEVELS, Contours, MeshContours
-from ..rendering.device_contours import DeviceContours
+from ..rendering.contours import LEVELS, MeshContours
 from ..rendering.zbuffer import DeviceRenderer
 
 VIEWS_AT_A_TIME = 64  # Views in memory at a time
@@ -105,11 +104,9 @@ class ViewDescriber:
         return MeshContours(self.view_mesh)
 
     @cached_property
-    def device_contours(self) -> Contours:
+    def device_contours(self) -> MeshContours:
         """The same, on the device of the views."""
-        if self._device.type == "cpu":
-            return self.contours
-        return DeviceContours(self.contours, self._device)
+        return self.contours.to(self._device)
 
     def with_settings(self, settings: BankSettings) -> "ViewDescriber":
         """The same mesh and renderer with other settings; convex hulls of large meshes take

@@ -4,7 +4,9 @@ import math
 
 import fast_simplification
 import numpy as np
+import torch.nn.functional as F
 import trimesh
+from torch import Tensor
 
 WELD = 1e-6  # Vertices nearer than this fraction of the mesh's longest side are one
 CREASE_ANGLE = 15.0  # Degrees between two faces from which their common edge is a crease
@@ -68,24 +70,29 @@ class MeshEdges:
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
         self.normals: np.ndarray = normals.astype(np.float32)
 
-    def sides_data(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What :meth:`sides` computes with: planes (F, 3) and offsets (F,) of the faces, whose
-        lengths are twice their areas, the faces (E, k) of each edge, and whether these run along it
-        backwards (k, E)."""
-        return self._plane, self._offset, self._edge_faces, self._flips
+    def side_planes(self) -> np.ndarray:
+        """(k, E, 4) float64 planes (n, d) of the faces of each edge, as :func:`occluding_edges`
+        looks at them: n . x + d has the sign of ((a - x) x (b - x)) . corner, with the ends a and b
+        of the edge and the third corner of the face, seen from x relative to ``centre``."""
+        planes = np.concatenate([-self._plane, self._offset[:, None]], axis=1)
+        signs = np.where(self._flips, -1.0, 1.0)
+        oriented: np.ndarray = signs[..., None] * planes[self._edge_faces.T]
+        return oriented
 
-    def sides(self, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which edges are on the occluding contour, seen from cameras (N, 3) relative to
-        ``centre``. (N, E) bool: the third corners of all faces lie on one side of the plane through
-        camera and edge. (N, E) bool: whether ((a - eye) x (b - eye)) . (corner - eye) is positive
-        there."""
-        behind = self._offset > eye @ self._plane.T  # (N, F): whether the camera is behind the face
-        flips = zip(self._edge_faces.T, self._flips, strict=True)
-        first, *others = (behind.take(faces, axis=1) ^ flip for faces, flip in flips)
-        all_same = np.ones_like(first)
-        for other in others:
-            all_same &= first == other
-        return all_same, first
+
+def occluding_edges(side_planes: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Which edges are on the occluding contour, seen from cameras ``eye`` (N, 3) relative to the
+    centre: (N, E) bool, whether the third corners of all faces lie on one side of the plane through
+    camera and edge; and (N, E) bool, whether this is the side that the ``side_planes`` (k, E, 4) of
+    :meth:`MeshEdges.side_planes` point to."""
+    k, E, _ = side_planes.shape
+    distance = F.pad(eye, (0, 1), value=1.0) @ side_planes.view(k * E, 4).mT
+    sides = (distance > 0).view(-1, k, E)
+    first = sides[:, 0]
+    all_same = sides[:, 1] == first
+    for other in range(2, k):
+        all_same &= sides[:, other] == first
+    return all_same, first
 
 
 def encloses_volumes(mesh: trimesh.Trimesh) -> bool:

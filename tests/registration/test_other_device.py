@@ -6,7 +6,8 @@ import torch
 
 import curvireg_torch as cr
 from curvireg_torch.registration import work
-from curvireg_torch.rendering.device_contours import DeviceContours
+from curvireg_torch.rendering.contours import MeshContours
+from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import Appearance
@@ -82,7 +83,8 @@ def test_photographs_in_company_have_the_poses_that_they_have_alone(monkeypatch)
     expected = learned_registrar()(images, boxes, CAMERA)
     registrar = cr.Registrar(learned_registrar().bank)
     describer = registrar.describer
-    describer.__dict__["device_contours"] = DeviceContours(describer.contours, "cpu")
+    monkeypatch.setattr("curvireg_torch.rendering.contours._visibility", FaceTests)
+    describer.__dict__["contours"] = MeshContours(describer.view_mesh)
     describer.view_renderer = DeviceRenderer(example_mesh(), "cpu")
     monkeypatch.setattr(work, "map_on_threads", company.map_in_company)
     together = registrar(images, boxes, CAMERA)

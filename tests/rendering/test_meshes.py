@@ -120,13 +120,13 @@ def test_contours_of_a_small_crop_are_those_of_a_coarser_mesh(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     used: list[int] = []
-    lengths = contours_module._Level.lengths_in_crop
+    level = contours_module.MeshContours._level
 
-    def watched(level: Any, *arguments: Any) -> Any:
-        used.append(len(level.edges.faces))
-        return lengths(level, *arguments)
+    def watched(contours: Any, limit: int) -> Any:
+        used.append(len(contours._edges[limit].faces))
+        return level(contours, limit)
 
-    monkeypatch.setattr(contours_module._Level, "lengths_in_crop", watched)
+    monkeypatch.setattr(contours_module.MeshContours, "_level", watched)
     # 20 480 faces
     contours = contours_module.MeshContours(trimesh.creation.icosphere(subdivisions=5))
     T = torch.eye(4, dtype=torch.float64)[None]
