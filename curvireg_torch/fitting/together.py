@@ -104,7 +104,12 @@ def _computed(
 
 
 def fit_together(
-    contours: MeshContours, crops: EdgeCrops, K: Tensor, T: Tensor, image_index: Tensor, **options: Any
+    contours: MeshContours,
+    crops: EdgeCrops,
+    K: Tensor,
+    T: Tensor,
+    image_index: Tensor,
+    **options: Any,
 ) -> ContourFit:
     """:func:`.fit_to_edges`, on the device of the contours; the result is on the CPU."""
     return ContourFit(

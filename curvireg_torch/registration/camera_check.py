@@ -14,7 +14,7 @@ from ..fitting.contour_problem import ContourProblem
 from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import FocalPrior, fit_focal_length, focal_information, scaled_cameras
 from ..fitting.measured_fit import FULL_SIZE_RADII
-from ..rendering.contours import Contours
+from ..rendering.contours import MeshContours
 from .focal import FULL_RADII, HALF_RADII, REPORTED_VARIANCE
 from .poses import Poses
 from .result import Registration
@@ -56,7 +56,7 @@ def with_checked_camera(
 
 
 def focal_gaps(
-    contours: Contours, crops: EdgeCrops, cameras: Tensor, T: Tensor, crop_index: Tensor
+    contours: MeshContours, crops: EdgeCrops, cameras: Tensor, T: Tensor, crop_index: Tensor
 ) -> tuple[Tensor, Tensor]:
     """How far photographs contradict the focal lengths of fitted poses.
 

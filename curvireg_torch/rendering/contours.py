@@ -40,6 +40,7 @@ CREASE_BEND = 0.36
 LEVELS = ((64, 800), (128, 2500), (256, 8000))
 NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 BEHIND = 16  # Bit of a vertex nearer than that
+LENGTH_UNITS = 4096.0  # Parts of a px in which lengths of edges are measured
 EDGES_AT_A_TIME = 2**22  # Edges of all poses that are looked at together
 
 
@@ -241,12 +242,12 @@ class _Views:
         start = _taken(self.level.starts, edge) + vertices_before
         end = _taken(self.level.ends, edge) + vertices_before
         along = _taken(self.pixels, end) - _taken(self.pixels, start)
-        length = along.abs()
+        span = along.abs()
         beyond_start = _taken(self.beyond, start)
         beyond_end = _taken(self.beyond, end)
         # Outside are edges whose ends share a bit, and those that reach behind the camera.
         outside = (beyond_start & beyond_end) | ((beyond_start | beyond_end) & BEHIND)
-        length.masked_fill_(outside != 0, 0.0)
+        length = span.masked_fill(outside != 0, 0.0).nan_to_num_(0.0, posinf=0.0)
         length[-1] = 0.0
         number, fraction, valid = _spread_evenly(length, pose, N, count)
         chosen = _taken(edge, number)
@@ -255,7 +256,7 @@ class _Views:
         second = _taken(vertices, _taken(end, number))
         at = torch.lerp(first, second, fraction[..., None])
         sign = torch.where(self.side.gather(1, chosen), -1.0, 1.0)
-        scale = sign / _taken(length, number).clamp(min=1e-30)
+        scale = sign / _taken(span, number).clamp(min=1e-30)
         normal = torch.view_as_real(1j * scale * _taken(along, number))
         return _Places(chosen, fraction, at, normal, valid)
 
@@ -316,7 +317,9 @@ def _spread_evenly(
     """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose``
     (M,) are the edges' poses, ascending. Returns (N, count): the number of the edge, the fraction
     of its length, whether there is one."""
-    end = length.double().cumsum(dim=0)
+    # in whole units, whose sums are exact: places of a pose do not depend on the other poses
+    length = (LENGTH_UNITS * length.double()).round()
+    end = length.cumsum(dim=0)
     border = torch.searchsorted(pose, torch.arange(poses + 1, device=pose.device))
     before = F.pad(end, (1, 0))[border]
     total = before.diff()
@@ -344,4 +347,6 @@ def _evenly_chosen(valid: Tensor, most: int) -> tuple[Tensor, Tensor]:
     is_point = place < count
     entry = F.pad(valid.flatten().nonzero()[:, 0], (0, 1))
     first = count.cumsum(dim=0) - count
-    return _taken(entry, torch.where(is_point, first + rank, len(entry) - 1)), is_point
+    index = _taken(entry, torch.where(is_point, first + rank, 0))
+    padding = valid.shape[1] * torch.arange(len(valid), device=valid.device)[:, None]
+    return torch.where(is_point, index, padding), is_point

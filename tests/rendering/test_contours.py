@@ -10,7 +10,12 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.rendering import render_depth
-from curvireg_torch.rendering.contours import MAX_OCCLUDING, ContourPoints, MeshContours
+from curvireg_torch.rendering.contours import (
+    MAX_OCCLUDING,
+    ContourPoints,
+    MeshContours,
+    _spread_evenly,
+)
 
 K = torch.tensor([[220.0, 0, 63.5], [0, 220.0, 63.5], [0, 0, 1]], dtype=torch.float64)
 
@@ -107,3 +112,26 @@ def test_the_simplified_mesh_is_drawn_where_the_mesh_is():
     assert float(((simple > 0) != (exact > 0)).sum()) < 0.01 * float((exact > 0).sum())
     both = (simple > 0) & (exact > 0)
     assert float((simple - exact)[both].abs().quantile(0.95)) < 0.01
+
+
+def test_a_pose_that_is_no_number_has_no_points_and_leaves_the_others_theirs():
+    contours = MeshContours(stairs(1.0))
+    T = poses().clone()
+    alone = contours.points(T[1:], K[None], 128)
+    T[0] = torch.nan
+    together = contours.points(T, K[None], 128)
+    assert not bool(together.valid[0].any())
+    assert torch.equal(together.valid[1:], alone.valid)
+    assert torch.equal(together.model[1:][alone.valid], alone.model[alone.valid])
+
+
+def test_places_lie_evenly_along_the_edges_of_each_pose():
+    """Lengths 1, 0, 3 of the first pose, none of the second, 2 and 2 of the third."""
+    length = torch.tensor([1.0, 0.0, 3.0, 2.0, 2.0, 0.0])
+    pose = torch.tensor([0, 0, 0, 2, 2, 2])
+    number, fraction, valid = _spread_evenly(length, pose, 3, 4)
+    assert number[[0, 2]].tolist() == [[0, 2, 2, 2], [3, 3, 4, 4]]
+    expected = torch.tensor([[1 / 2, 1 / 6, 1 / 2, 5 / 6], [1 / 4, 3 / 4, 1 / 4, 3 / 4]])
+    torch.testing.assert_close(fraction[[0, 2]], expected)
+    assert valid.all(dim=1).tolist() == [True, False, True]
+    assert not bool(valid[1].any())

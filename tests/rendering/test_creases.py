@@ -2,6 +2,7 @@
 camera."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,14 +129,20 @@ def test_normals_of_a_smooth_surface_replace_those_of_edges_they_agree_with(
 ):
     """An edge whose normal in the image is (1, 0), of a surface whose normal is turned from it."""
     angle = np.radians(degrees)
-    surface = np.array([[np.cos(angle), np.sin(angle), 0.0]] * 2, np.float32)
-    edges = SimpleNamespace(edges=np.array([[0, 1]]), normals=surface, is_smooth=np.array([smooth]))
-    level = SimpleNamespace(edges=edges)
-    nothing = np.zeros((1, 1, 3), np.float32)
-    turn = np.eye(3, dtype=np.float32)[None]
-    views = _Views(level, SIZE, turn, nothing, turn, nothing, nothing, nothing)
-    edge = np.zeros((1, 1), int)
-    fraction = np.full((1, 1), 0.5, np.float32)
-    normal = np.array([[[1.0, 0.0]]], np.float32)
-    found = views.smoothed(_Places(edge, fraction, nothing, normal)).normal[0, 0]
+    surface = torch.tensor([[np.cos(angle), np.sin(angle), 0.0]] * 2, dtype=torch.float32)
+    first = torch.tensor([0])
+    level = SimpleNamespace(
+        starts=first, ends=first + 1, normals=surface, is_smooth=torch.tensor([smooth])
+    )
+    views: Any = SimpleNamespace(
+        level=level, rotation=torch.eye(3)[None], focal_lengths=torch.ones(1, 1, 2)
+    )
+    places = _Places(
+        edge=first[None],
+        fraction=torch.tensor([[0.5]]),
+        at=torch.zeros(1, 1, 3),
+        normal=torch.tensor([[[1.0, 0.0]]]),
+        valid=torch.tensor([[True]]),
+    )
+    found = _Views._smoothed(views, places).normal[0, 0].tolist()
     assert np.degrees(np.arctan2(found[1], found[0])) == pytest.approx(expected, abs=1e-3)
