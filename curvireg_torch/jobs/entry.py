@@ -1,7 +1,7 @@
 """One photograph with what is known about it, before it is registered."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -36,8 +36,8 @@ class Entry:
     photo: Path = Path()
     meshes: tuple[Path, ...] = ()  # of several the best is found
     box: BoxLike | None = None  # x0, y0, x1, y1 in px; None: the object is detected
-    # "exif" insists on the file's; or a horizontal field of view in degrees
-    camera: Camera | str | float | None = None
+    # or fx, fy, cx, cy in px; "exif" insists on the file's; or a horizontal field of view in deg
+    camera: Camera | tuple[float, ...] | str | float | None = None
     mask: Any = None  # of the object, instead of a box or beside it: a path, or pixels
     instances: int = 1  # without a box, see registration.detect
     prior: PosePrior | None = None
@@ -90,8 +90,8 @@ class Entry:
 def entry_of(photo: Path, options: RegisterOptions) -> Entry:
     """A photograph with the box, camera, meshes and other inputs of the options."""
     camera = options.guess if options.camera is None else options.camera
-    if isinstance(camera, Sequence) and camera != "exif":
-        camera = Camera(camera_matrix(*camera))
+    if isinstance(camera, list):
+        camera = tuple(camera)
     return Entry(
         name=str(photo),
         photo=photo,
@@ -146,6 +146,8 @@ def camera_of(entry: Entry, photo: Photo) -> tuple[Camera | None, str | None]:
     """The camera, or None if it is unknown, and its source; that of a calibration has a size or
     distortion."""
     given = entry.camera
+    if isinstance(given, tuple):
+        given = Camera(camera_matrix(*given))
     if isinstance(given, Camera):
         return given, "file" if given.size or given.distorts else "given"
     if given not in (None, "exif"):

@@ -78,7 +78,7 @@ def _entry(
             raise InvalidInputError("mesh: empty, and no MESH was given; name one")
         numbers = numbers_of(values, BOX)
         box = None if numbers is None else options.box_of(find(values["photo"]), numbers)
-        camera = camera_of(values, find, calibrations) or options.guess
+        camera = _given_camera(values, find, calibrations) or options.guess
         mask = find(values["mask"]) if values.get("mask") else None
         own = limits_from_cells({name: values[name] for name in PRIOR_OPTIONS if name in values})
         prior = prior_from_limits({**(options.limits or {}), **own})
@@ -92,9 +92,17 @@ def camera_of(
     values: Mapping[str, str], find: FindFile, calibrations: Calibrations
 ) -> Camera | None:
     """The camera of a row: of numbers, or of a calibration that ``find`` finds by its name."""
+    given = _given_camera(values, find, calibrations)
+    return Camera(camera_matrix(*given)) if isinstance(given, tuple) else given
+
+
+def _given_camera(
+    values: Mapping[str, str], find: FindFile, calibrations: Calibrations
+) -> Camera | tuple[float, ...] | None:
+    """A calibration, or fx, fy, cx, cy: of a long list, cameras are made when they are needed."""
     numbers = numbers_of(values, CAMERA)
     if not values.get("camera"):
-        return None if numbers is None else Camera(camera_matrix(*numbers))
+        return numbers
     if numbers is not None:
         raise InvalidInputError("camera: give it or fx, fy, cx, cy")
     return calibrations.load(find(values["camera"]))
