@@ -1,4 +1,4 @@
-"""Files that people have, and what is right for each: the cases of ../shared/cases, whose README
+"""Files that people have, and what is right for each: the cases of tests/data/cases, whose README
 states it. Registrations are left to the tests of the modules, which generate such files."""
 
 import json

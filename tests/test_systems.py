@@ -16,7 +16,7 @@ from curvireg_torch import Registrar
 from curvireg_torch.data.calibrations import load_camera
 from curvireg_torch.data.masks import mask_file
 from curvireg_torch.formats.boxes import BoxFile, PictureSize
-from curvireg_torch.mesh.source import MeshSource
+from curvireg_torch.formats.meshes.source import MeshSource
 from curvireg_torch.utils.files import split_name
 from tests._support.scenes import CAMERA, scene, truck_registrar
 
@@ -68,7 +68,11 @@ for name in {sorted(UNIX_NAMES)}:
 for name in ("SIGHUP", "SIGPIPE", "SIGALRM", "SIGUSR1"):
     vars(signal).pop(name, None)
 import curvireg_torch
-skipped = ("curvireg_torch.mesh.usd_parts", "curvireg_torch.viewer")
+skipped = (
+    "curvireg_torch.formats.meshes.step_parts",
+    "curvireg_torch.formats.meshes.usd_parts",
+    "curvireg_torch.viewer",
+)
 for module in pkgutil.walk_packages(curvireg_torch.__path__, "curvireg_torch."):
     if not module.name.startswith(skipped):
         importlib.import_module(module.name)

@@ -17,7 +17,7 @@ from ..geometry.cameras import point_in_cameras, pose_around, transform
 from ..geometry.viewpoint import up_rotation
 from ..matching.describe import view_mesh
 from ..mesh import has_colours, mesh_centre, mesh_radius, mesh_up
-from ..mesh.colours import surface_colours
+from ..mesh.colours import colours_at, surface_colours
 from ..mesh.edges import simplified
 from ..mesh.mesh import cached_in_mesh
 from ..synthetic import procedural_background, random_pose, synthesize_photograph
@@ -134,7 +134,7 @@ def photographed_mesh(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     simple = trimesh.Trimesh(vertices + centre, faces, process=False)
     points, owners = trimesh.sample.sample_surface(mesh, COLOURED_POINTS, seed=0)
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[owners], points)
-    seen = colours.at(owners, *weights[:, 1:].T)
+    seen = colours_at(colours, owners, *weights[:, 1:].T)
     nearest = cKDTree(points).query(simple.vertices)[1]
     simple.visual.vertex_colors = (255.0 * seen[nearest]).round().astype(np.uint8)
     simple.units = mesh.units

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..geometry import rotation_error
 from ..mesh import has_colours, mesh_symmetries
-from ..mesh.colours import VARIED_BY, VARIED_FRACTION, surface_colours
+from ..mesh.colours import VARIED_BY, VARIED_FRACTION, colours_at, surface_colours
 from ..mesh.mesh import mesh_radius
 from ..rendering.embree import RayScene
 
@@ -98,7 +98,7 @@ class _ColouredPoints:
         found = surface_colours(mesh)
         if found is not None and has_colours(mesh):
             weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], self.points)
-            self.colours = found.at(faces, *weights[:, 1:].T)
+            self.colours = colours_at(found, faces, *weights[:, 1:].T)
         # of points on one and the same surface
         distance, nearest = self.tree.query(self.some, k=2)
         self.spacing = float(distance[:, 1].mean())

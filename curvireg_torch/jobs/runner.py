@@ -21,7 +21,7 @@ from ..errors import (
     MissingFileError,
     WorkerError,
 )
-from ..mesh.files import mesh_digest
+from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
 from ..registration.documents import SCHEMA, line_document, places_document
 from ..registration.result import verdict_of_error

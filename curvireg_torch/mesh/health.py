@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from .source import MeshWarning
+from ..formats.meshes.source import MeshWarning
 
 SAMPLES = 20_000  # Points of the surface that say where it is
 # Parts that together hold less than this fraction of the surface, and lie farther from the rest

@@ -21,16 +21,15 @@ from ..errors import (
     MIN_MESH_EXTENT,
     CurviregWarning,
     MeshError,
-    MissingFileError,
 )
+from ..formats.meshes.files import read_mesh
+from ..formats.meshes.scenes import joined_scene
+from ..formats.meshes.source import MeshWarning
 from ..utils.checks import check_option
-from ..utils.choices import MESHES, UNITS, UP_AXES
+from ..utils.choices import UNITS, UP_AXES
 from ..utils.likes import MeshLike
 from .colours import colours_of_parts
-from .files import read_source
 from .health import precision_warning, stray_faces, stray_warning
-from .scenes import joined_scene
-from .source import MeshSource, MeshWarning
 
 Found = TypeVar("Found")
 
@@ -89,16 +88,7 @@ def load_mesh(
         check_option(unit, UNITS, "unit")
     if up is not None:
         check_option(up, UP_AXES, "up")
-    if not path.is_file():
-        raise MissingFileError("no such file; check the path of the mesh", subject=path)
-    if path.suffix.lower() not in MESHES:
-        raise MeshError(
-            f"expected a mesh file ({', '.join(MESHES)}); convert it first", subject=path
-        )
-    if textures is not None and not Path(textures).is_dir():
-        raise MissingFileError("no such folder; check the folder of the textures", subject=textures)
-    source = MeshSource(path, [] if textures is None else [Path(textures)])
-    found = read_source(source, link)
+    found = read_mesh(path, link=link, textures=textures)
     if unit is not None and found.unit not in (None, unit):
         message = (
             f"the file states its unit, {found.unit}, which is not {unit!r}; leave the unit out"
@@ -106,7 +96,7 @@ def load_mesh(
         raise MeshError(message, subject=path)
     whole = trimesh.Trimesh(found.vertices, found.faces, process=False)
     whole.metadata["colours"] = found.colours
-    whole.metadata["warnings"] = tuple(source.warnings)
+    whole.metadata["warnings"] = found.warnings
     mesh = as_mesh(whole, name=str(path))
     mesh.units = unit or found.unit or found.usual_unit or "m"
     mesh.metadata.update(file_name=path.name, up=up or found.up or format_up(path.suffix))

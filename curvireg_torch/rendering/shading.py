@@ -8,7 +8,7 @@ import torch.nn.functional as F
 import trimesh
 from torch import Tensor
 
-from ..mesh.colours import surface_colours
+from ..mesh.colours import colours_at, surface_colours
 from ..mesh.mesh import as_mesh
 from ..utils.checks import check_camera_matrix, check_image, check_tensor
 from .depth import make_renderer
@@ -61,7 +61,7 @@ def render_colour(
     else:
         face, u, v, depth = faces_at(T, K, fine, orthographic=orthographic)
         visible = face >= 0
-        albedo[visible] = colours.at(face[visible], u[visible], v[visible])
+        albedo[visible] = colours_at(colours, face[visible], u[visible], v[visible])
     picture = shade(depth, K, orthographic=orthographic) * torch.from_numpy(albedo).permute(
         0, 3, 1, 2
     )

@@ -12,10 +12,11 @@ from PIL import Image
 from torch import Tensor
 
 from ..errors import InvalidInputError
-from ..mesh.colours import surface_colours
+from ..mesh.colours import colours_at, surface_colours
 from ..mesh.mesh import mesh_centre, mesh_radius, mesh_unit
 from ..utils.checks import check_camera_matrix, check_photograph, check_pose, check_tensor
 from ..utils.choices import UNITS
+from ..utils.srgb import linear_colours
 from .encoding import jpeg, shrink, to_uint8
 
 _PHOTO_SIDE = 1024
@@ -147,11 +148,12 @@ def _coloured(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         index = np.arange(len(faces), dtype=np.int32)
         zero = np.zeros(len(faces), np.float32)
         corners = [
-            colours.at(index, u, v) for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))
+            colours_at(colours, index, u, v)
+            for u, v in ((zero, zero), (zero + 1, zero), (zero, zero + 1))
         ]
         rgb = np.stack(corners, axis=1)
     # From sRGB: the vertex colours of glTF are linear.
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    linear = linear_colours(rgb)
     rgba = np.full((*faces.shape, 4), 255, np.uint8)
     rgba[..., :3] = (linear * 255).round()
     plain.visual = trimesh.visual.ColorVisuals(plain, vertex_colors=rgba.reshape(-1, 4))

@@ -1,4 +1,4 @@
-"""Where the real photographs lie, if this checkout has them beside it."""
+"""Where the cases of users lie, and the real photographs, if this checkout has them beside it."""
 
 import os
 from pathlib import Path
@@ -17,10 +17,9 @@ def real_data(name: str) -> Path:
 
 
 def real_case(name: str) -> Path:
-    """The folder ``name`` of the shared cases; skips the test where it is absent."""
-    folder = _shared_data().parent / "cases" / name
-    if not folder.is_dir():
-        pytest.skip(f"no files of users: {name} is not in ../shared/cases")
+    """The folder ``name`` of the cases that users reported, in tests/data/cases."""
+    folder = Path(__file__).parents[1] / "data" / "cases" / name
+    assert folder.is_dir(), f"no case {name}"
     return folder
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from curvireg_torch.mesh.colours import SurfaceColours
+from curvireg_torch.mesh.colours import SurfaceColours, colours_at
 
 TEXTURE = np.arange(60, dtype=np.uint8).reshape(4, 5, 3) * 4
 
@@ -12,7 +12,9 @@ def at(uv: tuple[float, float], corners: tuple[int, int, int] = (255, 255, 255))
     coordinates = np.tile(np.array(uv, np.float32), (1, 3, 1))
     colours = SurfaceColours(face, coordinates, np.zeros(1, np.int32), (TEXTURE,))
     third = np.full(1, 1.0 / 3.0, np.float32)
-    found: list[float] = (255.0 * colours.at(np.zeros(1, np.int32), third, third)[0]).tolist()
+    found: list[float] = (
+        255.0 * colours_at(colours, np.zeros(1, np.int32), third, third)[0]
+    ).tolist()
     return found
 
 

@@ -196,7 +196,7 @@ def test_a_degenerate_face_takes_no_colours_away(tmp_path: Path) -> None:
 def test_bytes_of_the_files_beside_a_mesh_are_bounded_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("curvireg_torch.mesh.source.MAX_MESH_BYTES", 1000)
+    monkeypatch.setattr("curvireg_torch.formats.meshes.source.MAX_MESH_BYTES", 1000)
     names = [f"{k}.mtl" for k in range(3)]
     for name in names:
         (tmp_path / name).write_text(f"newmtl m{name}\n# {'x' * 330}\n")

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.mesh import has_colours, load_mesh, surface_colours
+from curvireg_torch.mesh.colours import colours_at
 from curvireg_torch.rendering import make_renderer, render_colour, shade
 
 COLOURS = [
@@ -161,7 +162,7 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
     is_red = mesh.triangles_center[:, 0] > 1.0
     assert is_red.sum() == 12
     centre = np.full(24, 1 / 3, np.float32)
-    found = colours.at(np.arange(24, dtype=np.int32), centre, centre)
+    found = colours_at(colours, np.arange(24, dtype=np.int32), centre, centre)
     np.testing.assert_allclose(found[is_red], np.tile([1.0, 124 / 255, 0.0], (12, 1)), atol=0.005)
     box = textured_box()
     expected = surface_colours(box)
@@ -171,7 +172,7 @@ def test_load_mesh_reads_textures_and_materials(tmp_path: Path, suffix: str) -> 
         [by_centre[tuple(np.round(c, 4))] for c in mesh.triangles_center[~is_red]], np.int32
     )
     np.testing.assert_allclose(
-        found[~is_red], expected.at(match, centre[:12], centre[:12]), atol=0.02
+        found[~is_red], colours_at(expected, match, centre[:12], centre[:12]), atol=0.02
     )
 
 

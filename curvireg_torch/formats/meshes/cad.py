@@ -1,0 +1,273 @@
+"""STEP and IGES files by cascadio, which is OpenCASCADE, and Collada files by pycollada: the extra
+``cad``."""
+
+import tempfile
+import warnings
+import xml.etree.ElementTree as ET
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from ...errors import (
+    MAX_CAD_BYTES,
+    MAX_CAD_MEMORY,
+    MAX_CAD_SECONDS,
+    MAX_MESH_BYTES,
+    MAX_MESH_FACES,
+    MAX_MESH_PARTS,
+    MAX_TEXTURE_PIXELS,
+)
+from ...utils.choices import UNITS
+from ...utils.extras import check_extras
+from ...utils.programs import run_program
+from ..xml_files import check_elements, check_xml, local_name
+from .gltf import read_gltf
+from .scenes import joined_scene
+from .source import MeshSource, ReadMesh, spellings
+
+# Chords of curves may be off by so much of a curve's length, and turn by so many radians: of a
+# cylinder 0.1 % of the radius. Tenfold finer ones change no contour of 256 px.
+LINEAR_TOLERANCE = 0.002
+ANGULAR_TOLERANCE = 0.1
+_PROGRAM = Path(__file__).with_name("step_parts.py")
+IGES_METRES = 1e-3  # OpenCASCADE leaves the triangles of IGES files in mm
+_PREFIXES = {b".MILLI.": "mm", b".CENTI.": "cm", b".DECI.": "dm", b"$": "m"}
+_CONVERSIONS = {b"'INCH'": "in", b"'IN'": "in", b"'FOOT'": "ft", b"'FT'": "ft"}
+_IGES_FLAGS = {b"1": "in", b"2": "mm", b"4": "ft", b"6": "m", b"10": "cm"}
+
+
+def bounded(source: MeshSource) -> bytes:
+    """The content of a file whose reader takes much more memory than the file."""
+    if source.path.stat().st_size > MAX_CAD_BYTES:
+        raise ValueError(
+            f"larger than {MAX_CAD_BYTES:,} bytes; export parts of it, or another format"
+        )
+    return source.data()
+
+
+def read_step(source: MeshSource) -> ReadMesh:
+    """Read a STEP or IGES file: in its own unit where that is one of ``UNITS``, else in metres; z
+    is up."""
+    suffix = source.path.suffix.lower()
+    check_extras([source.path])
+    data = bounded(source)
+    is_iges = suffix in (".igs", ".iges")
+    if not is_iges and not data.lstrip().startswith(b"ISO-10303-21"):
+        raise ValueError("not a STEP file")
+    unit = (iges_unit(data) if is_iges else step_unit(data)) or "m"
+    mesh = read_gltf(source, _converted(source.path.resolve(), "iges" if is_iges else "step"))
+    metres = IGES_METRES if is_iges else 1.0
+    vertices = mesh.vertices * (metres / UNITS[unit])
+    return ReadMesh(vertices, mesh.faces, mesh.colours, unit, "z")
+
+
+def _converted(path: Path, kind: str) -> bytes:
+    """The GLB of a STEP file, in metres, or of an IGES file, in millimetres."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "part.glb")
+        tolerances = [str(LINEAR_TOLERANCE), str(ANGULAR_TOLERANCE)]
+        has_ended_well = run_program(
+            _PROGRAM,
+            [str(path), str(out), kind, *tolerances],
+            name="OpenCASCADE",
+            seconds=MAX_CAD_SECONDS,
+            memory=MAX_CAD_MEMORY,
+            advice="export it as STL or OBJ",
+        )
+        size = out.stat().st_size if out.is_file() else 0
+        if size > MAX_MESH_BYTES:
+            raise ValueError(
+                f"its triangles take more than {MAX_MESH_BYTES:,} bytes; export it as STL or OBJ"
+            )
+        if not has_ended_well or size == 0:
+            raise ValueError(
+                "OpenCASCADE finds no shape in it; the file is damaged, or of another kind"
+            )
+        return out.read_bytes()
+
+
+def step_unit(data: bytes) -> str | None:
+    """The unit of length of a STEP file, None if it is none of ``UNITS``."""
+    units: dict[bytes, str | None] = {}
+    contexts: list[list[bytes]] = []
+    for entity in data.split(b";"):
+        name, equals, content = entity.partition(b"=")
+        if not equals:
+            continue
+        if b"LENGTH_UNIT" in content:
+            units[name.strip()] = _length_unit(content.replace(b" ", b"").upper())
+        _, found, arguments = content.partition(b"GLOBAL_UNIT_ASSIGNED_CONTEXT")
+        if found:
+            contexts.append(
+                arguments.partition(b"))")[0].replace(b"(", b" ").replace(b",", b" ").split()
+            )
+    used = [units[name] for names in contexts for name in names if name in units]
+    return used[0] if used else None
+
+
+def _length_unit(content: bytes) -> str | None:
+    _, found, arguments = content.partition(b"SI_UNIT(")
+    if found:
+        prefix, _, name = arguments.partition(b")")[0].partition(b",")
+        return _PREFIXES.get(prefix) if name == b".METRE." else None
+    _, found, arguments = content.partition(b"CONVERSION_BASED_UNIT(")
+    return _CONVERSIONS.get(arguments.partition(b",")[0]) if found else None
+
+
+def iges_unit(data: bytes) -> str | None:
+    """The unit of length of an IGES file, its 14th global parameter; None if it is none of
+    ``UNITS``."""
+    lines = [line for line in data.splitlines() if line[72:73] == b"G"]
+    text = b"".join(line[:72].ljust(72) for line in lines[:100])
+    separator = b"," if not text.startswith(b"1H") else text[2:3]
+    values: list[bytes] = []
+    while text and len(values) < 14:
+        digits, letter, _ = text.lstrip().partition(b"H")
+        if letter and digits.isdigit() and len(digits) < 5:  # a text, preceded by its length
+            text = text.lstrip()
+            end = len(digits) + 1 + int(digits)
+            value = text[len(digits) + 1 : end]
+            rest = text[end:]
+        else:
+            value, _, rest = text.partition(separator)
+            rest = separator + rest
+        values.append(value.strip())
+        text = rest.lstrip()[1:]
+    return _IGES_FLAGS.get(values[13]) if len(values) == 14 else None
+
+
+class _Pictures(trimesh.resolvers.Resolver):  # type: ignore[misc]
+    """The pictures that a Collada file names, each decoded once and reduced as textures are.
+    trimesh asks for one again for each material, and keeps each answer as a picture of its own."""
+
+    def __init__(self, source: MeshSource) -> None:
+        self._source = source
+        self._answers: dict[str, bytes] = {}
+        self._pixels_left = MAX_TEXTURE_PIXELS
+
+    def get(self, name: str) -> bytes:
+        pixels = self._source.texture_file(*spellings(name.encode(errors="surrogateescape")))
+        if pixels is None:
+            raise ValueError("no such picture")
+        self._pixels_left -= pixels.shape[0] * pixels.shape[1]
+        if self._pixels_left < 0:
+            self._source.warn("texture", "too many materials with textures; some are left out")
+            raise ValueError("too many pictures")
+        if name not in self._answers:
+            file = BytesIO()
+            Image.fromarray(pixels).save(file, "PNG", compress_level=1)
+            self._answers[name] = file.getvalue()
+        return self._answers[name]
+
+    def keys(self) -> list[str]:
+        return []
+
+    def write(self, name: str, data: Any) -> None:
+        raise ValueError("nothing is written")
+
+    def namespaced(self, namespace: str) -> "_Pictures":
+        return self
+
+
+def read_collada(source: MeshSource) -> ReadMesh:
+    """Read a Collada file in its own unit and axes."""
+    check_extras([source.path])
+    data = bounded(source)
+    check_xml(data)
+    check_elements(data)
+    root = ET.fromstring(data)
+    _check_copies(root)
+    stated = {local_name(one): one for one in root.iter() if local_name(one) in ("unit", "up_axis")}
+    metres = float(stated["unit"].get("meter", "1")) if "unit" in stated else None
+    axis = (stated["up_axis"].text or "").strip() if "up_axis" in stated else "Y_UP"
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        scene = trimesh.load(
+            BytesIO(data), file_type="dae", resolver=_Pictures(source), process=False
+        )
+        mesh, colours = joined_scene(scene)
+    for warning in caught:
+        if "texture" in str(warning.message) or "colours" in str(warning.message):
+            source.warn("texture", str(warning.message))
+    if mesh is None:
+        return ReadMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    vertices = np.asarray(mesh.vertices, np.float64)
+    unit = None
+    if metres is not None:
+        unit = next(
+            (name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6), None
+        )
+        if unit is None:
+            vertices = vertices * metres
+            unit = "m"
+    up = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}.get(axis)
+    return ReadMesh(vertices, np.asarray(mesh.faces, np.int64), colours, unit, up)
+
+
+def _check_copies(root: Any) -> None:
+    """Nodes that stand for others, which stand for others: the parts and faces that they unfold to
+    are counted first."""
+    named = {f"#{one.get('id')}": one for one in root.iter() if one.get("id")}
+    nodes = {url: one for url, one in named.items() if local_name(one) == "node"}
+    known: dict[Any, tuple[int, int]] = {}
+    faces_of: dict[str, int] = {}
+
+    def faces(url: str) -> int:
+        if url not in faces_of:
+            own = named.get(url, ())
+            skins = [str(one.get("source")) for one in own if local_name(one) in ("skin", "morph")]
+            shapes = [own, *(named.get(skin, ()) for skin in skins)]
+            faces_of[url] = sum(map(_most_faces, shapes))
+        return faces_of[url]
+
+    def count(node: Any, depth: int) -> tuple[int, int]:
+        if node in known:
+            return known[node]
+        if depth > 200:
+            raise ValueError("its nodes form a circle, or are too deep")
+        found = []
+        for child in node:
+            kind = local_name(child)
+            url = str(child.get("url"))
+            if kind in ("node", "visual_scene", "library_visual_scenes", "library_nodes"):
+                found.append(count(child, depth + 1))
+            elif kind == "instance_node" and url in nodes:
+                found.append(count(nodes[url], depth + 1))
+            elif kind in ("instance_geometry", "instance_controller"):
+                found.append((1, faces(url)))
+        parts = sum(one[0] for one in found)
+        total = sum(one[1] for one in found)
+        known[node] = parts, total
+        if parts > MAX_MESH_PARTS:
+            raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+        if total > MAX_MESH_FACES:
+            raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+        return known[node]
+
+    count(root, 0)
+    for node in nodes.values():
+        count(node, 0)
+
+
+def _most_faces(geometry: Any) -> int:
+    """How many triangles the lists of indices of a geometry can hold."""
+    total = 0
+    for element in (below for child in geometry for below in child.iter()):
+        offsets = [
+            int(child.get("offset", "0")) for child in element if local_name(child) == "input"
+        ]
+        lists = [child.text or "" for child in element if local_name(child) == "p"]
+        if lists:
+            corners = sum(map(_word_count, lists)) // (max(offsets, default=0) + 1)
+            total += corners // 3 if local_name(element) == "triangles" else corners
+    return total
+
+
+def _word_count(text: str) -> int:
+    """``len(text.split())`` without the words, which take much more memory than the text."""
+    is_blank = np.frombuffer(text.encode(), np.uint8) <= ord(" ")
+    return int((is_blank[:-1] & ~is_blank[1:]).sum()) + int(len(is_blank) > 0 and not is_blank[0])

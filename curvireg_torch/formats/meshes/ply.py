@@ -1,0 +1,227 @@
+"""PLY files, as trimesh parses them; which of their properties are coordinates, faces and colours
+is decided here.
+
+Once trimesh reads colours under their other names and of 16 bits, coordinates of corners and several
+textures, and says that a file ends too early, the half of this reader behind its parser can go.
+"""
+
+import re
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from ...errors import MAX_MESH_LINES
+from .colours import SurfaceColours
+from .polygons import triangles_of_faces
+from .source import MeshSource, Pixels, ReadMesh, colour_bytes, spellings
+
+MAX_COLUMNS = 500  # Properties in a header, whose number squared bounds the time
+_COLOURS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
+_COORDINATES = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("s_tex", "t_tex"))
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+_TEXTURE_FILE = re.compile(
+    rb"^comment[ \t]+TextureFile[ \t]+([^\r\n]+)", re.MULTILINE | re.IGNORECASE
+)
+# A name by which trimesh would look for the texture coordinates of triangles, and one that it does
+# not know
+_CORNERS = re.compile(rb"^(property[ \t]+list[ \t]+\w+[ \t]+\w+[ \t]+)texcoord\b", re.MULTILINE)
+_OWN_CORNERS = "corner_uv"
+_REMARK = re.compile(rb"^(?:comment|obj_info)[^\n]*\n", re.MULTILINE)
+
+
+def read_ply(source: MeshSource) -> ReadMesh:
+    """Read a PLY file with the colours of its vertices or faces, or its textures."""
+    data = source.data().removeprefix(b"\xef\xbb\xbf")
+    header, end, body = data.partition(b"end_header")
+    if not end or not header.startswith(b"ply"):
+        raise ValueError("not a PLY file, or its header ends too early")
+    if max(header.count(b"property"), header.count(b"element")) > MAX_COLUMNS:
+        raise ValueError(f"more than {MAX_COLUMNS:,} kinds of rows or columns")
+    names = [name.strip() for name in _TEXTURE_FILE.findall(header)]
+    if b"ascii" in header[:100] and max(body.count(b"\n"), body.count(b"\r")) > MAX_MESH_LINES:
+        raise ValueError(f"more than {MAX_MESH_LINES:,} lines; simplify it")
+    plain = (
+        _REMARK.sub(b"", header.replace(b"\r\n", b"\n")).decode("ascii", errors="replace").encode()
+    )
+    plain = _CORNERS.sub(rb"\1" + _OWN_CORNERS.encode(), plain)
+    body = body.removeprefix(b"\r") if b"ascii" not in header[:100] else body
+    raw = trimesh.exchange.ply.load_ply(
+        BytesIO(plain + end + body), skip_materials=True, fix_texture=False
+    )
+    elements: dict[str, dict[str, Any]] = raw["metadata"]["_ply_raw"]
+    for name, element in elements.items():
+        values = element.get("data")
+        rows = list(values.values()) if isinstance(values, dict) else [values]
+        if element["length"] and any(row is None or len(row) < element["length"] for row in rows):
+            raise ValueError(f"the file ends before the last {name}")
+    points = _Element(elements.get("vertex", {}))
+    if not points.names:
+        return ReadMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    vertices = points.table(("x", "y", "z"))
+    if vertices is None:
+        raise ValueError("its vertices have no x, y and z")
+    polygons = _Element(elements.get("face", {}))
+    if not polygons.names and "tristrips" in elements:
+        raise ValueError("its faces are strips of triangles, which are not read; export triangles")
+    if not polygons.names:
+        return ReadMesh(vertices, np.zeros((0, 3), np.int64))
+    lists = polygons.lists(
+        next((name for name in _FACE_LISTS if name in polygons.names), polygons.names[0])
+    )
+    faces, owner, places = _divided(vertices, lists)
+    return ReadMesh(
+        vertices, faces, _colours(source, points, polygons, names, faces, owner, places)
+    )
+
+
+class _Element:
+    """One kind of rows of the file: its columns by name."""
+
+    def __init__(self, element: dict[str, Any]) -> None:
+        self._data = element.get("data")
+        self.names: list[str] = []
+        if isinstance(self._data, dict):
+            self.names = list(self._data)
+        elif self._data is not None:
+            self.names = list(self._data.dtype.names)
+
+    def table(self, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+        """(N, K) values of some columns, None if one is absent."""
+        if self._data is None or not set(names) <= set(self.names):
+            return None
+        columns = [np.asarray(self._data[name], np.float64).reshape(-1) for name in names]
+        return np.column_stack(columns)
+
+    def colours(self) -> NDArray[np.uint8] | None:
+        """(N, 3) colours under one of the names that exporters use; floating ones are in [0, 1],
+        and those of 16 bits are scaled if they need more than 8."""
+        for names in _COLOURS:
+            values = self.table(names)
+            if values is None or self._data is None:
+                continue
+            stored = np.asarray(self._data[names[0]]).dtype
+            if stored.kind == "f":
+                return colour_bytes(values)
+            is_large = stored == np.uint16 and values.max(initial=0.0) > 255
+            factor = 255.0 / 65535.0 if is_large else 1.0
+            return np.clip(np.nan_to_num(factor * values).round(), 0, 255).astype(np.uint8)
+        return None
+
+    def lists(self, name: str) -> Any:
+        """(N, n) values of a column of lists, or N arrays of several lengths."""
+        if self._data is None:
+            return []
+        values = self._data[name]
+        if isinstance(self._data, dict):
+            return values
+        # trimesh takes the first face's number of corners for that of all
+        if (values["f0"] != values["f1"].shape[1]).any():
+            raise ValueError(
+                "binary faces with different numbers of corners are not read; export triangles"
+            )
+        return values["f1"]
+
+
+def _divided(
+    vertices: NDArray[np.float64], lists: Any
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """(T, 3) triangles, (T,) their faces, and (T, 3) which corners of these they have."""
+    if np.shape(lists)[1:] == (3,):
+        faces = np.asarray(lists).astype(np.int64)
+        return faces, np.arange(len(faces)), np.broadcast_to(np.arange(3), faces.shape)
+    rows = [row.tolist() for row in lists]
+    return triangles_of_faces(vertices, rows)
+
+
+def _colours(
+    source: MeshSource,
+    points: _Element,
+    polygons: _Element,
+    names: list[bytes],
+    faces: NDArray[np.int64],
+    owner: NDArray[np.int64],
+    places: NDArray[np.int64],
+) -> SurfaceColours | None:
+    """Textures first, then colours of faces, then of vertices."""
+    plain = SurfaceColours.plain(len(faces))
+    uv = _coordinates(points, polygons, faces, owner, places) if names else None
+    if uv is not None:
+        pixels = [source.texture_file(*spellings(name)) for name in names]
+        number = polygons.table(("texnumber",))
+        if number is None and len(names) > 1:
+            text = (
+                f"it names {len(names)} textures and does not say which face has which; the "
+                f"first "
+                f"is used"
+            )
+            source.warn("texture", text)
+        texture = (
+            np.zeros(len(faces), np.int32) if number is None else number[owner, 0].astype(np.int32)
+        )
+        if any(found is not None for found in pixels):
+            return _textured(plain, uv, texture, pixels)
+    elif names:
+        source.warn(
+            "texture",
+            "it names a texture and has no texture coordinates; the mesh is shown without it",
+        )
+    colours = polygons.colours()
+    if colours is not None:
+        return SurfaceColours(
+            np.repeat(colours[owner][:, None], 3, axis=1), plain.uv, plain.texture
+        )
+    colours = points.colours()
+    if colours is not None:
+        return SurfaceColours(colours[faces], plain.uv, plain.texture)
+    return None
+
+
+def _textured(
+    plain: SurfaceColours,
+    uv: NDArray[np.float32],
+    texture: NDArray[np.int32],
+    pixels: list[Pixels | None],
+) -> SurfaceColours:
+    used = [k for k, found in enumerate(pixels) if found is not None]
+    number = np.full(len(pixels) + 1, -1, np.int32)
+    number[used] = np.arange(len(used))
+    known = np.where((texture >= 0) & (texture < len(pixels)), texture, len(pixels))
+    return SurfaceColours(
+        plain.corners, uv, number[known], tuple(found for found in pixels if found is not None)
+    )
+
+
+def _coordinates(
+    points: _Element,
+    polygons: _Element,
+    faces: NDArray[np.int64],
+    owner: NDArray[np.int64],
+    places: NDArray[np.int64],
+) -> NDArray[np.float32] | None:
+    """(T, 3, 2) texture coordinates, of the faces' corners or of the vertices."""
+    if _OWN_CORNERS in polygons.names:
+        rows = polygons.lists(_OWN_CORNERS)
+        starts = np.cumsum([0, *map(len, rows)])
+        values = (
+            np.concatenate([np.asarray(row, np.float64) for row in rows])
+            if len(rows)
+            else np.zeros(0)
+        )
+        at = starts[:-1][owner][:, None] + 2 * places
+        if (at + 2 > starts[1:][owner][:, None]).any():
+            raise ValueError("texture coordinates that do not fit the faces")
+        uv = np.stack([values[at], values[at + 1]], axis=-1)
+    else:
+        tables = [points.table(names) for names in _COORDINATES]
+        found = next((table for table in tables if table is not None), None)
+        if found is None:
+            return None
+        uv = found[faces]
+    return np.nan_to_num(uv, posinf=0.0, neginf=0.0).astype(np.float32)

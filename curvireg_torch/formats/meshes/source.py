@@ -1,0 +1,367 @@
+"""What readers of mesh files share: access to the files that a mesh names, its textures, and its
+warnings."""
+
+import os
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import MAX_MESH_BYTES, MAX_MESH_PARTS, MAX_TEXTURE_PIXELS
+from .colours import SurfaceColours, texture_pixels
+
+Pixels = NDArray[np.uint8]
+MOST_WARNINGS = 5  # Of one kind
+# Bytes and parts of a file's name, and bytes of each part: no longer one is that of a file
+MAX_NAME_BYTES = 4096
+MAX_NAME_PARTS = 64
+MAX_PART_BYTES = 255
+
+
+@dataclass(frozen=True)
+class MeshWarning:
+    """What a mesh lacks, or what was changed in it; :func:`read_mesh` returns
+    them.
+
+    Attributes:
+        kind: "texture", "material", "stray", "skin", "precision", "cut", "link" or "parts".
+        text: one sentence, without the name of the file.
+
+    Example:
+        >>> MeshWarning("colours", "the texture 'label.png' is missing").text
+        "the texture 'label.png' is missing"
+    """
+
+    kind: str
+    text: str
+
+
+@dataclass
+class ReadMesh:
+    """A mesh as a reader returns it.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        faces: (F, 3) int64.
+        colours: of its F faces; None without any.
+        unit: the unit that the file itself states, a key of ``UNITS``.
+        up: the axis that the file itself states, or its format prescribes.
+        usual_unit: the unit of files of its format that state none; None where the format says
+            nothing.
+        warnings: what was left out of it.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    colours: SurfaceColours | None = None
+    unit: str | None = None
+    up: str | None = None
+    usual_unit: str | None = None
+    warnings: tuple[MeshWarning, ...] = ()
+
+    def without_unused_vertices(self) -> "ReadMesh":
+        """The same faces without the vertices that none of them names, so that copies stay in
+        proportion to the faces, which are counted."""
+        if self.faces.min(initial=0) < 0:
+            raise IndexError
+        is_used = np.zeros(len(self.vertices), bool)
+        is_used[self.faces] = True
+        if is_used.all():
+            return self
+        number = np.cumsum(is_used) - 1
+        vertices = self.vertices[is_used]
+        return ReadMesh(vertices, number[self.faces], self.colours, self.unit, self.up)
+
+    def transformed(self, T: NDArray[np.float64]) -> "ReadMesh":
+        """The mesh at another place, by a (4, 4) affine transform; mirrored faces are turned
+        over."""
+        vertices = self.vertices @ T[:3, :3].T + T[:3, 3]
+        if np.linalg.det(T[:3, :3]) >= 0.0:
+            return ReadMesh(vertices, self.faces, self.colours, self.unit, self.up)
+        colours = self.colours
+        if colours is not None:
+            colours = SurfaceColours(
+                colours.corners[:, ::-1], colours.uv[:, ::-1], colours.texture, colours.textures
+            )
+        return ReadMesh(vertices, self.faces[:, ::-1], colours, self.unit, self.up)
+
+    @classmethod
+    def joined(
+        cls, parts: Sequence["ReadMesh"], unit: str | None = None, up: str | None = None
+    ) -> "ReadMesh":
+        """One mesh of several, in one unit; parts without colours are white where others have
+        some."""
+        if not parts:
+            return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64), None, unit, up)
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+        vertices = np.concatenate([part.vertices for part in parts])
+        faces = np.concatenate(
+            [part.faces + start for part, start in zip(parts, starts, strict=True)]
+        )
+        colours = None
+        if any(part.colours is not None for part in parts):
+            known = [part.colours or SurfaceColours.plain(len(part.faces)) for part in parts]
+            colours = SurfaceColours.cat(known)
+        return cls(vertices, faces, colours, unit, up)
+
+
+class MeshSource:
+    """A mesh file and the files that it names: those in its folder and below, and in the folders
+    ``extra``.
+
+    Attributes:
+        path: the mesh file.
+        requested: files that the mesh named, existing or not.
+        warnings: what was noticed while it was read.
+    """
+
+    def __init__(self, path: Path, extra: Iterable[Path] = ()) -> None:
+        self.path = path
+        self.folder = path.parent.resolve()
+        self.extra = [folder.resolve() for folder in extra]
+        self.requested: set[Path] = set()
+        self.warnings: list[MeshWarning] = []
+        self._bytes_left = MAX_MESH_BYTES
+        self._pixels_left = MAX_TEXTURE_PIXELS
+        self._textures: dict[object, Pixels | None] = {}
+        self._known_places: dict[str, list[Path]] = {}
+        self._listings: dict[Path, dict[str, str]] = {}
+
+    def data(self) -> bytes:
+        """The content of the mesh file."""
+        if self.path.stat().st_size > MAX_MESH_BYTES:
+            raise ValueError(f"larger than {MAX_MESH_BYTES:,} bytes")
+        return self.path.read_bytes()
+
+    def beside(self, path: Path) -> "MeshSource":
+        """The source of another mesh file that this one names; what it requests and reads counts
+        for this one."""
+        other = MeshSource(path, [self.folder, *self.extra])
+        other.requested = self.requested
+        other._bytes_left = self._bytes_left - path.stat().st_size
+        if other._bytes_left < 0:
+            raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
+        self._bytes_left = other._bytes_left
+        return other
+
+    def warn(self, kind: str, text: str) -> None:
+        """Note a warning, once, and of each kind a few only."""
+        same = [warning for warning in self.warnings if warning.kind == kind]
+        if len(same) == MOST_WARNINGS:
+            text = "and more of this kind"
+        warning = MeshWarning(kind, text)
+        if len(same) <= MOST_WARNINGS and warning not in same:
+            self.warnings.append(warning)
+
+    def has(self, name: str) -> bool:
+        """Whether a name is that of a file that may be read, which is not thereby requested."""
+        return any(self._existing(place) is not None for place in self._places(name))
+
+    def find(self, name: str) -> Path | None:
+        """The file that a mesh names; None if it lies outside of the folders. It may not exist."""
+        inside = self._places(name)
+        if not inside:
+            return None
+        found = next((file for file in map(self._existing, inside) if file is not None), None)
+        self.requested.add(found or inside[0])
+        if len(self.requested) > MAX_MESH_PARTS:
+            raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
+        return found or inside[0]
+
+    def _places(self, name: str) -> list[Path]:
+        """Where in the folders a file of a name may be, existing or not; each name is looked for
+        once, and of names of strangers a bounded number."""
+        if name not in self._known_places:
+            if len(self._known_places) >= MAX_MESH_PARTS:
+                raise ValueError(f"it names more than {MAX_MESH_PARTS:,} files")
+            self._known_places[name] = self._places_of(name)
+        return self._known_places[name]
+
+    def _places_of(self, name: str) -> list[Path]:
+        relative = self._relative_name(name)
+        if relative is None:
+            return []
+        beside = (self.folder / relative).resolve()
+        inside = [beside] if beside.is_relative_to(self.folder) else []
+        for folder in self.extra:
+            places = [beside, (folder / relative).resolve(), (folder / relative.name).resolve()]
+            inside += [
+                place for place in places if place.is_relative_to(folder) and place not in inside
+            ]
+        return inside
+
+    def read(self, name: str) -> bytes:
+        """The content of a file that the mesh needs; ValueError where it cannot be had."""
+        content = self._content(name)
+        if content is None:
+            raise ValueError(f"it names {name[:100]!r}, which is no file of its folder")
+        return content
+
+    def read_optional(self, kind: str, *names: str) -> bytes | None:
+        """The content of the first of several spellings of a file's name that exists; None, with a
+        warning."""
+        for name in names:
+            content = self._content(name)
+            if content is not None:
+                return content
+        first = names[0][:100]
+        if not any(map(is_file_name, names)):
+            self.warn(kind, f"{first} is no name of a file, and is left out")
+        elif any(self._places(name) for name in names):
+            self.warn(
+                kind, f"{first} is missing beside it; the mesh is shown without these colours"
+            )
+        else:
+            text = f"{first} lies outside of its folder and is left out; name its folder (textures)"
+            self.warn(kind, text)
+        return None
+
+    def texture(
+        self, key: object, read_content: Callable[[], bytes | None], name: str
+    ) -> Pixels | None:
+        """The pixels of a picture, read and decoded once for each ``key``; None, with a warning, if
+        it cannot be used."""
+        if key not in self._textures:
+            content = read_content()
+            self._textures[key] = None if content is None else self._decoded(content, name)
+        return self._textures[key]
+
+    def texture_file(self, *names: str) -> Pixels | None:
+        """The pixels of a picture that is named in one of several spellings."""
+        return self.texture(names, lambda: self.read_optional("texture", *names), names[0])
+
+    def _decoded(self, content: bytes, name: str) -> Pixels | None:
+        try:
+            pixels, count = texture_pixels(content, self._pixels_left)
+        except Exception as error:  # decoders raise anything
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            text = (
+                f"the texture {name[:100]} cannot be used ({reason}); its faces are shown in "
+                f"their plain colour"
+            )
+            self.warn("texture", text)
+            return None
+        self._pixels_left -= count
+        return pixels
+
+    def _content(self, name: str) -> bytes | None:
+        path = self.find(name)
+        if path is None or not path.is_file():
+            return None
+        self._bytes_left -= path.stat().st_size
+        if self._bytes_left < 0:
+            raise ValueError(f"the files that it names hold more than {MAX_MESH_BYTES:,} bytes")
+        return path.read_bytes()
+
+    @staticmethod
+    def _relative_name(name: str) -> PurePosixPath | None:
+        """A name as a relative path: backslashes separate folders too, and of absolute names the
+        last part counts."""
+        if "://" in name or not is_file_name(name):
+            return None
+        path = PurePosixPath(name.replace("\\", "/"))
+        is_absolute = path.is_absolute() or ":" in path.parts[0]
+        return PurePosixPath(path.name) if is_absolute else path
+
+    def _existing(self, path: Path) -> Path | None:
+        """The file itself, or one whose name differs in upper and lower case only."""
+        if path.is_file():
+            return path
+        roots = [self.folder, *self.extra]
+        root = next((folder for folder in roots if path.is_relative_to(folder)), None)
+        if root is None:
+            return None
+        place = root
+        for part in path.relative_to(root).parts:
+            name = self._names_in(place).get(part.lower())
+            if name is None:
+                return None
+            place = (place / name).resolve()
+        is_inside = any(place.is_relative_to(folder) for folder in roots)
+        return place if is_inside and place.is_file() else None
+
+    def _names_in(self, folder: Path) -> dict[str, str]:
+        """Names of a folder by their lower case; of several the first in order."""
+        if folder not in self._listings:
+            names = (
+                sorted((entry.name for entry in folder.iterdir()), reverse=True)
+                if folder.is_dir()
+                else []
+            )
+            self._listings[folder] = {name.lower(): name for name in names}
+        return self._listings[folder]
+
+
+def is_file_name(name: str) -> bool:
+    """Whether a name can be that of a file: neither empty nor longer than systems allow."""
+    try:
+        encoded = os.fsencode(name)
+    except UnicodeEncodeError:  # half of a pair of surrogates, as JSON can hold
+        return False
+    if len(encoded) > MAX_NAME_BYTES or b"\0" in encoded or not encoded.strip():
+        return False
+    parts = encoded.replace(b"\\", b"/").split(b"/")
+    return len(parts) <= MAX_NAME_PARTS and max(map(len, parts)) <= MAX_PART_BYTES
+
+
+def spellings(name: bytes) -> tuple[str, ...]:
+    """A file's name in the encodings that exporters write."""
+    found: list[str] = []
+    for encoding in ("utf-8", "gb18030", "cp1252", "latin-1"):
+        try:
+            text = name.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if text not in found:
+            found.append(text)
+    return tuple(found)
+
+
+def plain_text(data: bytes) -> bytes:
+    """A text file without byte-order mark, in an encoding that contains ASCII, with one kind of
+    line end."""
+    for mark, encoding in ((b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if data.startswith(mark):
+            data = data.decode(encoding, errors="replace").encode()
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def colour_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours of vertices that a file writes as numbers, in 0..1 or in 0..255: whole numbers of
+    which some are above 1, or numbers that mostly are, count as the latter. Beyond the range, as
+    of highlights in linear colours, they are clipped; NaN is black."""
+    known = np.nan_to_num(colours, posinf=255.0, neginf=0.0)
+    bright = known[known > 0.0]
+    is_whole = bool((known == known.round()).all()) and bright.max(initial=0.0) > 1.0
+    is_in_bytes = is_whole or (bright.size > 0 and float(np.median(bright)) > 1.0)
+    return np.clip((known * (1.0 if is_in_bytes else 255.0)).round(), 0, 255).astype(np.uint8)
+
+
+def numbers(text: bytes) -> NDArray[np.float64]:
+    """Numbers between blanks; ValueError for anything else."""
+    count = len(text.split())
+    if b"," in text:
+        raise ValueError("decimal commas; export it with decimal points")
+    with warnings.catch_warnings():
+        # of what is no number, which is counted below
+        warnings.simplefilter("ignore", DeprecationWarning)
+        try:
+            values = np.fromstring(text.decode("latin-1"), dtype=np.float64, sep=" ")
+        except ValueError:  # how newer versions of numpy say it
+            values = np.zeros(0)
+    if len(values) != count:
+        raise ValueError("a coordinate is not a number")
+    return values
+
+
+def as_plain_numbers(value: Any, count: int, default: Sequence[float]) -> NDArray[np.float64]:
+    """(count,) numbers of JSON, or the default where None."""
+    values = np.asarray(default if value is None else value, dtype=np.float64)
+    if values.shape != (count,):
+        raise ValueError(f"expected {count} numbers, got {value!r}"[:200])
+    return values

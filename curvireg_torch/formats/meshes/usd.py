@@ -1,0 +1,174 @@
+"""USD and USDZ files by OpenUSD: the extra ``usd``."""
+
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import (
+    MAX_CAD_MEMORY,
+    MAX_CAD_SECONDS,
+    MAX_IMAGE_BYTES,
+    MAX_MESH_BYTES,
+    MAX_MESH_FACES,
+    MAX_MESH_PARTS,
+)
+from ...utils.choices import UNITS
+from ...utils.extras import check_extras
+from ...utils.programs import run_program
+from ...utils.srgb import srgb
+from .cad import bounded
+from .colours import SurfaceColours
+from .polygons import triangles_of_faces
+from .source import MeshSource, Pixels, ReadMesh
+
+_PROGRAM = Path(__file__).with_name("usd_parts.py")
+FALLBACK_UNIT = "cm"  # OpenUSD's, of a stage that states no metersPerUnit
+Arrays = Mapping[str, NDArray[Any]]
+
+
+def read_usd(source: MeshSource) -> ReadMesh:
+    """Read a USD or USDZ file at its first frame, in its own unit and axes; surfaces that are
+    subdivided are taken as they are stored."""
+    check_extras([source.path])
+    bounded(source)
+    about, arrays = _parts_of(source.path.resolve())
+    for name in about["layers"]:
+        source.find(name)
+    if about["left_out"]:
+        kinds = ", ".join(about["left_out"])
+        source.warn("parts", f"parts that are no meshes are left out ({kinds}); export meshes")
+    parts = [_part(source, f"{k}.", part, arrays) for k, part in enumerate(about["parts"])]
+    unit, factor = _unit(about["metres"])
+    mesh = ReadMesh.joined(parts)
+    vertices = mesh.vertices * factor
+    return ReadMesh(vertices, mesh.faces, mesh.colours, unit, about["up"], FALLBACK_UNIT)
+
+
+def _unit(metres: float | None) -> tuple[str | None, float]:
+    """The unit of a length in metres and 1; metres and a factor, if it has no name; None of an
+    unknown one."""
+    if metres is None:
+        return None, 1.0
+    named = [name for name, length in UNITS.items() if abs(metres / length - 1.0) < 1e-6]
+    return (named[0], 1.0) if named else ("m", metres)
+
+
+def _parts_of(path: Path) -> tuple[dict[str, Any], Arrays]:
+    """What OpenUSD finds in a file, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "parts.npz")
+        bounds = [str(MAX_MESH_PARTS), str(MAX_MESH_FACES)]
+        run_program(
+            _PROGRAM,
+            [str(path), str(out), *bounds],
+            name="OpenUSD",
+            seconds=MAX_CAD_SECONDS,
+            memory=MAX_CAD_MEMORY,
+            advice="export it as OBJ or GLB",
+        )
+        if not out.is_file():
+            raise ValueError("OpenUSD cannot read it; it is damaged, or too large")
+        if out.stat().st_size > 4 * MAX_MESH_BYTES:
+            raise ValueError(f"its parts take more than {4 * MAX_MESH_BYTES:,} bytes")
+        with np.load(out, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    about = json.loads(str(arrays["about"]))
+    if "error" in about:
+        raise ValueError(about["error"])
+    return about, arrays
+
+
+def _part(source: MeshSource, key: str, part: dict[str, Any], arrays: Arrays) -> ReadMesh:
+    """One mesh at its place, with its colours."""
+    vertices = arrays[key + "points"]
+    counts = arrays[key + "counts"]
+    starts = np.cumsum(counts) - counts
+    material = arrays[key + "material"]
+    kept = (material >= 0) & (counts > 2)
+    corners = [np.arange(s, s + n) for s, n in zip(starts[kept], counts[kept], strict=True)]
+    indices = arrays[key + "indices"]
+    polygons = [indices[one].tolist() for one in corners]
+    faces, owner, places = triangles_of_faces(vertices, polygons)
+    corner = starts[kept][owner][:, None] + places
+    if part["left_handed"]:
+        faces = faces[:, ::-1]
+        corner = corner[:, ::-1]
+    colours = _colours(source, key, part, arrays, corner, material[kept][owner])
+    mesh = ReadMesh(vertices, faces, colours)
+    return mesh.transformed(np.array(part["place"]))
+
+
+def _colours(
+    source: MeshSource,
+    key: str,
+    part: dict[str, Any],
+    arrays: Arrays,
+    corner: NDArray[np.int64],
+    material: NDArray[np.int64],
+) -> SurfaceColours | None:
+    """Colours of faces by their material, where they have one, else those of the mesh."""
+    own = arrays.get(key + "colour")
+    if own is None and not part["materials"]:
+        return None
+    plain = SurfaceColours.plain(len(corner))
+    tint = np.array(plain.corners)
+    uv = plain.uv.copy()
+    texture = plain.texture.copy()
+    textures: list[Pixels] = []
+    if own is not None:
+        tint = _bytes(own[corner])
+    for number, surface in enumerate(part["materials"], start=1):
+        faces = material == number
+        if "colour" in surface:
+            tint[faces] = _bytes(np.array(surface["colour"]))
+        if surface.get("unread"):
+            source.warn("texture", "a texture is made in a way that is not read; it is left out")
+        pixels = _texture(source, surface) if "texture" in surface else None
+        if pixels is not None:
+            tint[faces] = _tint(source, surface)
+            coordinates = np.nan_to_num(arrays[f"{key}uv{number - 1}"], posinf=0.0, neginf=0.0)
+            uv[faces] = coordinates[corner[faces]]
+            texture[faces] = len(textures)
+            textures.append(pixels)
+    return SurfaceColours(tint, uv, texture, tuple(textures))
+
+
+def _tint(source: MeshSource, surface: dict[str, Any]) -> NDArray[np.uint8]:
+    """(3,) what the colours of a texture are multiplied by."""
+    scale = np.array(surface.get("scale", (1.0, 1.0, 1.0)))
+    if scale.max() > 1.0 or any(surface.get("bias", ())):
+        source.warn("texture", "a texture is made brighter by scale or bias: read without")
+    return _bytes(scale)
+
+
+def _bytes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.round(255.0 * srgb(linear)).astype(np.uint8)
+
+
+def _texture(source: MeshSource, surface: dict[str, Any]) -> Pixels | None:
+    """The pixels of a texture: a file beside the mesh, or in a package."""
+    name = str(surface["texture"])
+    inner = str(surface["inner"])
+    beside = os.path.relpath(Path(surface["file"]).resolve(), source.folder)
+    if not inner:
+        names = [beside, name] if os.path.isabs(name) else [beside]
+        return source.texture_file(*names)
+    package = source.find(beside)
+
+    def read_content() -> bytes | None:
+        if package is not None and package.is_file():
+            with zipfile.ZipFile(package) as archive:
+                sizes = {one.filename: one.file_size for one in archive.infolist()}
+                if sizes.get(inner, MAX_IMAGE_BYTES + 1) <= MAX_IMAGE_BYTES:
+                    return archive.read(inner)
+        source.warn("texture", f"{name[:100]} is missing in it; its faces have no colours")
+        return None
+
+    return source.texture((package, inner), read_content, name)

@@ -1,0 +1,3 @@
+"""What tests of meshes share."""
+
+from tests._support.meshes import load as load

@@ -1,0 +1,599 @@
+"""STEP, IGES, Collada, 3MF and URDF files, which are generated."""
+
+import json
+import math
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError, MissingDependencyError
+from curvireg_torch.formats.meshes import cad
+from curvireg_torch.formats.meshes.files import mesh_files
+from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
+from curvireg_torch.utils import extras
+from curvireg_torch.utils.extras import is_installed
+from tests.formats.meshes.step import iges_file, step_file
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+BOX = trimesh.creation.box((30.0, 20.0, 10.0))
+
+
+def needs(package: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(not is_installed(package), reason=f"{package} is not installed")
+
+
+@needs("cascadio")
+@pytest.mark.parametrize(("unit", "suffix"), [("cm", "step"), ("in", "STP")])
+def test_step_files_keep_their_unit_and_axes(
+    tmp_path: Path, load: Load, unit: str, suffix: str
+) -> None:
+    path = tmp_path / f"part.{suffix}"
+    path.write_text(step_file((3.0, 2.0, 1.0), unit))
+    mesh, texts = load(path)
+    assert (mesh.units, mesh_up(mesh), texts) == (unit, "z", [])
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]], atol=1e-6)
+    assert mesh.volume == pytest.approx(6.0, rel=1e-6)
+    with pytest.raises(
+        MeshError, match=f"the file states its unit, {unit}, which is not 'dm'; leave the unit out"
+    ):
+        cr.load_mesh(path, unit="dm")
+
+
+@needs("cascadio")
+@pytest.mark.parametrize(("flag", "name", "unit"), [(2, "MM", "mm"), (1, "IN", "in")])
+def test_iges_files_keep_their_unit(
+    tmp_path: Path, load: Load, flag: int, name: str, unit: str
+) -> None:
+    (tmp_path / "part.igs").write_text(iges_file((3.0, 2.0), flag, name))
+    mesh, _ = load(tmp_path / "part.igs")
+    assert mesh.units == unit
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 0]], atol=1e-5)
+
+
+@needs("cascadio")
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"ISO-10303-21;\n",
+        b"nothing",
+        step_file((3, 2, 1), "mm").encode()[:900],
+        b"ISO-10303-21;" * 999,
+    ],
+)
+def test_damaged_step_files_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "part.step").write_bytes(content)
+    with pytest.raises(MeshError, match=r"part\.step: cannot be read as a mesh"):
+        cr.load_mesh(tmp_path / "part.step")
+
+
+@needs("cascadio")
+def test_step_files_are_bounded_in_size_and_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "part.step"
+    path.write_text(step_file((3.0, 2.0, 1.0), "mm"))
+    for name, value, match in (
+        ("MAX_CAD_BYTES", 99, "larger than 99 bytes"),
+        ("MAX_MESH_BYTES", 99, "more than 99 bytes"),
+        ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
+    ):
+        monkeypatch.setattr(cad, name, value)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path)
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "package"), [("step", "cascadio"), ("igs", "cascadio"), ("dae", "collada")]
+)
+def test_the_message_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, package: str
+) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    (tmp_path / f"a.{suffix}").write_text("a part")
+    with pytest.raises(MissingDependencyError, match=package) as caught:
+        cr.load_mesh(tmp_path / f"a.{suffix}")
+    assert "pip install 'curvireg_torch[cad]', in a checkout pip install -e '.[cad]'" in str(
+        caught.value
+    )
+    assert f"a.{suffix}: " in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_extra_is_loaded_only_when_needed(tmp_path: Path) -> None:
+    BOX.export(tmp_path / "a.stl")
+    code = "import sys, curvireg_torch as cr; cr.load_mesh(sys.argv[1], unit='mm'); "
+    code += "print('collada' in sys.modules)"  # trimesh itself imports cascadio
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "a.stl"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize(
+    ("parameters", "unit"),
+    [
+        (
+            "1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,4Hpart,1.,2,2HMM,1,0.01,15H20260101.000000,",
+            "mm",
+        ),
+        ("1H,,1H;,4Hpart,8Hpa,t.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,1,4HINCH,1,0.01,", "in"),
+        (",,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,6,1HM,1,", "m"),
+        ("1H/,1H;,4Hpart/8Hpart.igs/3Hcad/3H1.0/32/38/6/308/15//1./10/2HCM/", "cm"),
+        ("1H,,1H;,4Hpart,8Hpart.igs,3Hcad,3H1.0,32,38,6,308,15,,1.,9,2HUM,", None),
+        ("", None),
+        ("9999H", None),
+    ],
+)
+def test_the_unit_of_an_iges_file(parameters: str, unit: str | None) -> None:
+    lines = [f"{'part':<72}S      1", *_records(parameters)]
+    assert cad.iges_unit("\n".join(lines).encode()) == unit
+
+
+def _records(text: str) -> list[str]:
+    return [f"{text[k : k + 72]:<72}G{k // 72 + 1:7d}" for k in range(0, len(text), 72)]
+
+
+@pytest.mark.parametrize("prefix", [".MILLI.", ".MICRO.", "$"])
+def test_the_unit_of_a_step_file_is_that_of_its_context(prefix: str) -> None:
+    """The base of a converted unit is none itself."""
+    text = step_file((3.0, 2.0, 1.0), "in")
+    assert cad.step_unit(text.encode()) == "in"
+    text = step_file((3.0, 2.0, 1.0), "mm").replace(".MILLI.", prefix)
+    assert cad.step_unit(text.encode()) == {".MILLI.": "mm", "$": "m"}.get(prefix)
+    assert cad.step_unit(b"") is None
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset>{asset}</asset>
+<library_images><image id="im"><init_from>{image}</init_from></image></library_images>
+<library_effects><effect id="fx"><profile_COMMON>
+<newparam sid="surf"><surface type="2D"><init_from>im</init_from></surface></newparam>
+<newparam sid="samp"><sampler2D><source>surf</source></sampler2D></newparam>
+<technique sid="t"><lambert><diffuse><texture texture="samp" texcoord="UV"/></diffuse></lambert></technique>
+</profile_COMMON></effect></library_effects>
+<library_materials><material id="mat"><instance_effect url="#fx"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="pa" count="9">0 0 0 4 0 0 0 2 0</float_array><technique_common>
+<accessor source="#pa" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<source id="u"><float_array id="ua" count="6">0 0 1 0 0 1</float_array><technique_common>
+<accessor source="#ua" count="3" stride="2"><param name="S" type="float"/><param name="T" type="float"/></accessor>
+</technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="1" material="m"><input semantic="VERTEX" source="#v" offset="0"/>
+<input semantic="TEXCOORD" source="#u" offset="1"/><p>0 0 1 1 2 2</p></triangles></mesh></geometry></library_geometries>
+<library_nodes>{nodes}</library_nodes>
+<library_visual_scenes><visual_scene id="s"><node><translate>10 0 0</translate><instance_geometry url="#g">
+<bind_material><technique_common><instance_material symbol="m" target="#mat"/></technique_common></bind_material>
+</instance_geometry>{more}</node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>
+"""  # noqa: E501
+
+
+def collada(asset: str = "", image: str = "label.png", nodes: str = "", more: str = "") -> str:
+    return COLLADA.format(asset=asset, image=image, nodes=nodes, more=more)
+
+
+@needs("collada")
+@pytest.mark.parametrize(
+    ("asset", "unit", "up", "scale"),
+    [
+        ('<unit name="inch" meter="0.0254"/><up_axis>Z_UP</up_axis>', "in", "z", 1.0),
+        ('<unit meter="0.001"/>', "mm", "y", 1.0),
+        ('<unit meter="0.05"/><up_axis>X_UP</up_axis>', "m", "x", 0.05),
+        ("", "m", "y", 1.0),
+    ],
+)
+def test_collada_files_keep_their_unit_and_axes(
+    tmp_path: Path, load: Load, asset: str, unit: str, up: str, scale: float
+) -> None:
+    (tmp_path / "a.dae").write_text(collada(asset))
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "label.png")
+    mesh, texts = load(tmp_path / "a.dae")
+    assert (mesh.units, mesh_up(mesh), texts) == (unit, up, [])
+    np.testing.assert_allclose(mesh.bounds, np.array([[10, 0, 0], [14, 2, 0]]) * scale, atol=1e-6)
+    colours = surface_colours(mesh)
+    assert colours is not None
+    np.testing.assert_array_equal(colours.textures[0], pixels)
+    np.testing.assert_allclose(colours.uv[0], [[0, 0], [1, 0], [0, 1]], atol=1e-6)
+    assert tmp_path / "label.png" in mesh_files(tmp_path / "a.dae")
+
+
+@needs("collada")
+def test_collada_names_textures_that_it_cannot_use(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "label.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n")
+    for image, match in (
+        ("no.png", "no.png is missing"),
+        ("../x.png", "lies outside"),
+        ("label.png", "not an image"),
+    ):
+        (tmp_path / "a.dae").write_text(collada(image=image))
+        mesh, texts = load(tmp_path / "a.dae")
+        assert not has_colours(mesh)
+        assert match in " ".join(texts)
+
+
+@needs("collada")
+def test_hostile_collada_files_are_refused(tmp_path: Path) -> None:
+    nodes = "".join(
+        f'<node id="n{k}">' + f'<instance_node url="#n{k + 1}"/>' * 10 + "</node>"
+        for k in range(20)
+    )
+    nodes += '<node id="n20"><instance_geometry url="#g"/></node>'
+    circle = '<node id="n0"><instance_node url="#n0"/></node>'
+    more = '<instance_node url="#n0"/>'
+    entity = collada().replace("<COLLADA", '<!DOCTYPE x [<!ENTITY a "aaaa">]>\n<COLLADA', 1)
+    for text, match in (
+        (collada(nodes=nodes, more=more), "more than 10,000 parts"),
+        (collada(nodes=circle, more=more), "form a circle"),
+        (entity, "document type"),
+        ("<COLLADA>", "cannot be read"),
+        ("", "cannot be read"),
+    ):
+        (tmp_path / "a.dae").write_text(text)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(tmp_path / "a.dae")
+    (tmp_path / "a.dae").write_bytes(
+        entity.replace('version="1.0"', 'version="1.0" encoding="utf-16"').encode("utf-16")
+    )
+    with pytest.raises(MeshError, match="document type"):
+        cr.load_mesh(tmp_path / "a.dae")
+
+
+def threemf(
+    path: Path,
+    resources: str,
+    items: str,
+    *,
+    unit: str = 'unit="inch"',
+    more: dict[str, bytes] | None = None,
+) -> Path:
+    namespace = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    text = (
+        f'<?xml version="1.0"?><model {unit} xmlns="{namespace}" xmlns:m="materials" '
+        f'xmlns:p="production">'
+    )
+    text += f"<resources>{resources}</resources><build>{items}</build></model>"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/3dmodel.model", text)
+        for name, content in (more or {}).items():
+            archive.writestr(name, content)
+    return path
+
+
+def solid(number: int, attributes: str = "", triangle: str = "") -> str:
+    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in BOX.vertices)
+    faces = "".join(
+        f'<triangle v1="{a}" v2="{b}" v3="{c}" {triangle if k < 6 else ""}/>'
+        for k, (a, b, c) in enumerate(BOX.faces)
+    )
+    mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
+    return f'<object id="{number}" type="model" {attributes}>{mesh}</object>'
+
+
+def test_threemf_names_shapes_that_are_left_out(tmp_path: Path, load: Load) -> None:
+    lattice = "<b:beamlattice><b:beams/></b:beamlattice></mesh>"
+    resources = solid(1).replace("</mesh>", lattice).replace("<object", '<object xmlns:b="beams"')
+    mesh, texts = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
+    assert len(mesh.faces) == 12
+    assert texts == [
+        f"{tmp_path / 'a.3mf'}: it has parts that are not read (beamlattice): left out"
+    ]
+
+
+def test_threemf_places_objects_and_their_components(tmp_path: Path, load: Load) -> None:
+    components = (
+        '<component objectid="1" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/><component objectid="1"/>'
+    )
+    resources = solid(1) + f'<object id="2"><components>{components}</components></object>'
+    items = '<item objectid="2" transform="1 0 0 0 1 0 0 0 1 0 0 5"/>'
+    mesh, texts = load(threemf(tmp_path / "a.3mf", resources, items))
+    assert (mesh.units, mesh_up(mesh), len(mesh.faces), texts) == ("in", "z", 24, [])
+    np.testing.assert_allclose(mesh.bounds, [[-15, -15, 0], [110, 15, 10]])
+    assert mesh.volume == pytest.approx(2 * 6000)
+    with pytest.raises(MeshError, match="states its unit, in"):
+        cr.load_mesh(tmp_path / "a.3mf", unit="mm")
+    for unit, name, scale in (
+        ("", "mm", 1.0),
+        ('unit="micron"', "mm", 1e-3),
+        ('unit="meter"', "m", 1.0),
+    ):
+        mesh, _ = load(threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>', unit=unit))
+        assert (mesh.units, mesh.extents[0]) == (name, pytest.approx(30.0 * scale))
+
+
+def test_threemf_leaves_out_what_is_not_the_object(tmp_path: Path, load: Load) -> None:
+    """Supports, items that are not printed, and copies on the build plate."""
+    resources = solid(1) + solid(2).replace('type="model"', 'type="support"')
+    resources += solid(3).replace('type="model"', 'type="solidsupport"') + solid(4)
+    move = 'transform="1 0 0 0 1 0 0 0 1 {} 0 0"'
+    items = f'<item objectid="1" {move.format(50)}/>'
+    more = "".join(f'<item objectid="{k}" {move.format(500)}/>' for k in (1, 2, 3))
+    path = tmp_path / "a.3mf"
+    mesh, texts = load(threemf(path, resources, items + more))
+    assert mesh.bounds[:, 0].tolist() == [35, 65]
+    assert [text.removeprefix(f"{path}: ") for text in texts] == [
+        "supports of the print are left out",
+        "further copies of its objects on the build plate are left out (1)",
+    ]
+    for flag in ("0", "false"):
+        mesh, texts = load(
+            threemf(path, resources, items + f'<item objectid="4" printable="{flag}"/>')
+        )
+        assert len(mesh.faces) == 12
+        assert "items that are not printed" in texts[0]
+    mesh, texts = load(threemf(path, resources, items + '<item objectid="4" printable="1"/>'))
+    assert len(mesh.faces) == 24
+    assert "2 objects on its build plate are read as one rigid body" in texts[0]
+
+
+def test_threemf_reads_colours_and_textures(tmp_path: Path, load: Load) -> None:
+    base = (
+        '<basematerials id="5"><base name="a" displaycolor="#FF0000"/><base name="b" '
+        'displaycolor="#0000FFFF"/>'
+    )
+    resources = f"{base}</basematerials>" + solid(1, 'pid="5" pindex="1"', 'pid="5" p1="0"')
+    mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert (colours.corners[:6] == [255, 0, 0]).all()
+    assert (colours.corners[6:] == [0, 0, 255]).all()
+    group = (
+        '<m:colorgroup id="6"><m:color color="#00FF00"/><m:color color="#000000"/></m:colorgroup>'
+    )
+    mesh, _ = load(
+        threemf(
+            tmp_path / "a.3mf",
+            group + solid(1, "", 'pid="6" p1="0" p2="1" p3="0"'),
+            '<item objectid="1"/>',
+        )
+    )
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert colours.corners[0].tolist() == [[0, 255, 0], [0, 0, 0], [0, 255, 0]]
+    pixels = np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    texture = (
+        '<m:texture2d id="7" path="/3D/a.png" contenttype="image/png"/><m:texture2dgroup '
+        'id="8" '
+        'texid="7">'
+    )
+    texture += (
+        '<m:tex2coord u="0" v="0"/><m:tex2coord u="1" v="0"/><m:tex2coord u="0" '
+        'v="1"/></m:texture2dgroup>'
+    )
+    resources = texture + solid(1, "", 'pid="8" p1="0" p2="1" p3="2"')
+    pictures = {"3D/a.png": (tmp_path / "a.png").read_bytes()}
+    mesh, texts = load(
+        threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=pictures)
+    )
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert not texts
+    np.testing.assert_array_equal(colours.textures[0], pixels)
+    assert colours.uv[0].tolist() == [[0, 0], [1, 0], [0, 1]]
+    assert (
+        "/3D/a.png is missing"
+        in load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))[1][0]
+    )
+    other = solid(1, "", 'pid="9" p1="0"')
+    assert (
+        "of a kind that is not read"
+        in load(threemf(tmp_path / "a.3mf", other, '<item objectid="1"/>'))[1][0]
+    )
+
+
+def test_threemf_of_several_models(tmp_path: Path, load: Load) -> None:
+    inner = threemf(tmp_path / "inner.3mf", solid(3), "")
+    with zipfile.ZipFile(inner) as archive:
+        content = archive.read("3D/3dmodel.model")
+    resources = (
+        '<object id="1"><components><component p:path="/3D/Objects/a.model" '
+        'objectid="3"/></components></object>'
+    )
+    more = {"3D/Objects/a.model": content}
+    mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>', more=more))
+    assert mesh.extents.tolist() == [30.0, 20.0, 10.0]
+
+
+def test_hostile_threemf_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.3mf"
+    circle = '<object id="1"><components><component objectid="1"/></components></object>'
+    many = "".join(
+        f'<object id="{k}"><components>{f"""<component objectid="{k + 1}"/>""" * 10}</components></object>'  # noqa: E501
+        for k in range(1, 9)
+    )
+    item = '<item objectid="1"/>'
+    for resources, items, match in (
+        (circle, item, "circle"),
+        (many + solid(9), item, "more than 10,000 parts"),
+        (solid(1), '<item objectid="7"/>', "which it lacks"),
+        (solid(1), '<item objectid="1" transform="1 2 3"/>', "12 numbers"),
+        (solid(1).replace('v1="0"', 'v1="99"'), item, "a vertex that the file lacks"),
+        (solid(1).replace('v1="0"', 'v1="-1"'), item, "a vertex that the file lacks"),
+        (solid(1).replace('x="', 'x="x'), item, "cannot be read"),
+        ("<object", item, "damaged XML"),
+    ):
+        threemf(path, resources, items)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path)
+    path.write_bytes(b"PK\3\4 no archive")
+    with pytest.raises(MeshError, match="no zip archive"):
+        cr.load_mesh(path)
+    threemf(path, solid(1), item, unit='unit="mile"')
+    with pytest.raises(MeshError, match="its unit 'mile' is unknown"):
+        cr.load_mesh(path)
+    threemf(path, solid(1) + " " * 1_000_000, item)
+    assert path.stat().st_size < 10_000
+    monkeypatch.setattr("curvireg_torch.formats.meshes.threemf.MAX_MESH_BYTES", 500_000)
+    with pytest.raises(MeshError, match="unpacks to more than 500,000 bytes"):
+        cr.load_mesh(path)
+
+
+ROBOT = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></material>
+<link name="base"><visual><geometry><mesh filename="{base}"/></geometry><material name="blue"/></visual></link>
+<link name="tip"><visual><origin xyz="0 0 0.5" rpy="0 0 1.5707963267948966"/><geometry><mesh filename="meshes/tip.ply"
+scale="0.01 0.01 0.01"/></geometry></visual></link>
+<link name="ball"><visual><geometry><sphere radius="0.25"/></geometry></visual></link>
+<joint name="j" type="revolute"><parent link="base"/><child link="tip"/><origin xyz="1 0 0"
+rpy="0 1.5707963267948966 0"/></joint>
+<joint name="k" type="fixed"><parent link="tip"/><child link="ball"/><origin xyz="0 0 2"/></joint></robot>
+"""  # noqa: E501
+
+
+def robot(folder: Path, base: str = "package://arm/meshes/base.stl") -> Path:
+    (folder / "meshes").mkdir(exist_ok=True, parents=True)
+    trimesh.creation.box((3.0, 2.0, 1.0)).export(folder / "meshes" / "base.stl")
+    BOX.export(folder / "meshes" / "tip.ply")
+    path = folder / "arm.urdf"
+    path.write_text(ROBOT.format(base=base))
+    return path
+
+
+def test_urdf_gives_all_links_with_the_joints_at_zero(tmp_path: Path, load: Load) -> None:
+    mesh, texts = load(robot(tmp_path))
+    assert (mesh.units, mesh_up(mesh), texts) == ("m", "z", [])
+    # The tip's box of 0.3 x 0.2 x 0.1 is turned about z, lies 0.5 along z, and z is turned to x.
+    np.testing.assert_allclose(mesh.bounds[0], [-1.5, -1.0, -0.5], atol=1e-6)
+    assert mesh.bounds[1][0] == pytest.approx(3.25, abs=0.01)
+    tip, _ = load(tmp_path / "arm.urdf", link="tip")
+    np.testing.assert_allclose(tip.bounds, [[-0.1, -0.15, 0.45], [0.1, 0.15, 0.55]], atol=1e-6)
+    names = {path.name for path in mesh_files(tmp_path / "arm.urdf")}
+    assert names == {"arm.urdf", "base.stl", "tip.ply"}
+    colours = surface_colours(mesh)
+    assert colours is not None
+    assert (colours.corners[:12] == [0, 0, 255]).all()
+    with pytest.raises(MeshError, match=r"no link 'hand'; it has base, tip, ball"):
+        cr.load_mesh(tmp_path / "arm.urdf", link="hand")
+    with pytest.raises(MeshError, match="only a URDF has links"):
+        cr.load_mesh(tmp_path / "meshes" / "base.stl", link="tip")
+
+
+def test_urdf_names_meshes_that_it_does_not_find(tmp_path: Path, load: Load) -> None:
+    path = robot(tmp_path / "urdf", "package://arm/other/base.stl")
+    assert "other/base.stl is missing in its folder" in load(path)[1][0]
+    (tmp_path / "other").mkdir()
+    trimesh.creation.box((3.0, 2.0, 1.0)).export(tmp_path / "other" / "base.stl")
+    mesh, texts = load(path, textures=tmp_path)
+    assert not texts
+    assert mesh.bounds[0][0] == pytest.approx(-1.5)
+
+
+@pytest.mark.parametrize(
+    ("place", "names_package", "is_found"),
+    [
+        ("arm_description/urdf", True, True),
+        ("arm_description/robots", True, True),
+        ("arm_description/robots", False, False),
+        ("arm_description/other", True, False),
+        ("arm_description/other", "package.xml", True),
+        ("other/urdf", True, False),
+    ],
+)
+def test_meshes_of_a_package_are_found_from_its_folder_urdf(
+    tmp_path: Path, load: Load, place: str, names_package: bool | str, is_found: bool
+) -> None:
+    folder = tmp_path / place
+    folder.mkdir(parents=True)
+    (folder.parent / "meshes").mkdir()
+    trimesh.creation.box((3.0, 2.0, 1.0)).export(folder.parent / "meshes" / "base.stl")
+    if names_package == "package.xml":
+        (folder.parent / "package.xml").write_text("<package/>")
+    name = "package://arm_description/meshes/base.stl" if names_package else "meshes/base.stl"
+    shape = f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+    path = folder / "arm.urdf"
+    path.write_text(f'<robot name="r"><link name="l">{shape}</link></robot>')
+    if is_found:
+        assert load(path)[0].extents.tolist() == [3.0, 2.0, 1.0]
+        return
+    text = rf"the meshes that it names are missing in its folder \({name}\); name their folder"
+    with pytest.raises(MeshError, match=text):
+        cr.load_mesh(path)
+
+
+def test_hostile_urdf_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = robot(tmp_path)
+    text = path.read_text()
+    joint = '<joint name="l" type="fixed"><parent link="ball"/><child link="base"/></joint></robot>'
+    for changed, match in (
+        (text.replace("</robot>", joint), "joints form a circle"),
+        (text.replace("<robot", "<!DOCTYPE robot><robot"), "document type"),
+        (text.replace("robot", "xacro"), "no robot in it"),
+        (text.replace('xyz="1 0 0"', 'xyz="1 nan 0"'), "expected 3 numbers"),
+        (text.replace('radius="0.25"', ""), "expected 1 numbers"),
+        (text.replace("meshes/tip.ply", "arm.urdf"), "names a URDF as a mesh"),
+        ("<robot>", "cannot be read"),
+    ):
+        path.write_text(changed)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path)
+    path.write_text(text)
+    monkeypatch.setattr("curvireg_torch.formats.meshes.urdf.MAX_MESH_FACES", 20)
+    with pytest.raises(MeshError, match="faces; leave some out"):
+        cr.load_mesh(path)
+
+
+def test_a_mirrored_part_keeps_its_outside(tmp_path: Path) -> None:
+    path = robot(tmp_path)
+    path.write_text(path.read_text().replace('scale="0.01 0.01 0.01"', 'scale="0.01 -0.01 0.01"'))
+    assert cr.load_mesh(path, link="tip").volume == pytest.approx(0.006)
+
+
+@pytest.mark.slow
+@needs("cascadio")
+def test_register_takes_the_unit_of_a_step_file(tmp_path: Path) -> None:
+    """As a user does: a photograph, a STEP file and a box; the mesh is in the file's
+    millimetres."""
+    from curvireg_torch.cli import main
+
+    (tmp_path / "part.step").write_text(step_file((60.0, 40.0, 25.0), "mm"))
+    mesh = cr.load_mesh(tmp_path / "part.step")
+    T = np.eye(4)
+    T[:3, :3] = cr.rotation_from_viewpoint(35.0, 30.0, 0.0).numpy()
+    T[:3, 3] = np.array([0.0, 0.0, 300.0]) - T[:3, :3] @ mesh.bounds.mean(axis=0)
+    K = cr.camera_matrix(900.0, 900.0, 319.5, 239.5)
+    import torch
+
+    pose = torch.from_numpy(T)
+    picture = cr.rendering.render_colour(mesh, pose, K, (480, 640))[0].permute(1, 2, 0).numpy()
+    depth = cr.render_depth(mesh, pose, K, (480, 640))[0, 0].numpy()
+    picture[depth == 0] = 0.25
+    Image.fromarray((255 * picture).astype(np.uint8)).save(tmp_path / "photo.png")
+    rows, columns = (depth > 0).nonzero()
+    box = [columns.min(), rows.min(), columns.max(), rows.max()]
+    words = [
+        "register",
+        str(tmp_path / "photo.png"),
+        str(tmp_path / "part.step"),
+        "--preset",
+        "fast",
+        "--quiet",
+    ]
+    words += [
+        "--box",
+        *map(str, box),
+        "--camera",
+        "900",
+        "900",
+        "319.5",
+        "239.5",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(words) in (None, 0)
+    document: dict[str, Any] = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert document["unit"] == "mm"
+    assert document["translation"][2] == pytest.approx(T[2, 3], rel=0.2)
+    assert math.isclose(document["translation"][2], 300, rel_tol=0.3)

@@ -1,0 +1,385 @@
+"""Small files cannot make a reader work or hold much: what grows, and with what, is counted."""
+
+import base64
+import json
+import tracemalloc
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.formats.meshes import cad, colours, files, gltf, source, threemf, usd
+from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, is_file_name
+from curvireg_torch.utils.extras import is_installed
+from curvireg_torch.utils.programs import run_program
+from tests.formats.meshes.step import step_file
+from tests.formats.meshes.test_cad import collada
+from tests.formats.meshes.test_cad import threemf as write_threemf
+from tests.formats.meshes.test_hostile_meshes import tree
+
+UNUSED = 100_000  # vertices
+
+
+def resolved(monkeypatch: pytest.MonkeyPatch, path: Path) -> int:
+    """How many paths are resolved while a mesh is read."""
+    resolve = Path.resolve
+    count = 0
+
+    def counted(self: Path, strict: bool = False) -> Path:
+        nonlocal count
+        count += 1
+        return resolve(self, strict)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "resolve", counted)
+        files.read_source(MeshSource(path))
+    return count
+
+
+def peak(path: Path) -> int:
+    """The most bytes that are held while a mesh is read."""
+    tracemalloc.start()
+    files.read_source(MeshSource(path))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return most
+
+
+def robot(path: Path, *visuals: str) -> Path:
+    shapes = "".join(f"<visual><geometry>{one}</geometry></visual>" for one in visuals)
+    path.write_text(f'<robot name="r"><link name="l">{shapes}</link></robot>')
+    return path
+
+
+def test_names_of_urdf_are_looked_for_by_a_bounded_number_of_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = []
+    for parts in (10, 20, 1000, 2000):
+        mesh = f'<mesh filename="package://{"a/" * parts}b.stl"/>'
+        path = robot(tmp_path / "a.urdf", '<box size="1 1 1"/>', mesh, mesh)
+        counts.append(resolved(monkeypatch, path))
+    few, twice, many, most = counts
+    assert many == most < few < twice <= 2 * few
+    assert twice < 30
+    visuals = [f'<mesh filename="package://{k}/b.stl"/>' for k in range(60)]
+    path = robot(tmp_path / "a.urdf", *visuals)
+    monkeypatch.setattr("curvireg_torch.formats.meshes.urdf.MAX_MESH_PARTS", 50)
+    with pytest.raises(MeshError, match="more than 50 parts"):
+        cr.load_mesh(path)
+
+
+def with_unused_vertices() -> ReadMesh:
+    box = trimesh.creation.box()
+    vertices = np.concatenate([np.zeros((UNUSED, 3)), box.vertices])
+    return ReadMesh(vertices, np.asarray(box.faces, np.int64) + UNUSED)
+
+
+def test_unused_vertices_are_dropped() -> None:
+    mesh = with_unused_vertices()
+    small = mesh.without_unused_vertices()
+    assert small.vertices.shape == (8, 3)
+    np.testing.assert_array_equal(small.vertices[small.faces], mesh.vertices[mesh.faces])
+    assert small.without_unused_vertices() is small
+    with pytest.raises(IndexError):
+        ReadMesh(np.zeros((3, 3)), np.array([[0, 1, -1]])).without_unused_vertices()
+
+
+@pytest.mark.parametrize("suffix", ["urdf", "3mf"])
+def test_copies_of_a_part_do_not_hold_its_unused_vertices(tmp_path: Path, suffix: str) -> None:
+    mesh = with_unused_vertices()
+    ply = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    ply.export(tmp_path / "a.ply")
+    vertices = "".join('<vertex x="{:g}" y="{:g}" z="{:g}"/>'.format(*v) for v in mesh.vertices)
+    faces = "".join('<triangle v1="{}" v2="{}" v3="{}"/>'.format(*face) for face in mesh.faces)
+    solid = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
+    copy = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 0 0 {}"/>'
+    peaks = []
+    for copies in (4, 8, 16):
+        if suffix == "urdf":
+            path = robot(tmp_path / "a.urdf", *['<mesh filename="a.ply"/>'] * copies)
+        else:
+            all_copies = "".join(map(copy.format, range(copies)))
+            whole = f'<object id="2"><components>{all_copies}</components></object>'
+            resources = f'<object id="1">{solid}</object>{whole}'
+            path = write_threemf(tmp_path / "a.3mf", resources, '<item objectid="2"/>')
+        peaks.append(peak(path))
+    assert peaks[2] - peaks[0] < UNUSED  # bytes: less than one for each vertex
+
+
+def part_of_image(count: int, image: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """``count`` parts with a material of their own, which share an image."""
+    content = tree(
+        nodes=[{"mesh": k} for k in range(count)],
+        scenes=[{"nodes": list(range(count))}],
+        meshes=[
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": k}]}
+            for k in range(count)
+        ],
+        materials=[
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}} for k in range(count)
+        ],
+        textures=[{"source": 0}] * count,
+        images=[image],
+        **more,
+    )
+    content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
+    )
+    return content
+
+
+def picture() -> bytes:
+    file = BytesIO()
+    Image.new("RGB", (4, 4), (200, 100, 50)).save(file, "PNG")
+    return file.getvalue()
+
+
+def test_bytes_of_a_shared_image_are_made_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coded = base64.b64encode(picture()).decode()
+    points = tree()["buffers"][0]
+    views = [*tree()["bufferViews"], {"buffer": 1, "byteLength": len(picture())}]
+    decode = Mock(wraps=gltf._data_of)
+    monkeypatch.setattr(gltf, "_data_of", decode)
+    view = gltf._File._view
+    viewed: list[int] = []
+
+    def noted(self: Any, index: int) -> memoryview:
+        viewed.append(index)
+        return view(self, index)
+
+    monkeypatch.setattr(gltf._File, "_view", noted)
+    path = tmp_path / "a.gltf"
+    for count in (5, 10):
+        decode.reset_mock()
+        path.write_text(json.dumps(part_of_image(count, {"uri": f"data:image/png;base64,{coded}"})))
+        assert len(cr.load_mesh(path).metadata["colours"].textures) == 1
+        assert decode.call_count == 2  # the buffer and the image
+        viewed.clear()
+        buffers = [points, {"uri": f"data:;base64,{coded}", "byteLength": len(picture())}]
+        shared = part_of_image(count, {"bufferView": 1}, buffers=buffers, bufferViews=views)
+        path.write_text(json.dumps(shared))
+        assert len(cr.load_mesh(path).metadata["colours"].textures) == 1
+        assert viewed.count(1) == 1
+
+
+def test_joints_of_a_skin_are_placed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    joints = Mock(wraps=gltf._File._joints)
+    placed = Mock(wraps=np.stack)
+    attributes = {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}
+    content = tree(
+        nodes=[{"mesh": 0, "skin": 0}] * 20 + [{"translation": [0, 0, 2]}],
+        scenes=[{"nodes": list(range(21))}],
+        meshes=[{"primitives": [{"attributes": attributes}]}],
+        skins=[{"joints": [20]}],
+    )
+    content["bufferViews"].append({"buffer": 1, "byteLength": 24})
+    content["buffers"].append(
+        {
+            "byteLength": 24,
+            "uri": "data:;base64,"
+            + base64.b64encode(bytes(12) + bytes([255, 0, 0, 0] * 3)).decode(),
+        }
+    )
+    content["accessors"] += [
+        {"bufferView": 1, "componentType": 5121, "count": 3, "type": "VEC4"},
+        {
+            "bufferView": 1,
+            "byteOffset": 12,
+            "componentType": 5121,
+            "count": 3,
+            "type": "VEC4",
+            "normalized": True,
+        },
+    ]
+    monkeypatch.setattr(gltf._File, "_joints", lambda self, index: joints(self, index))
+    monkeypatch.setattr(gltf.np, "stack", placed)
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(content))
+    monkeypatch.setattr(gltf, "SKINNED_AT_ONCE", 2)  # blocks of one part
+    found = files.read_source(MeshSource(path))
+    assert (found.vertices[:, 2] == 2.0).all()
+    assert found.vertices[:3].tolist() == [[0, 0, 2], [1, 0, 2], [0, 1, 2]]
+    assert (joints.call_count, placed.call_count) == (20, 1)
+    content["skins"] = [{"joints": [20] * 100_001}]
+    path.write_text(json.dumps(content))
+    with pytest.raises(MeshError, match="more than 100,000 joints"):
+        cr.load_mesh(path)
+
+
+def test_names_outside_of_the_folder_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.obj"
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    counts = []
+    for count in (100, 200):
+        names = " ".join(f"../{k}.mtl" for k in range(count))
+        path.write_text(f"mtllib {names}\n{triangle}")
+        counts.append(resolved(monkeypatch, path))
+    assert counts[1] - counts[0] <= 100
+    names = " ".join(f"../{k}.mtl" for k in range(20_000))
+    path.write_text(f"mtllib {names}\n{triangle}")
+    with pytest.raises(MeshError, match="names more than 10,000 files"):
+        cr.load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_possible"),
+    [
+        ("a.png", True),
+        ("textures/" * 63 + "a.png", True),
+        ("textures/" * 64 + "a.png", False),
+        ("t\\" * 64 + "a.png", False),
+        ("a" * 255, True),
+        ("a" * 256, False),
+        ("ä" * 128, False),
+        ("/".join(["a" * 200] * 20), True),
+        ("/".join(["a" * 200] * 21), False),
+        ("a\0b", False),
+        (" ", False),
+        ("\ud800.png", False),
+    ],
+)
+def test_names_that_no_file_has(name: str, is_possible: bool) -> None:
+    assert is_file_name(name) == is_possible
+
+
+def test_a_long_name_of_a_texture_leaves_the_mesh_alone(
+    tmp_path: Path, load: Callable[..., tuple[trimesh.Trimesh, list[str]]]
+) -> None:
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nKd 1 0 0\nmap_Kd {'x' * 8000}.png\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
+    mesh, texts = load(tmp_path / "a.obj")
+    assert len(mesh.faces) == 1
+    assert texts == [
+        f"{tmp_path / 'a.obj'}: {'x' * 100} is no name of a file, and is left out",
+    ]
+
+
+def test_a_texture_of_many_groups_is_unpacked_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    groups = "".join(
+        f'<texture2dgroup id="{k}" texid="7"><tex2coord u="0" v="0"/></texture2dgroup>'
+        for k in range(10, 20)
+    )
+    faces = "".join(f'<triangle v1="0" v2="1" v3="2" pid="{k}" p1="0"/>' for k in range(10, 20))
+    vertices = '<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>'
+    mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles></mesh>"
+    resources = f'<texture2d id="7" path="/3D/a.png"/>{groups}<object id="1">{mesh}</object>'
+    path = write_threemf(
+        tmp_path / "a.3mf", resources, '<item objectid="1"/>', more={"3D/a.png": picture()}
+    )
+    content = threemf._Package._content
+    asked: list[str] = []
+
+    def noted(self: Any, name: str) -> bytes:
+        asked.append(name)
+        return content(self, name)
+
+    monkeypatch.setattr(threemf._Package, "_content", noted)
+    found = files.read_source(MeshSource(path)).colours
+    assert found is not None
+    assert len(found.textures) == 1
+    assert asked.count("/3D/a.png") == 1
+    monkeypatch.setitem(threemf._MOST, "triangle", 9)
+    with pytest.raises(MeshError, match="more than 9 of 'triangle'"):
+        cr.load_mesh(path)
+
+
+@pytest.mark.skipif(not is_installed("collada"), reason="collada is not installed")
+def test_collada_counts_faces_of_copies_and_decodes_a_picture_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "label.png").write_bytes(picture())
+    path = tmp_path / "a.dae"
+    text = collada()
+    materials = "".join(
+        f'<material id="m{k}"><instance_effect url="#fx"/></material>' for k in range(5)
+    )
+    path.write_text(text.replace("</library_materials>", f"{materials}</library_materials>"))
+    decode = Mock(wraps=colours._texture)
+    monkeypatch.setattr(source, "texture_pixels", Mock(wraps=source.texture_pixels))
+    files.read_source(MeshSource(path))
+    assert source.texture_pixels.call_count == 1  # type: ignore[attr-defined]
+    assert decode.call_count == 0
+    copies = '<instance_geometry url="#g"/>' * 4
+    skin = '<controller id="c"><skin source="#g"/></controller>'
+    for more in (copies, '<instance_controller url="#c"/>' * 4):
+        with_more = collada(more=more).replace("<library_nodes>", f"{skin}<library_nodes>")
+        path.write_text(with_more)
+        monkeypatch.setattr(cad, "MAX_MESH_FACES", 4)
+        with pytest.raises(MeshError, match="more than 4 faces"):
+            cr.load_mesh(path)
+        monkeypatch.setattr(cad, "MAX_MESH_FACES", 5)
+        cad._check_copies(cad.ET.fromstring(with_more))
+    monkeypatch.setattr("curvireg_torch.formats.xml_files.MAX_XML_ELEMENTS", 20)
+    with pytest.raises(MeshError, match="more than 20 elements of XML"):
+        cr.load_mesh(path)
+
+
+def test_a_program_has_limits_of_time_and_memory(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    limits = {"name": "It", "seconds": 60.0, "memory": 1 << 28, "advice": "export less"}
+    program.write_text("import sys\nsys.exit(int(sys.argv[1]))")
+    assert run_program(program, ["0"], **limits)  # type: ignore[arg-type]
+    assert not run_program(program, ["1"], **limits)  # type: ignore[arg-type]
+    program.write_text("x = bytearray(1 << 29)")
+    with pytest.raises(ValueError, match=r"It needs more than 268,435,456 bytes .*; export less"):
+        run_program(program, [], **limits)  # type: ignore[arg-type]
+    program.write_text("while True:\n    pass")
+    with pytest.raises(ValueError, match=r"It took more than 0.5 seconds; export less"):
+        run_program(program, [], **{**limits, "seconds": 0.5})  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not is_installed("cascadio"), reason="cascadio is not installed")
+def test_opencascade_has_a_limit_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.step").write_text(step_file((3.0, 2.0, 1.0), "mm"))
+    monkeypatch.setattr(cad, "MAX_CAD_MEMORY", 1 << 28)
+    with pytest.raises(MeshError, match=r"OpenCASCADE (needs more than|finds no shape)"):
+        cr.load_mesh(tmp_path / "a.step")
+
+
+@pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
+def test_usd_drops_unused_points_before_they_are_copied(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = ", ".join(["(9, 9, 9)"] * 1000 + ["(0, 0, 0)", "(1, 0, 0)", "(0, 1, 0)"])
+    text = f"""#usda 1.0
+def Xform "a" (
+    instanceable = true
+)
+{{
+    def Mesh "m"
+    {{
+        point3f[] points = [{points}]
+        int[] faceVertexCounts = [3]
+        int[] faceVertexIndices = [1000, 1001, 1002]
+    }}
+}}
+def "b" (
+    instanceable = true
+    references = </a>
+)
+{{
+}}
+"""
+    (tmp_path / "a.usda").write_text(text)
+    _, arrays = usd._parts_of(tmp_path / "a.usda")
+    for key in ("0.", "1."):
+        assert arrays[key + "points"].tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+        assert arrays[key + "indices"].tolist() == [0, 1, 2]
+    monkeypatch.setattr(usd, "MAX_CAD_MEMORY", 1 << 27)
+    with pytest.raises(MeshError, match=r"OpenUSD (needs more than|cannot read)"):
+        cr.load_mesh(tmp_path / "a.usda")

@@ -1,0 +1,254 @@
+"""Malicious mesh files end in a one-line error, soon and in little memory."""
+
+import base64
+import json
+import math
+import struct
+import time
+import tracemalloc
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.formats.meshes import colours, gltf, polygons, source
+from curvireg_torch.mesh import mesh as mesh_module
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+
+
+def tree(**changes: Any) -> dict[str, Any]:
+    """A triangle as glTF."""
+    whole = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36, "uri": "data:;base64," + base64.b64encode(POINTS).decode()}],
+    }
+    return {**whole, **changes}
+
+
+def glb(content: dict[str, Any]) -> bytes:
+    text = json.dumps({**content, "buffers": [{"byteLength": 36}]}).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", 36, b"BIN\0") + POINTS
+    )
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def refused(
+    path: Path, content: bytes, match: str, *, seconds: float = 5.0, megabytes: float = 100.0
+) -> None:
+    path.write_bytes(content)
+    tracemalloc.start()
+    start = time.process_time()
+    with pytest.raises(MeshError, match=match) as caught:
+        cr.load_mesh(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert time.process_time() - start < seconds
+    assert peak < megabytes * 1e6
+    assert len(str(caught.value).splitlines()) == 1
+    assert path.name in str(caught.value)
+
+
+def test_load_mesh_reads_the_valid_gltf_and_glb_and_refuses_damaged_glb(tmp_path: Path) -> None:
+    (tmp_path / "a.gltf").write_text(json.dumps(tree()))
+    (tmp_path / "a.glb").write_bytes(glb(tree()))
+    assert cr.load_mesh(tmp_path / "a.gltf").area == cr.load_mesh(tmp_path / "a.glb").area == 0.5
+    for damaged in (
+        b"glTF",
+        glb(tree())[:60],
+        glb(tree())[:-5],
+        glb(tree()).replace(b"JSON", b"TEXT"),
+    ):
+        refused(tmp_path / "a.glb", damaged, "cannot be read")
+
+
+def zeros(**changes: Any) -> dict[str, Any]:
+    """A triangle whose accessor is changed."""
+    return {
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3", **changes}
+        ]
+    }
+
+
+def required(name: str) -> dict[str, Any]:
+    return {"extensionsRequired": [name]}
+
+
+INSTANCES = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
+
+
+def test_check_gltf_refuses_what_is_not_read_or_too_large(tmp_path: Path) -> None:
+    for changes, match in (
+        ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [0], "mesh": 0}]}, "circle"),
+        ({"nodes": [{"children": [1, 1]}, {"mesh": 0}]}, "child of several"),
+        ({"nodes": [{"children": [7], "mesh": 0}]}, "missing"),
+        ({"nodes": [{"mesh": 0}] * 20_000}, "10,000 parts"),
+        (
+            {"nodes": [{"mesh": 0, "extensions": INSTANCES}]},
+            "gpu_instancing, which is not read; export without it",
+        ),
+        (zeros(count=10**9), "claim more than"),
+        (zeros(count=10**6), "cannot be read"),
+        (zeros(count=-3), "-3"),
+        (zeros(sparse={"count": 1}), "valid glTF"),
+        (
+            {"accessors": [{"componentType": 5126, "count": 30_000_000, "type": "VEC3"}]},
+            "has no data",
+        ),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 10**12}]}, "claim more than"),
+        ({"bufferViews": [{"buffer": 0, "byteLength": 100}]}, "cannot be read"),
+        ({"buffers": [{"byteLength": 36}]}, "cannot be read"),
+        (required("KHR_draco_mesh_compression"), "KHR_draco_mesh_compression.*export without it"),
+        (required("EXT_meshopt_compression"), "EXT_meshopt_compression.*export without it"),
+        ({"asset": {"version": "1.0"}}, "version 2"),
+        ({"meshes": 5}, "valid glTF"),
+    ):
+        refused(tmp_path / "a.gltf", json.dumps(tree(**changes)).encode(), match)
+        if "buffers" not in changes:
+            refused(tmp_path / "a.glb", glb(tree(**changes)), match)
+
+
+def test_load_mesh_decodes_a_texture_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few bytes unpack to a large picture, which many parts share."""
+    picture = BytesIO()
+    Image.new("RGB", (4096, 4096), (200, 100, 50)).save(picture, "PNG")
+    uri = "data:image/png;base64," + base64.b64encode(picture.getvalue()).decode()
+    content = tree(
+        nodes=[{"mesh": i % 20, "translation": [i, 0, 0]} for i in range(40)],
+        scenes=[{"nodes": list(range(40))}],
+        meshes=[
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": i}]}
+            for i in range(20)
+        ],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}] * 20,
+        textures=[{"source": 0}],
+        images=[{"uri": uri}],
+    )
+    content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
+    )
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    decode = Mock(wraps=colours._texture)
+    monkeypatch.setattr(colours, "_texture", decode)
+    found = cr.load_mesh(tmp_path / "a.gltf").metadata["colours"]
+    assert (decode.call_count, len(found)) == (1, 40)
+    (texture,) = found.textures
+    assert texture[9, 9].tolist() == [200, 100, 50]
+
+
+OUTSIDE = [
+    "../b.bin",
+    "/etc/passwd",
+    "file:///etc/passwd",
+    "http://127.0.0.1:9/b.bin",
+    "%2e%2e/b.bin",
+]
+
+
+@pytest.mark.parametrize("uri", [*OUTSIDE, "link.bin", "Linked/b.bin", "linked/b.bin", "no.bin"])
+def test_load_mesh_opens_no_file_outside_the_folder(tmp_path: Path, uri: str) -> None:
+    folder = tmp_path / "inside"
+    folder.mkdir()
+    (tmp_path / "b.bin").write_bytes(POINTS)
+    (folder / "link.bin").symlink_to(tmp_path / "b.bin")
+    # names that differ in upper and lower case only are searched for: in links to folders too
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "b.bin").write_bytes(POINTS)
+    (folder / "Linked").symlink_to(tmp_path / "other", target_is_directory=True)
+    content = tree(buffers=[{"byteLength": 36, "uri": uri}])
+    refused(folder / "a.gltf", json.dumps(content).encode(), "no file of its folder")
+
+
+AXES = b"".join(b"property float %c\n" % axis for axis in b"xyz")
+PLY = b"ply\nformat %s 1.0\nelement vertex %d\n" + AXES + b"element face 9000000\n"
+PLY += b"property list uchar int vertex_indices\nend_header\n"
+
+
+def test_load_mesh_refuses_false_claims_and_bounds_its_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, content, match in (
+        ("a.off", b"OFF\n1000000000 1000000000 0\n0 0 0\n", "too early"),
+        ("a.off", b"OFF\n-1 1 0\n0 0 0\n", "too early"),
+        ("a.ply", PLY % (b"binary_little_endian", 10**9) + b"\0\0", "early"),
+        ("a.ply", PLY % (b"ascii", 1) + b"0 0 0\n3 0 0 0\n", "ends before the last face"),
+        ("a.stl", b"\0" * 80 + struct.pack("<I", 10**9) + b"\0" * 50, "it was cut while"),
+        ("a.gltf", b'{"asset": ' + b"[" * 1_000_000, "RecursionError"),
+        ("a.obj", b"v 0 0 0\nv 1e300 0 0\nv 0 1 0\nf 1 2 3\n", r"1e\+12"),
+        (
+            "a.obj",
+            b"v 0 0 0\nv 9e-7 0 0\nv 0 1e-9 0\nf 1 2 3\n",
+            "only 9e-07 units across; scale it up",
+        ),
+        ("a.obj", b"v 0 0 0\n" * 9 + b"f " + b"1 2 3 " * 2_000 + b"\n", "degenerate"),
+    ):
+        refused(tmp_path / name, content, match)
+    trimesh.creation.icosphere(3).export(tmp_path / "a.stl")
+    content = (tmp_path / "a.stl").read_bytes()
+    monkeypatch.setattr(mesh_module, "MAX_MESH_FACES", 1000)
+    refused(tmp_path / "a.stl", content, "1,280 faces")
+    copies = json.dumps(tree(nodes=[{"mesh": 0}] * 200)).encode()
+    monkeypatch.setattr(gltf, "MAX_MESH_FACES", 100)
+    refused(tmp_path / "a.gltf", copies, "more than 100 faces")
+    monkeypatch.setattr(source, "MAX_MESH_BYTES", 1000)
+    refused(tmp_path / "a.stl", content, "larger than 1,000 bytes")
+
+
+def test_load_mesh_places_parts_of_a_deep_tree_in_linear_time(tmp_path: Path) -> None:
+    """trimesh alone multiplies the whole chain again for each part."""
+    half_degree = {
+        "rotation": [0.0, 0.0, math.sin(math.radians(0.25)), math.cos(math.radians(0.25))]
+    }
+    chain = [{"children": [i + 1], "translation": [0.01, 0, 0], **half_degree} for i in range(179)]
+    leaves = [{"mesh": 0, "translation": [0, 0, 0.1 * i]} for i in range(500)]
+    nodes = [*chain, {"children": list(range(180, 680))}, *leaves]
+    (tmp_path / "a.gltf").write_text(json.dumps(tree(nodes=nodes)))
+    start = time.process_time()
+    mesh = cr.load_mesh(tmp_path / "a.gltf")
+    assert time.process_time() - start < 10
+    assert len(mesh.faces) == 500
+    # the chain's end, in the complex plane
+    at = 0.01 * np.exp(1j * np.radians(0.5 * np.arange(179))).sum()
+    far = at + np.exp(1j * np.radians(0.5 * 179))  # the corner at x = 1 of a part
+    vertices = mesh.vertices[np.isclose(mesh.vertices[:, 2], 0.7)]
+    for point in (at, far):
+        assert np.abs(vertices - [point.real, point.imag, 0.7]).max(axis=1).min() < 1e-6
+
+
+def test_divide_faces_counts_before_it_divides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dart = b"OFF\n4 %d 0\n0 0 0\n1 2 0\n0 1 0\n-1 2 0\n" + b"4 0 1 2 3\n" * 10
+    ply = PLY.replace(b"9000000", b"10") % (b"ascii", 4) + dart.split(b"\n", 2)[2]
+    obj = b"v 0 0 0\nv 1 2 0\nv 0 1 0\nv -1 2 0\n" + b"f 1 2 3 4\n" * 10
+    for name, content in (("a.off", dart % 10), ("a.ply", ply), ("a.obj", obj)):
+        monkeypatch.undo()
+        (tmp_path / name).write_bytes(content)
+        assert len(cr.load_mesh(tmp_path / name).faces) == 20
+        monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 159)
+        refused(tmp_path / name, content, "not convex have too many corners")
+        monkeypatch.setattr(polygons, "MAX_MESH_FACES", 19)
+        refused(tmp_path / name, content, "more than 19 faces")
+        for reader in ("files", "obj", "ply"):
+            monkeypatch.setattr(f"curvireg_torch.formats.meshes.{reader}.MAX_MESH_LINES", 9)
+        refused(tmp_path / name, content, "more than 9 lines")
+    monkeypatch.undo()
+    monkeypatch.setattr(polygons, "MAX_POLYGON_WORK", 160)
+    assert len(cr.load_mesh(tmp_path / "a.off").faces) == 20

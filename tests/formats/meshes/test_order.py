@@ -1,0 +1,482 @@
+"""Where two readings are possible: transforms whose order matters, which of two statements wins,
+and on which side a face lies."""
+
+import itertools
+import math
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import CurviregWarning, MeshError
+from curvireg_torch.formats.meshes.colours import texture_pixels
+from curvireg_torch.formats.meshes.polygons import divide_faces, triangles_of_faces
+from curvireg_torch.formats.meshes.source import MeshSource, ReadMesh, colour_bytes
+from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
+from curvireg_torch.utils.extras import is_installed
+from tests.formats.meshes.test_cad import solid, threemf
+from tests.formats.meshes.test_gltf import Tree
+from tests.formats.meshes.test_ply import header, rows
+from tests.formats.meshes.test_usd import BOUND, MAP, MATERIAL, painted, square, stage
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+needs_usd = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
+TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
+RED = [255, 0, 0]
+GREEN = [0, 255, 0]
+BLUE = [0, 0, 255]
+WHITE = [255, 255, 255]
+# about z by 90 degrees: x becomes y
+QUARTER = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
+
+
+def first_corners(mesh: trimesh.Trimesh) -> list[list[int]]:
+    """The colours of the first corner of each face."""
+    colours = surface_colours(mesh)
+    assert colours is not None
+    found: list[list[int]] = colours.corners[:, 0].tolist()
+    return found
+
+
+def textures(mesh: trimesh.Trimesh) -> list[list[int]]:
+    """The colour of each face's texture in its first texel; white where there is none."""
+    colours = surface_colours(mesh)
+    assert colours is not None
+    plain = [texture[0, 0].tolist() for texture in colours.textures]
+    return [plain[k] if k >= 0 else WHITE for k in colours.texture]
+
+
+# glTF
+
+
+def test_a_node_is_scaled_then_turned_then_moved(tmp_path: Path) -> None:
+    tree = Tree()
+    tree.part(None, TRIANGLE)
+    node = {"mesh": 0, "rotation": QUARTER, "scale": [2, 3, 5], "translation": [10, 0, 0]}
+    tree.content["nodes"] = [node]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    # x of 1 is stretched to 2 and becomes y; y of 1 is stretched to 3 and becomes -x
+    np.testing.assert_allclose(mesh.vertices, [[10, 0, 0], [10, 2, 0], [7, 0, 0]], atol=1e-6)
+
+
+def test_a_node_lies_in_the_frame_of_its_parent(tmp_path: Path) -> None:
+    tree = Tree()
+    tree.part(None, TRIANGLE)
+    parent = {"children": [1], "rotation": QUARTER, "translation": [0, 0, 1]}
+    tree.content["nodes"] = [parent, {"mesh": 0, "translation": [5, 0, 0]}]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.vertices, [[0, 5, 1], [0, 6, 1], [-1, 5, 1]], atol=1e-6)
+
+
+def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path: Path) -> None:
+    tree = Tree()
+    part = tree.part(None, TRIANGLE)
+    part["attributes"]["JOINTS_0"] = tree.array([[0, 0, 0, 0]] * 3, "B")
+    part["attributes"]["WEIGHTS_0"] = tree.array([[1, 0, 0, 0]] * 3)
+    bind = np.eye(4)
+    bind[3, 0] = 4.0  # by column: a shift along x
+    tree.content["skins"] = [
+        {"joints": [1], "inverseBindMatrices": tree.array(bind.reshape(1, 16))}
+    ]
+    tree.content["nodes"] = [{"mesh": 0, "skin": 0}, {"rotation": QUARTER}]
+    tree.content["scenes"] = [{"nodes": [0, 1]}]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
+
+
+def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path: Path) -> None:
+    tree = Tree()
+    positions = tree.array([[-128, 0, 0], [127, 0, 0], [0, -127, 0]], "b", normalized=True)
+    tree.content["meshes"] = [{"primitives": [{"attributes": {"POSITION": positions}}]}]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    assert mesh.bounds.tolist() == [[-1, -1, 0], [1, 0, 0]]
+
+
+def textured(more: dict[str, Any], material: dict[str, Any] | None = None) -> Tree:
+    """A triangle with two sets of coordinates, and a texture; ``more`` is said of its use."""
+    tree = Tree()
+    part = tree.part(None, TRIANGLE, material=0)
+    part["attributes"]["TEXCOORD_0"] = tree.array([[0, 0], [1, 0], [0, 0.5]])
+    part["attributes"]["TEXCOORD_1"] = tree.array([[0.25, 0], [0.25, 0], [0.25, 0]])
+    tree.picture(np.full((4, 4, 3), 255, np.uint8))
+    used = {"baseColorTexture": {"index": 0, **more}, "baseColorFactor": [1, 0, 0, 1]}
+    tree.content["materials"] = [material or {"pbrMetallicRoughness": used}]
+    return tree
+
+
+def coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
+    colours = surface_colours(mesh)
+    assert colours is not None
+    return colours.uv[0] * [1, -1] + [0, 1]  # from the top left, as in glTF
+
+
+def test_coordinates_are_scaled_then_turned_then_moved(tmp_path: Path) -> None:
+    transform = {"scale": [2, 4], "rotation": math.pi / 2, "offset": [0.5, 0.25]}
+    tree = textured({"extensions": {"KHR_texture_transform": transform}})
+    found = coordinates(cr.load_mesh(tree.write(tmp_path / "a.gltf")))
+    # by KHR_texture_transform: translation * rotation * scale, with rotation (cos, sin; -sin, cos)
+    np.testing.assert_allclose(found, [[0.5, 0.25], [0.5, -1.75], [2.5, 0.25]], atol=1e-6)
+
+
+def test_the_set_that_a_transform_names_wins(tmp_path: Path) -> None:
+    for more, first in (
+        ({}, 0.0),
+        ({"texCoord": 1}, 0.25),
+        ({"texCoord": 0, "extensions": {"KHR_texture_transform": {"texCoord": 1}}}, 0.25),
+        ({"texCoord": 1, "extensions": {"KHR_texture_transform": {"texCoord": 0}}}, 0.0),
+    ):
+        mesh = cr.load_mesh(textured(more).write(tmp_path / "a.gltf"))
+        assert coordinates(mesh)[0, 0] == first
+        assert first_corners(mesh) == [RED], "a texture times the factor of the material"
+
+
+def test_specular_colours_win_over_metallic_ones(tmp_path: Path) -> None:
+    specular = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 0, 1, 1]}}
+    metallic = {"baseColorFactor": [1, 0, 0, 1], "baseColorTexture": {"index": 0}}
+    material = {"pbrMetallicRoughness": metallic, "extensions": specular}
+    mesh = cr.load_mesh(textured({}, material).write(tmp_path / "a.gltf"))
+    assert (first_corners(mesh), textures(mesh)) == ([BLUE], [WHITE])
+    assert surface_colours(mesh).textures == ()  # type: ignore[union-attr]
+
+
+def test_a_picture_as_webp_wins(tmp_path: Path) -> None:
+    tree = textured({})
+    tree.content["images"] += [{"uri": "b.png"}]
+    (tmp_path / "b.png").write_bytes(painted((0, 255, 0)))
+    tree.content["textures"] = [{"source": 0, "extensions": {"EXT_texture_webp": {"source": 1}}}]
+    assert textures(cr.load_mesh(tree.write(tmp_path / "a.gltf"))) == [GREEN]
+
+
+# OBJ
+
+
+def obj(folder: Path, libraries: dict[str, str], more: str = "") -> Path:
+    for name, text in libraries.items():
+        (folder / name).write_text(text)
+    path = folder / "a.obj"
+    names = "".join(f"mtllib {name}\n" for name in libraries)
+    path.write_text(f"{names}v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n{more}")
+    return path
+
+
+def test_of_two_materials_of_a_name_the_first_counts(tmp_path: Path) -> None:
+    red = "newmtl m\nKd 1 0 0\n"
+    blue = "newmtl m\nKd 0 0 1\n"
+    assert first_corners(cr.load_mesh(obj(tmp_path, {"a.mtl": red, "b.mtl": blue}))) == [RED]
+    assert first_corners(cr.load_mesh(obj(tmp_path, {"b.mtl": blue, "a.mtl": red}))) == [BLUE]
+
+
+def test_colours_of_vertices_win_over_those_of_materials(tmp_path: Path) -> None:
+    path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\n"})
+    text = path.read_text()
+    for line in ("v 0 0 0", "v 1 0 0", "v 0 1 0"):
+        text = text.replace(line, f"{line} 0 1 0")
+    path.write_text(text)
+    assert first_corners(cr.load_mesh(path)) == [GREEN]
+
+
+def test_indices_below_zero_count_from_the_face(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 9 9 9\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 5 5 5\nf 2 3 -1\n")
+    mesh = cr.load_mesh(path)
+    assert mesh.triangles.tolist() == [
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        [[0, 0, 0], [1, 0, 0], [5, 5, 5]],
+    ]
+
+
+def test_weights_of_vertices_divide(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0 1\nv 2 0 0 2\nv 0 3 0\nv 0 0 4 0\nf 1 2 3\nf 1 2 4\n")
+    mesh = cr.load_mesh(path)
+    assert mesh.bounds.tolist() == [[0, 0, 0], [1, 3, 4]]
+
+
+# PLY
+
+UV = "property float s\nproperty float t\n"
+TEXTURES = "".join(f"comment TextureFile {name}.png\n" for name in ("red", "green"))
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    for name, colour in (("red", RED), ("green", GREEN)):
+        (tmp_path / f"{name}.png").write_bytes(painted((colour[0], colour[1], colour[2])))
+    return tmp_path
+
+
+def test_the_texture_of_a_polygon_is_that_of_its_triangles(pictures: Path) -> None:
+    text = header(UV, "property int texnumber\n", count=4, comments=TEXTURES)
+    faces = "4 0 1 2 3 1\n3 0 1 2 0\n3 0 1 3 -1\n3 0 2 3 -2\n"
+    (pictures / "a.ply").write_text(text + rows(["0 0"] * 4) + faces)
+    mesh = cr.load_mesh(pictures / "a.ply")
+    assert textures(mesh) == [GREEN, GREEN, RED, WHITE, WHITE]
+
+
+def test_colours_of_faces_win_over_those_of_vertices(tmp_path: Path) -> None:
+    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    text = header(names, names) + rows(["255 0 0"] * 4) + "3 0 1 2 0 0 255\n3 0 2 3 0 255 0\n"
+    (tmp_path / "a.ply").write_text(text)
+    assert first_corners(cr.load_mesh(tmp_path / "a.ply")) == [BLUE, GREEN]
+
+
+# 3MF
+
+
+def test_a_component_lies_in_the_frame_of_a_turned_item(tmp_path: Path, load: Load) -> None:
+    turn = "0 1 0 -1 0 0 0 0 1"  # x becomes y
+    component = '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
+    resources = solid(1) + f'<object id="2"><components>{component}</components></object>'
+    item = f'<item objectid="2" transform="{turn} 0 0 7"/>'
+    mesh, _ = load(threemf(tmp_path / "a.3mf", resources, item))
+    np.testing.assert_allclose(mesh.bounds, [[-10, 85, 2], [10, 115, 12]])
+
+
+def test_the_model_in_its_usual_place_is_the_first(tmp_path: Path, load: Load) -> None:
+    path = threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>')
+    for name in ("a.model", "3D/a.model", "3D/very/3dmodel_b.model"):
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(name, "<model/>")
+    assert len(load(path)[0].faces) == 12
+
+
+def test_properties_of_a_triangle_win_over_those_of_its_object(tmp_path: Path, load: Load) -> None:
+    groups = "".join(
+        f'<basematerials id="{k}"><base name="a" displaycolor="{colour}"/></basematerials>'
+        for k, colour in ((5, "#FF0000"), (6, "#0000FF"))
+    )
+    resources = groups + solid(1, 'pid="5" pindex="0"', 'pid="6" p1="0"')
+    mesh, _ = load(threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>'))
+    assert first_corners(mesh) == [BLUE] * 6 + [RED] * 6
+
+
+# URDF
+
+
+def robot(folder: Path, visual: str, joint: str = "", more: str = "") -> Path:
+    path = folder / "a.urdf"
+    tip = f'<link name="tip"><visual>{visual}</visual></link>'
+    if joint:
+        tip += '<link name="base"/><joint name="j" type="fixed"><parent link="base"/>'
+        tip += f'<child link="tip"/>{joint}</joint>'
+    path.write_text(f'<robot name="r">{more}{tip}</robot>')
+    return path
+
+
+def wedge(folder: Path) -> str:
+    trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 1, 2], [0, 1, 3]]).export(
+        folder / "wedge.stl"
+    )
+    return '<geometry><mesh filename="wedge.stl" scale="1 2 1"/></geometry>'
+
+
+def test_roll_comes_before_pitch_before_yaw(tmp_path: Path, load: Load) -> None:
+    half = math.pi / 2
+    origin = f'<origin rpy="{half} 0 {half}" xyz="10 0 0"/>'
+    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
+    # roll takes y to z and z to -y, yaw x to y and y to -x: (1, 4, 3) -> (3, 1, 4)
+    np.testing.assert_allclose(mesh.bounds, [[10, 0, 0], [13, 1, 4]], atol=1e-6)
+    origin = f'<origin rpy="0 {half} {half}"/>'
+    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + origin))
+    # pitch takes x to -z and z to x
+    np.testing.assert_allclose(mesh.bounds, [[-4, 0, -1], [0, 3, 0]], atol=1e-6)
+
+
+def test_a_visual_lies_in_its_link_and_that_at_its_joint(tmp_path: Path, load: Load) -> None:
+    joint = f'<origin rpy="0 0 {math.pi / 2}" xyz="0 0 5"/>'
+    mesh, _ = load(robot(tmp_path, wedge(tmp_path) + '<origin xyz="10 0 0"/>', joint))
+    np.testing.assert_allclose(mesh.bounds, [[-4, 10, 5], [0, 11, 8]], atol=1e-6)
+
+
+def test_a_colour_of_a_visual_wins_over_a_named_one(tmp_path: Path, load: Load) -> None:
+    named = '<material name="m"><color rgba="1 0 0 1"/></material>'
+    own = '<material name="m"><color rgba="0 0 1 1"/></material>'
+    box = '<geometry><box size="1 1 1"/></geometry>'
+    assert first_corners(load(robot(tmp_path, box + own, more=named))[0])[0] == BLUE
+    bare = '<material name="m"/>'
+    assert first_corners(load(robot(tmp_path, box + bare, more=named))[0])[0] == RED
+
+
+def test_colours_of_a_mesh_win_over_those_of_the_urdf(tmp_path: Path, load: Load) -> None:
+    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    text = header(names, "") + rows(["0 255 0"] * 4) + "3 0 1 2\n3 0 2 3\n"
+    (tmp_path / "a.ply").write_text(text)
+    shape = '<geometry><mesh filename="a.ply"/></geometry>'
+    own = '<material name="m"><color rgba="0 0 1 1"/></material>'
+    assert first_corners(load(robot(tmp_path, shape + own))[0]) == [GREEN, GREEN]
+
+
+# USD
+
+
+@needs_usd
+def test_helpers_and_holes_are_no_surface(tmp_path: Path, load: Load) -> None:
+    path = tmp_path / "a.usda"
+    for purpose, faces in (("guide", 2), ("proxy", 2), ("render", 4), ("default", 4)):
+        other = square(f'uniform token purpose = "{purpose}"').replace('"square"', '"other"')
+        path.write_text(stage(square(), other))
+        assert len(load(path)[0].faces) == faces
+    holed = square("int[] holeIndices = [0]", counts="3, 3", indices="0, 1, 2, 0, 2, 3")
+    path.write_text(stage(holed))
+    mesh, _ = load(path)
+    assert mesh.triangles.tolist() == [[[0, 0, 0], [2, 1, 0], [0, 1, 0]]]
+
+
+@needs_usd
+def test_a_part_of_usd_lies_in_the_frame_of_its_parent(tmp_path: Path, load: Load) -> None:
+    inner = square(
+        "double3 xformOp:translate = (5, 0, 0)\n"
+        '        uniform token[] xformOpOrder = ["xformOp:translate"]'
+    )
+    place = "    double3 xformOp:rotateXYZ = (0, 0, 90)\n"
+    place += '    uniform token[] xformOpOrder = ["xformOp:rotateXYZ"]\n'
+    (tmp_path / "a.usda").write_text(stage(inner, place=place))
+    mesh, _ = load(tmp_path / "a.usda")
+    np.testing.assert_allclose(mesh.bounds, [[-1, 5, 0], [0, 7, 0]], atol=1e-6)
+
+
+@needs_usd
+def test_materials_of_usd_win_over_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "textures").mkdir()
+    (tmp_path / "textures" / "print.png").write_bytes(painted((255, 0, 0)))
+    colour = 'color3f[] primvars:displayColor = [(0, 1, 0)] (interpolation = "constant")\n        '
+    plain = square(colour).replace('"square"', '"plain"')
+    (tmp_path / "a.usda").write_text(stage(MATERIAL, square(colour + MAP, BOUND), plain))
+    mesh, _ = load(tmp_path / "a.usda")
+    assert first_corners(mesh) == [WHITE, WHITE, GREEN, GREEN]
+    assert textures(mesh) == [RED, RED, WHITE, WHITE]
+
+
+# Faces and colours of all formats
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("signs", list(itertools.product([1, -1], repeat=2)))
+def test_faces_keep_their_side_and_convex_ones_are_fans(
+    order: tuple[int, ...], signs: tuple[int, int]
+) -> None:
+    corners = np.array([[0, 0, 0], [3, 0, 0], [4, 2, 0], [2, 4, 0], [0, 2, 0]], float)
+    dart = np.array([[0, 0, 0], [1, 2, 0], [0, 1, 0], [-1, 2, 0]], float)
+    for flat, is_convex in ((corners, True), (dart, False)):
+        tilted = (flat * [signs[0], signs[1], 1] + [[0, 0, 0.1]] * flat[:, :1])[:, list(order)]
+        area = 0.5 * np.cross(tilted, np.roll(tilted, -1, axis=0)).sum(axis=0)
+        faces, owner, places = triangles_of_faces(tilted, [list(range(len(tilted)))])
+        a, b, c = tilted[faces].transpose(1, 0, 2)
+        np.testing.assert_allclose(0.5 * np.cross(b - a, c - a).sum(axis=0), area, atol=1e-9)
+        sides = np.cross(b - a, c - a) @ area
+        assert (sides > 0).all()
+        assert (owner == 0).all()
+        np.testing.assert_array_equal(places, faces)
+        if is_convex:
+            assert divide_faces(tilted, [range(5)]) == [[[0, 1, 2], [0, 2, 3], [0, 3, 4]]]
+
+
+def test_a_mirrored_part_keeps_its_outside_and_its_colours() -> None:
+    colours = surface_colours(
+        trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
+    )
+    mesh = ReadMesh(np.array(TRIANGLE), np.array([[0, 1, 2]]), colours, "mm", "y")
+    for signs, corners in (((-1, 1, 1), [BLUE, GREEN, RED]), ((-1, -1, 1), [RED, GREEN, BLUE])):
+        moved = mesh.transformed(np.diag([*signs, 1.0]))
+        assert moved.colours is not None
+        assert moved.colours.corners[0].tolist() == corners
+        normal = np.cross(*(moved.vertices[moved.faces[0, 1:]] - moved.vertices[moved.faces[0, 0]]))
+        assert normal[2] > 0
+        assert (moved.unit, moved.up) == ("mm", "y")
+
+
+def test_transparent_texels_are_white() -> None:
+    file = BytesIO()
+    Image.new("RGBA", (2, 2), (200, 0, 0, 51)).save(file, "PNG")
+    pixels, count = texture_pixels(file.getvalue(), 4)
+    assert (pixels[0, 0].tolist(), count) == ([244, 204, 204], 4)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.0, 0.5, 1.0], [0, 128, 255]),
+        ([0.2, 0.5, 1.0024], [51, 128, 255]),
+        ([0.2, 0.5, math.inf], [51, 128, 255]),
+        ([0.2, 0.5, math.nan], [51, 128, 0]),
+        ([0.0, 1.0, 1.0], [0, 255, 255]),
+        ([0.0, 1.0, 2.0], [0, 1, 2]),
+        ([0.0, 51.5, 254.9], [0, 52, 255]),
+        ([0.5, 20.5, 300.0], [0, 20, 255]),
+        ([-1.0, 0.5, 0.5], [0, 128, 128]),
+        ([0.0, 0.0, 0.0], [0, 0, 0]),
+    ],
+)
+def test_colours_are_fractions_or_bytes(values: list[float], expected: list[int]) -> None:
+    assert colour_bytes(np.array(values)).tolist() == expected
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply"])
+def test_a_bright_channel_and_an_uncoloured_vertex_leave_the_others_alone(
+    tmp_path: Path, suffix: str
+) -> None:
+    shades = ["1.0024 0.2 0", "0 0.2 0", "1 0.2 0"]
+    if suffix == "obj":
+        points = [
+            f"v {x} {y} {z} {shade}\n" for (x, y, z), shade in zip(TRIANGLE, shades, strict=True)
+        ]
+        text = "".join(points) + "v 5 5 5\nf 1 2 3\nf 4 1 2\n"
+    else:
+        names = "".join(f"property float {name}\n" for name in ("red", "green", "blue"))
+        text = header(names, "") + rows([*shades, "1 1 1"]) + "3 0 1 2\n3 3 0 1\n"
+    (tmp_path / f"a.{suffix}").write_text(text)
+    mesh = cr.load_mesh(tmp_path / f"a.{suffix}")
+    assert has_colours(mesh)
+    assert first_corners(mesh) == [[255, 51, 0], WHITE]
+
+
+def test_a_folder_beside_the_mesh_wins_over_one_of_textures(tmp_path: Path) -> None:
+    for folder in ("mesh", "textures"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.png").write_bytes(folder.encode())
+    source = MeshSource(tmp_path / "mesh" / "a.obj", [tmp_path / "textures"])
+    assert source.read("a.png") == b"mesh"
+    (tmp_path / "mesh" / "a.png").unlink()
+    assert source.read("a.png") == b"textures"
+    assert source.read("somewhere/else/a.png") == b"textures"
+
+
+@pytest.mark.parametrize(("suffix", "unit"), [("stl", "mm"), ("glb", "m")])
+def test_the_likely_unit_is_proposed(tmp_path: Path, suffix: str, unit: str) -> None:
+    box = trimesh.creation.box((200.0, 100.0, 50.0) if suffix == "stl" else (0.2, 0.1, 0.05))
+    path = tmp_path / f"a.{suffix}"
+    box.export(path)
+    given = None if suffix == "stl" else "mm"
+    with pytest.warns(CurviregWarning, match=rf"give the unit \({unit}\?\)"):
+        assert mesh_up(cr.load_mesh(path, unit=given)) == ("z" if suffix == "stl" else "y")
+    box.apply_scale(1e-9)
+    box.vertices *= 1e4
+    box.export(tmp_path / "b.stl")
+    with pytest.warns(CurviregWarning, match=r"give the unit$"):
+        cr.load_mesh(tmp_path / "b.stl")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nl 1 2\n", "3 points and no faces: a cloud of points"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+            "property float z\nelement tristrips 1\nproperty list int int vertex_indices\n"
+            "end_header\n0 0 0\n3 0 0 0\n",
+            "strips of triangles, which are not read; export triangles",
+        ),
+    ],
+)
+def test_what_a_mesh_without_faces_is(tmp_path: Path, name: str, text: str, match: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MeshError, match=match):
+        cr.load_mesh(tmp_path / name)

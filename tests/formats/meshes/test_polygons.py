@@ -1,0 +1,192 @@
+"""Polygons become triangles; what trimesh reads wrongly is rewritten or refused."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError
+from curvireg_torch.formats.meshes.polygons import divide_faces
+
+U = np.array([[0, 0], [3, 0], [3, 3], [2, 3], [2, 1], [1, 1], [1, 3], [0, 3]], dtype=float)
+
+
+def square_with_hole(n: int) -> np.ndarray:
+    square = np.array([[0, 0], [10, 0], [10, 10], [0, 10.0]])
+    angle = -np.linspace(0, 2 * np.pi, n, endpoint=False) - 3 * np.pi / 4
+    hole = 5 + 2 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([square, square[:1], hole, hole[:1]])
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_divide_faces_covers_polygons_once(axis: int, sign: int) -> None:
+    rng = np.random.default_rng(0)
+    turns = [
+        np.exp(1j * np.sort(rng.uniform(0, 2 * np.pi, n))) * rng.uniform(0.2, 1, n)
+        for n in (4, 5, 6, 9, 60)
+    ]
+    stars = [np.stack([turn.real, turn.imag], axis=-1) for turn in turns]
+    for flat in (U, *map(square_with_hole, (3, 8, 40)), *stars):
+        # in a tilted plane
+        polygon = np.insert(flat[::sign], axis, 0.3 * flat[::sign].sum(axis=1), axis=1)
+        # A plane over (u, v) of slope (0.3, 0.3): area grows by sqrt(1.18). Equal sums mean that
+        # none overlap.
+        a, b, c = np.moveaxis(
+            polygon[np.array(divide_faces(polygon, [list(range(len(polygon)))])[0])], 1, 0
+        )
+        (x, y), area = flat.T, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
+        expected = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
+        assert area == pytest.approx(expected * 1.18**0.5, rel=1e-9)
+
+
+def prism() -> tuple[np.ndarray, list[list[int]]]:
+    """A U of 3 x 3, 1 thick: two concave ends, eight walls."""
+    vertices = np.concatenate([np.insert(U, 2, 0.0, axis=1), np.insert(U, 2, 1.0, axis=1)])
+    walls = [[i, (i + 1) % 8, 8 + (i + 1) % 8, 8 + i] for i in range(8)]
+    return vertices, [list(range(7, -1, -1)), list(range(8, 16)), *walls]
+
+
+def write(path: Path, kind: str) -> None:
+    vertices, faces = prism()
+    points = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in vertices)
+    lists = "".join(f"{len(f)} {' '.join(map(str, f))}\n" for f in faces)
+    if kind == "off":
+        path.write_text(f"OFF # a U\n16 10 0\n\n{points}{lists}")
+    elif kind == "off with colours":
+        lists = "".join(f"{line} 255 0 0\n" for line in lists.splitlines())
+        path.write_text(f"OFF\n16 10 0\n{points}{lists}")
+    elif kind.startswith("obj"):
+        first = -16 if kind == "obj counted back" else 1
+        corner = "{0}/{0}/{0}" if kind == "obj with texture" else "{0}"
+        lines = ["f " + " ".join(corner.format(i + first) for i in f) for f in faces]
+        if kind == "obj continued":
+            lines = [line.replace(" 5 ", " 5 \\\n") for line in lines]
+        uv = "".join(f"vt {x / 4:g} {y / 4:g}\nvn 0 0 1\n" for x, y, _ in vertices) * (
+            kind == "obj with texture"
+        )
+        path.write_text(
+            "".join(f"v {p}\n" for p in points.splitlines()) + uv + "\n".join(lines) + "\n"
+        )
+    else:
+        colour = "property uchar red\nproperty uchar green\nproperty uchar blue\n" * (
+            kind == "ply with colours"
+        )
+        lists = "".join(f"{line}{' 255 0 0' * bool(colour)}\n" for line in lists.splitlines())
+        header = "ply\nformat ascii 1.0\ncomment a U\nelement vertex 16\n"
+        header += "".join(f"property float {axis}\n" for axis in "xyz") + "element face 10\n"
+        path.write_text(
+            f"{header}property list uchar int vertex_indices\n{colour}end_header\n{points}{lists}"
+        )
+
+
+KINDS = ["off", "off with colours", "obj", "obj counted back", "obj continued", "obj with texture"]
+KINDS += ["ply", "ply with colours"]
+
+
+def silhouette(mesh: trimesh.Trimesh) -> int:
+    T = torch.eye(4, dtype=torch.float64)
+    T[:3, 3] = torch.tensor([-1.5, -1.5, 8.0])
+    K = cr.camera_matrix(80.0, 80.0, 31.5, 31.5, dtype=torch.float64)
+    return int((cr.render_depth(mesh, T, K, (64, 64)) > 0).sum())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_load_mesh_leaves_the_gap_of_a_concave_face_open(tmp_path: Path, kind: str) -> None:
+    vertices, faces = prism()
+    path = tmp_path / f"u.{kind[:3]}"
+    write(path, kind)
+    mesh = cr.load_mesh(path)
+    fans = [[f[0], f[i], f[i + 1]] for f in faces for i in range(1, len(f) - 1)]
+    assert silhouette(trimesh.Trimesh(vertices, fans, process=False)) - silhouette(mesh) > 150
+    assert (mesh.area, len(mesh.faces)) == (pytest.approx(2 * 7 + 16), 2 * 6 + 8 * 2)
+    if kind == "ply with colours":
+        assert (mesh.metadata["colours"].corners == [255, 0, 0]).all()
+
+
+def test_divided_faces_of_an_obj_keep_texture_coordinates_at_their_corners(tmp_path: Path) -> None:
+    path = tmp_path / "u.obj"
+    write(path, "obj with texture")
+    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3) * 5
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd a.png\n")
+    path.write_text("mtllib a.mtl\nusemtl skin\n" + path.read_text())
+    mesh = cr.load_mesh(path)
+    uv = mesh.metadata["colours"].uv
+    np.testing.assert_allclose(uv, np.asarray(mesh.vertices)[mesh.faces][..., :2] / 4, atol=1e-6)
+    assert mesh.area == pytest.approx(30)
+
+
+def binary_ply(faces: list[list[int]], vertices: np.ndarray) -> bytes:
+    header = f"ply\nformat binary_big_endian 1.0\nelement vertex {len(vertices)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz") + f"element face {len(faces)}\n"
+    body = vertices.astype(">f4").tobytes() + b"".join(
+        struct.pack(f">B{len(f)}i", len(f), *f) for f in faces
+    )
+    return f"{header}property list uchar int vertex_indices\nend_header\n".encode() + body
+
+
+def test_load_mesh_reads_binary_ply_of_one_number_of_corners(tmp_path: Path) -> None:
+    vertices, faces = prism()
+    path = tmp_path / "u.ply"
+    path.write_bytes(binary_ply(faces[:2], vertices))
+    assert cr.load_mesh(path).area == pytest.approx(2 * 7)
+    # 12 corners as three quads
+    path.write_bytes(binary_ply([[0, 1, 2, 3], [4, 5, 6], [7, 8, 9, 10, 11]], vertices))
+    with pytest.raises(
+        MeshError, match="different numbers of corners are not read; export triangles"
+    ):
+        cr.load_mesh(path)
+    path.write_bytes(binary_ply(faces, vertices))
+    with pytest.raises(MeshError, match="different numbers of corners: export triangles"):
+        cr.load_mesh(path)
+
+
+BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+SIDES = [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]]
+
+
+@pytest.mark.parametrize("line", ["f {}", "  f {}", "\tf {}", "f {} # side", "f\t{}"])
+@pytest.mark.parametrize("triangles", [True, False])
+def test_load_mesh_reads_every_face_of_an_obj(tmp_path: Path, line: str, triangles: bool) -> None:
+    """trimesh drops indented faces and refuses comments behind them."""
+    faces = [
+        f for a, b, c, d in SIDES for f in ([[a, b, c], [a, c, d]] if triangles else [[a, b, c, d]])
+    ]
+    rows = [
+        f"f {' '.join(map(str, f))}" if k % 2 else line.format(" ".join(map(str, f)))
+        for k, f in enumerate(faces)
+    ]
+    path = tmp_path / "box.obj"
+    path.write_text(BOX + "\n".join(rows) + "\n")
+    mesh = cr.load_mesh(path)
+    assert (len(mesh.faces), abs(mesh.volume)) == (12, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1 2 0", "f 3/1/1 0/1/1 1/1/1", "f 0 1 2 3"])
+def test_load_mesh_refuses_obj_that_counts_from_0(tmp_path: Path, face: str) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(f"{BOX}{face}\n")
+    with pytest.raises(MeshError, match="vertex 0; OBJ files count from 1"):
+        cr.load_mesh(path)
+
+
+@pytest.mark.parametrize("kind", ["off", "obj", "ply"])
+def test_load_mesh_refuses_damaged_polygons(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"u.{kind[:3]}"
+    write(path, kind)
+    data = path.read_bytes()
+    for damaged in (
+        data.replace(b"\n8 7 6", b"\n8 99 6").replace(b"f 8 7 ", b"f 8 99 "),
+        data[: len(data) - 12],
+    ):
+        if kind == "obj" and damaged == data[:-12]:
+            continue  # a shorter OBJ is another OBJ
+        path.write_bytes(damaged)
+        with pytest.raises(MeshError, match=path.name):
+            cr.load_mesh(path)

@@ -1,0 +1,162 @@
+"""Textures of unknown origin: which formats are decoded, and how much of them."""
+
+import base64
+import json
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.formats.meshes import colours, source
+from curvireg_torch.mesh import has_colours, mesh_warnings, surface_colours
+from tests.formats.meshes.test_hostile_meshes import tree
+from tests.formats.meshes.test_obj import write as write_obj
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\nshowpage\n%%EOF\n"
+FORMATS = {"JPEG": True, "PNG": True, "TIFF": True, "WEBP": True, "BMP": True, "PPM": True}
+FORMATS |= {
+    "GIF": False,
+    "TGA": False,
+    "PCX": False,
+    "ICO": False,
+    "EPS": False,
+    "PDF": False,
+    "SGI": False,
+}
+
+
+def encoded(kind: str, size: tuple[int, int] = (8, 8), **how: object) -> bytes:
+    if kind == "EPS":
+        return POSTSCRIPT
+    pixels = np.random.default_rng(0).integers(0, 255, (*size[::-1], 3), np.uint8)
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, kind, **how)
+    return file.getvalue()
+
+
+def write(folder: Path, carrier: str, picture: bytes) -> Path:
+    """A mesh of one format whose texture is called a.png, whatever it holds."""
+    (folder / "a.png").write_bytes(picture)
+    if carrier == "obj":
+        return write_obj(folder, "newmtl label\nmap_Kd a.png\n")
+    path = folder / f"a.{carrier}"
+    if carrier == "ply":
+        text = "ply\nformat ascii 1.0\ncomment TextureFile a.png\nelement vertex 3\n"
+        text += "".join(f"property float {name}\n" for name in "xyzst") + "element face 1\n"
+        text += (
+            "property list uchar int vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 "
+            "0 "
+            "1\n3 0 1 2\n"
+        )
+        path.write_text(text)
+        return path
+    uri = "data:image/png;base64," + base64.b64encode(picture).decode()
+    content = tree(
+        images=[{"uri": "a.png"} if carrier == "gltf" else {"uri": uri}],
+        textures=[{"source": 0}],
+        materials=[{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
+        meshes=[{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "material": 0}]}],
+    )
+    content["accessors"].append(
+        {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}
+    )
+    path = folder / "a.gltf"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize("carrier", ["obj", "ply", "gltf", "data"])
+@pytest.mark.parametrize("kind", FORMATS)
+def test_only_the_formats_of_photographs_are_decoded(
+    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch, carrier: str, kind: str
+) -> None:
+    def refuse(*words: object, **how: object) -> None:
+        raise AssertionError(f"a program is started: {words} {how}")
+
+    monkeypatch.setattr("subprocess.Popen", refuse)
+    mesh, texts = load(write(tmp_path, carrier, encoded(kind)))
+    assert has_colours(mesh) == FORMATS[kind]
+    assert [warning.kind for warning in mesh_warnings(mesh)] == (
+        [] if FORMATS[kind] else ["texture"]
+    )
+    assert all("not an image that is read" in text for text in texts)
+
+
+def test_pictures_of_a_mesh_in_memory_are_checked_too(tmp_path: Path) -> None:
+    (tmp_path / "a.eps").write_bytes(POSTSCRIPT)
+    mesh = trimesh.creation.box()
+    with Image.open(tmp_path / "a.eps") as picture:
+        mesh.visual = trimesh.visual.TextureVisuals(uv=mesh.vertices[:, :2], image=picture)
+        with pytest.warns(UserWarning, match="the format EPS is not read"):
+            assert surface_colours(mesh) is None or not has_colours(mesh)
+
+
+def test_pixels_of_all_textures_together_are_bounded(
+    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = encoded("PNG", (40, 25))
+    path = write(tmp_path, "obj", picture)
+    library = "".join(f"newmtl m{k}\nmap_Kd {k}.png\n" for k in range(4))
+    (tmp_path / "a.mtl").write_text(library)
+    for k in range(4):
+        (tmp_path / f"{k}.png").write_bytes(picture)
+    head, _, faces = path.read_text().partition("usemtl label\n")
+    rows = faces.splitlines(keepends=True)
+    parts = [f"usemtl m{k}\n" + "".join(rows[3 * k : 3 * k + 3]) for k in range(4)]
+    path.write_text(head + "".join(parts))
+    monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 3999)
+    monkeypatch.setattr(colours, "MAX_TEXTURE_PIXELS", 3999)
+    mesh, texts = load(path)
+    found = surface_colours(mesh)
+    assert found is not None
+    assert len(found.textures) == 3
+    assert len(texts) == 1
+    assert (
+        "the texture 3.png cannot be used (the textures have more than 3,999 pixels together)"
+        in texts[0]
+    )
+    monkeypatch.setattr(source, "MAX_TEXTURE_PIXELS", 4000)
+    assert not load(path)[1]
+
+
+def test_a_texture_of_many_pixels_or_scans_is_left_out(
+    tmp_path: Path, load: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path, "obj", encoded("PNG", (200, 100)))
+    monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_PIXELS", 19_999)
+    assert "pixels; scale it down" in load(path)[1][0]
+    monkeypatch.undo()
+    path = write(tmp_path, "obj", encoded("JPEG", (64, 64), progressive=True))
+    assert not load(path)[1]
+    monkeypatch.setattr("curvireg_torch.utils.pictures.MAX_IMAGE_SCANS", 5)
+    assert "scans, more than 5" in load(path)[1][0]
+    path = write(tmp_path, "obj", encoded("PNG")[:60])
+    assert "a.png cannot be used" in load(path)[1][0]
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16"])
+def test_large_textures_are_reduced_in_every_mode(mode: str) -> None:
+    """Before they are converted to RGBA, which would take four times the memory."""
+    image = (
+        Image.new("L", (6400, 5600), 255).convert(mode)
+        if mode != "I;16"
+        else Image.new(mode, (6400, 5600), 65535)
+    )
+    file = BytesIO()
+    image.save(file, "TIFF")
+    pixels, count = colours.texture_pixels(file.getvalue(), 6400 * 5600)
+    assert count == 6400 * 5600
+    assert max(pixels.shape[:2]) == colours.TEXTURE_SIDE
+    assert pixels.shape[0] == round(colours.TEXTURE_SIDE * 5600 / 6400)
+    assert int(pixels.min()) >= 254 or mode == "CMYK"
+
+
+def test_a_mesh_without_any_colour_has_none(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n")
+    assert surface_colours(cr.load_mesh(tmp_path / "a.obj")) is None

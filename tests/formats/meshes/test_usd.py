@@ -1,0 +1,301 @@
+"""USD files, which are generated: their places, units, axes, colours and textures."""
+
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import curvireg_torch as cr
+from curvireg_torch.errors import MeshError, MissingDependencyError
+from curvireg_torch.formats.meshes import usd
+from curvireg_torch.formats.meshes.files import mesh_files
+from curvireg_torch.mesh import has_colours, mesh_up, surface_colours
+from curvireg_torch.mesh.colours import colours_at
+from curvireg_torch.utils import extras
+from curvireg_torch.utils.extras import is_installed
+
+Load = Callable[..., tuple[trimesh.Trimesh, list[str]]]
+pytestmark = pytest.mark.skipif(not is_installed("pxr"), reason="usd-core is not installed")
+
+SQUARE = """
+    def Mesh "square" ({api})
+    {{
+        point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0)]
+        int[] faceVertexCounts = [{counts}]
+        int[] faceVertexIndices = [{indices}]
+        {more}
+    }}
+"""
+MATERIAL = """
+    def Material "paint"
+    {
+        token outputs:surface.connect = </part/paint/shader.outputs:surface>
+        def Shader "shader"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor.connect = </part/paint/print.outputs:rgb>
+            token outputs:surface
+        }
+        def Shader "print"
+        {
+            uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @textures/print.png@
+            float2 inputs:st.connect = </part/paint/reader.outputs:result>
+            float3 outputs:rgb
+        }
+        def Shader "reader"
+        {
+            uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "map"
+            float2 outputs:result
+        }
+    }
+"""
+BOUND = 'prepend apiSchemas = ["MaterialBindingAPI"]'
+MAP = """rel material:binding = </part/paint>
+        texCoord2f[] primvars:map = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "faceVarying")
+"""
+
+
+def square(more: str = "", api: str = "", counts: str = "4", indices: str = "0, 1, 2, 3") -> str:
+    return SQUARE.format(more=more, api=api, counts=counts, indices=indices)
+
+
+def stage(
+    *parts: str, about: str = 'metersPerUnit = 0.001\n    upAxis = "Z"', place: str = ""
+) -> str:
+    body = "\n".join(parts)
+    return f'#usda 1.0\n(\n    {about}\n)\ndef Xform "part"\n{{\n{place}{body}\n}}\n'
+
+
+def png() -> bytes:
+    pixels = np.zeros((8, 8, 3), np.uint8)
+    pixels[:4] = 255, 0, 0
+    pixels[4:] = 0, 0, 255
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def package(path: Path, text: str, **more: bytes) -> Path:
+    """A USDZ: a zip without compression, whose contents begin at multiples of 64 bytes."""
+    with zipfile.ZipFile(path, "w") as file:
+        for name, content in {"part.usda": text.encode(), **more}.items():
+            entry = zipfile.ZipInfo(name.replace("__", "/").replace("_png", ".png"))
+            end = file.fp.tell() + 30 + len(entry.filename.encode())  # type: ignore[union-attr]
+            padding = -(end + 4) % 64
+            entry.extra = b"\x86\x19" + padding.to_bytes(2, "little") + bytes(padding)
+            file.writestr(entry, content)
+    return path
+
+
+def test_places_units_axes_and_polygons(tmp_path: Path, load: Load) -> None:
+    path = tmp_path / "part.usda"
+    place = (
+        "    double3 xformOp:translate = (10, 0, 5)\n    double3 xformOp:rotateXYZ = (90, 0, 0)\n"
+    )
+    place += '    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]\n'
+    path.write_text(stage(square(), place=place))
+    mesh, texts = load(path)
+    assert (mesh.units, mesh_up(mesh), texts) == ("mm", "z", [])
+    np.testing.assert_allclose(mesh.bounds, [[10, 0, 5], [12, 0, 6]], atol=1e-6)
+    np.testing.assert_allclose(mesh.face_normals, [[0, -1, 0]] * 2, atol=1e-6)
+    assert not has_colours(mesh)
+    path.write_text(stage(square('uniform token orientation = "leftHanded"'), place=place))
+    np.testing.assert_allclose(load(path)[0].face_normals, [[0, 1, 0]] * 2, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("about", "unit", "up", "width"),
+    [
+        ('metersPerUnit = 0.01\n    upAxis = "Y"', "cm", "y", 2.0),
+        ("metersPerUnit = 0.5", "m", "y", 1.0),  # a unit without a name
+        ('upAxis = "Z"', "cm", "z", 2.0),  # not stated: OpenUSD's centimetres
+    ],
+)
+def test_units_and_axes_are_those_of_the_stage(
+    tmp_path: Path, load: Load, about: str, unit: str, up: str, width: float
+) -> None:
+    path = tmp_path / "part.usda"
+    path.write_text(stage(square(), about=about))
+    mesh, _ = load(path)
+    assert (mesh.units, mesh_up(mesh)) == (unit, up)
+    assert mesh.extents[0] == pytest.approx(width)
+    if "metersPerUnit" not in about:
+        assert load(path, unit="mm")[0].units == "mm"
+
+
+def test_colours_of_the_mesh(tmp_path: Path, load: Load) -> None:
+    colours = "color3f[] primvars:displayColor = [(1, 0, 0), (0, 0, 1)]"
+    more = colours + ' (interpolation = "uniform")'
+    path = tmp_path / "part.usda"
+    path.write_text(stage(square(more, counts="3, 3", indices="0, 1, 2, 0, 2, 3")))
+    mesh, _ = load(path)
+    found = surface_colours(mesh)
+    assert found is not None
+    assert found.corners[:, 0].tolist() == [[255, 0, 0], [0, 0, 255]]
+    assert has_colours(mesh)
+
+
+@pytest.mark.parametrize("kind", ["usda", "usdz"])
+def test_textures_by_the_coordinates_that_they_name(tmp_path: Path, load: Load, kind: str) -> None:
+    text = stage(MATERIAL, square(MAP, BOUND))
+    path = tmp_path / f"part.{kind}"
+    if kind == "usda":
+        path.write_text(text)
+        (tmp_path / "textures").mkdir()
+        (tmp_path / "textures" / "print.png").write_bytes(png())
+        assert mesh_files(path) == [path, tmp_path / "textures" / "print.png"]
+    else:
+        package(path, text, textures__print_png=png())
+    mesh, texts = load(path)
+    assert not texts
+    found = surface_colours(mesh)
+    assert found is not None
+    near = np.array([0.8, 0.1], np.float32)
+    lower = colours_at(
+        found, np.array([0], np.int32), near[:1], near[1:]
+    )  # beside (2, 0), the bottom
+    assert lower[0].round().tolist() == [0, 0, 1]
+    if kind == "usda":
+        (tmp_path / "textures" / "print.png").unlink()
+        assert any("print.png is missing" in text for text in load(path)[1])
+
+
+def painted(colour: tuple[int, int, int]) -> bytes:
+    file = BytesIO()
+    Image.new("RGB", (4, 4), colour).save(file, "PNG")
+    return file.getvalue()
+
+
+def textures_of(mesh: trimesh.Trimesh) -> list[list[int]]:
+    colours = surface_colours(mesh)
+    assert colours is not None
+    return [texture[0, 0].tolist() for texture in colours.textures]
+
+
+def test_textures_lie_beside_the_file_that_names_them(tmp_path: Path, load: Load) -> None:
+    """A file of the same name beside the first one is another texture."""
+    for folder, colour in ((".", (255, 0, 0)), ("blue", (0, 0, 255))):
+        (tmp_path / folder / "textures").mkdir(parents=True)
+        (tmp_path / folder / "textures" / "print.png").write_bytes(painted(colour))
+    # without ./ OpenUSD looks beside the first file too
+    material = MATERIAL.replace("@textures", "@./textures")
+    text = stage(material, square(MAP, BOUND), about='defaultPrim = "part"')
+    (tmp_path / "blue" / "part.usda").write_text(text)
+    path = tmp_path / "all.usda"
+    path.write_text('#usda 1.0\ndef "a" (references = @blue/part.usda@)\n{\n}\n')
+    mesh, texts = load(path)
+    assert (textures_of(mesh), texts) == ([[0, 0, 255]], [])
+    (tmp_path / "blue" / "textures" / "print.png").unlink()
+    mesh, texts = load(path)
+    assert textures_of(mesh) == []
+    assert "blue/textures/print.png is missing" in texts[0]
+    packed = package(tmp_path / "p[1].usdz", text, textures__print_png=painted((0, 255, 0)))
+    for place in (packed, path):
+        path.write_text('#usda 1.0\ndef "a" (references = @p[1].usdz@)\n{\n}\n')
+        mesh, texts = load(place)
+        assert (textures_of(mesh), texts) == ([[0, 255, 0]], [])
+
+
+def test_a_texture_whose_file_is_an_input_of_the_material(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "print.png").write_bytes(painted((1, 2, 3)))
+    named = MATERIAL.replace(
+        "asset inputs:file = @textures/print.png@",
+        "asset inputs:file.connect = </part/paint.inputs:picture>",
+    )
+    surface = "        token outputs:surface.connect"
+    named = named.replace(surface, f"        asset inputs:picture = @print.png@\n{surface}", 1)
+    (tmp_path / "part.usda").write_text(stage(named, square(MAP, BOUND)))
+    assert textures_of(load(tmp_path / "part.usda")[0]) == [[1, 2, 3]]
+
+
+def test_textures_are_scaled(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "textures").mkdir()
+    (tmp_path / "textures" / "print.png").write_bytes(painted((255, 255, 255)))
+    path = tmp_path / "part.usda"
+    for more, tint, count in (
+        ("float4 inputs:scale = (0.2158605, 1, 0, 1)", [128, 255, 0], 0),
+        ("float4 inputs:scale = (2, 1, 1, 1)", [255, 255, 255], 1),
+        ("float4 inputs:bias = (0.1, 0, 0, 0)", [255, 255, 255], 1),
+    ):
+        scaled = MATERIAL.replace("asset inputs:file", f"{more}\n            asset inputs:file")
+        path.write_text(stage(scaled, square(MAP, BOUND)))
+        mesh, texts = load(path)
+        assert len(texts) == count
+        colours = surface_colours(mesh)
+        assert colours is not None
+        assert colours.corners[0, 0].tolist() == tint
+
+
+def test_references_stay_in_the_folder(tmp_path: Path, load: Load) -> None:
+    (tmp_path / "in").mkdir()
+    part = '#usda 1.0\n(\n    defaultPrim = "part"\n)\ndef Xform "part"\n{' + square() + "}\n"
+    (tmp_path / "in" / "other.usda").write_text(part)
+    (tmp_path / "other.usda").write_text(part)
+    text = '#usda 1.0\ndef "a" (references = @{name}@)\n{{\n}}\n'
+    path = tmp_path / "in" / "part.usda"
+    path.write_text(text.format(name="./other.usda"))
+    mesh, _ = load(path)
+    assert len(mesh.faces) == 2
+    assert mesh_files(path) == [path, tmp_path / "in" / "other.usda"]
+    for name in ("../other.usda", str(tmp_path / "other.usda")):
+        path.write_text(text.format(name=name))
+        with pytest.raises(MeshError, match="outside of its folder; flatten it"):
+            load(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("#usda 1.0\n(", "not a USD file, or damaged"),
+        ("a part", "not a USD file, or damaged"),
+        (stage(square(indices="0, 1, 2, 9")), "does not exist"),
+        (stage(square(counts="5")), "do not fit"),
+        (stage('    def PointInstancer "a" {}'), "point instancers"),
+        (stage('    def "a" (clips = {}) {}'), "value clips"),
+        (
+            stage('    def Cube "a" {}'),
+            r"has no faces: parts that are no meshes are left out \(Cube\)",
+        ),
+    ],
+)
+def test_what_is_not_read_is_refused(tmp_path: Path, load: Load, text: str, match: str) -> None:
+    (tmp_path / "part.usda").write_text(text)
+    with pytest.raises(MeshError, match=match):
+        load(tmp_path / "part.usda")
+
+
+def test_other_parts_are_named(tmp_path: Path, load: Load) -> None:
+    hidden = square('token visibility = "invisible"').replace('"square"', '"hidden"')
+    (tmp_path / "part.usda").write_text(stage(square(), '    def Cube "a" {}', hidden))
+    mesh, texts = load(tmp_path / "part.usda")
+    assert len(mesh.faces) == 2
+    assert any("no meshes are left out (Cube)" in text for text in texts)
+
+
+def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "part.usda"
+    path.write_text(stage(square()))
+    for name, value, match in (
+        ("MAX_MESH_FACES", 1, "more than 1 faces"),
+        ("MAX_MESH_PARTS", 0, "more than 0 parts"),
+        ("MAX_MESH_BYTES", 9, "more than 36 bytes"),
+        ("MAX_CAD_SECONDS", 0.001, "took more than 0.001 seconds"),
+    ):
+        monkeypatch.setattr(usd, name, value)
+        with pytest.raises(MeshError, match=match):
+            cr.load_mesh(path, unit="mm")
+        monkeypatch.undo()
+
+
+def test_the_message_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extras, "find_spec", lambda _: None)
+    (tmp_path / "part.usdz").write_text("a part")
+    with pytest.raises(MissingDependencyError, match=r"pip install 'curvireg_torch\[usd\]'"):
+        cr.load_mesh(tmp_path / "part.usdz")
