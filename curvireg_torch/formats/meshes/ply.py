@@ -1,8 +1,9 @@
 """PLY files, as trimesh parses them; which of their properties are coordinates, faces and colours
 is decided here.
 
-Once trimesh reads colours under their other names and of 16 bits, coordinates of corners and several
-textures, and says that a file ends too early, the half of this reader behind its parser can go.
+Once trimesh reads colours under their other names and of 16 bits, coordinates of corners and
+several textures, and says that a file ends too early, the half of this reader behind its parser can
+go.
 """
 
 import re
