@@ -480,3 +480,33 @@ def test_what_a_mesh_without_faces_is(tmp_path: Path, name: str, text: str, matc
     (tmp_path / name).write_text(text)
     with pytest.raises(MeshError, match=match):
         cr.load_mesh(tmp_path / name)
+
+
+def test_names_do_not_lead_out_of_a_folder_of_textures(tmp_path: Path) -> None:
+    for folder in ("mesh", "textures"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    (tmp_path / "textures" / "link.png").symlink_to(tmp_path / "secret.png")
+    source = MeshSource(tmp_path / "mesh" / "a.obj", [tmp_path / "textures"])
+    for name in ("../secret.png", "link.png", "../mesh/../secret.png"):
+        assert not source.has(name)
+        assert source.read_optional("texture", name) is None
+
+
+def test_a_mesh_of_a_robot_may_use_files_of_the_robots_folder(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "a.mtl").write_text("newmtl red")
+    (tmp_path / "meshes" / "a.obj").write_text("")
+    robot = MeshSource(tmp_path / "a.urdf")
+    part = robot.beside(tmp_path / "meshes" / "a.obj")
+    assert part.read("a.mtl") == b"newmtl red"
+    assert robot.requested == {tmp_path / "a.mtl"}
+
+
+def test_of_a_kind_of_warning_a_few_are_kept(tmp_path: Path) -> None:
+    source = MeshSource(tmp_path / "a.obj")
+    for k in range(8):
+        source.warn("texture", f"{k} is missing")
+        source.warn("texture", "0 is missing")
+    texts = [warning.text for warning in source.warnings]
+    assert texts == [*(f"{k} is missing" for k in range(5)), "and more of this kind"]
