@@ -91,6 +91,18 @@ def test_a_joint_moves_what_its_inverse_bind_matrix_has_moved(tmp_path: Path) ->
     np.testing.assert_allclose(mesh.vertices, [[0, 4, 0], [0, 5, 0], [-1, 4, 0]], atol=1e-6)
 
 
+def test_weights_of_joints_are_shares(tmp_path: Path) -> None:
+    tree = Tree()
+    part = tree.part(None, TRIANGLE)
+    part["attributes"]["JOINTS_0"] = tree.array([[0, 1, 0, 0]] * 3, "B")
+    part["attributes"]["WEIGHTS_0"] = tree.array([[3, 1, 0, 0]] * 3)
+    tree.content["skins"] = [{"joints": [1, 2]}]
+    tree.content["nodes"] = [{"mesh": 0, "skin": 0}, {}, {"translation": [0, 0, 4]}]
+    tree.content["scenes"] = [{"nodes": [0, 1, 2]}]
+    mesh = cr.load_mesh(tree.write(tmp_path / "a.gltf"))
+    np.testing.assert_allclose(mesh.vertices, np.add(TRIANGLE, [0, 0, 1]), atol=1e-6)
+
+
 def test_the_least_integer_of_a_fraction_is_minus_one(tmp_path: Path) -> None:
     tree = Tree()
     positions = tree.array([[-128, 0, 0], [127, 0, 0], [0, -127, 0]], "b", normalized=True)
@@ -387,6 +399,8 @@ def test_a_mirrored_part_keeps_its_outside_and_its_colours() -> None:
         moved = mesh.transformed(np.diag([*signs, 1.0]))
         assert moved.colours is not None
         assert moved.colours.corners[0].tolist() == corners
+        order = [corners.index(colour) for colour in (RED, GREEN, BLUE)]
+        assert moved.colours.uv[0, order].tolist() == [[0, 0], [1, 0], [0, 1]]
         normal = np.cross(*(moved.vertices[moved.faces[0, 1:]] - moved.vertices[moved.faces[0, 0]]))
         assert normal[2] > 0
         assert (moved.unit, moved.up) == ("mm", "y")
