@@ -140,12 +140,11 @@ def _check_sizes(tree: dict[str, Any]) -> None:
         for mesh in tree.get("meshes", [])
     ]
     copies = [meshes[_natural(node["mesh"])] for node in tree.get("nodes", []) if "mesh" in node]
-    for each in (meshes, copies):
-        parts, most = (sum(column) for column in zip((0, 0), *each, strict=True))
-        if parts > MAX_MESH_PARTS:
-            raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
-        if most > 3 * MAX_MESH_FACES:
-            raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
+    parts, most = (sum(column) for column in zip((0, 0), *copies, strict=True))
+    if parts > MAX_MESH_PARTS:
+        raise ValueError(f"more than {MAX_MESH_PARTS:,} parts; join them")
+    if most > 3 * MAX_MESH_FACES:
+        raise ValueError(f"more than {MAX_MESH_FACES:,} faces; simplify it")
 
 
 def _check_nodes(tree: dict[str, Any]) -> None:

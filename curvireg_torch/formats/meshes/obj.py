@@ -188,9 +188,9 @@ def _corners(lines: _Lines) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     before = np.repeat(before, counts, axis=0)
     if (indices[:, 0] == 0).any():
         raise ValueError("a face names vertex 0; OBJ files count from 1")
+    # 0, for no texture coordinate, becomes -1
     corners = np.where(indices < 0, before + indices, indices - 1)
     known = np.array([len(lines.points), len(lines.uv)])
-    corners[indices[:, 1] == 0, 1] = -1
     if (corners[:, 0] < 0).any() or (corners >= known).any() or (corners[:, 1] < -1).any():
         raise IndexError
     return corners, counts

@@ -204,6 +204,37 @@ def test_indices_below_zero_count_from_the_face(tmp_path: Path) -> None:
     ]
 
 
+def test_a_face_has_a_texture_if_all_its_corners_have_coordinates(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(painted((0, 255, 0)))
+    path = obj(tmp_path, {"a.mtl": "newmtl m\nKd 1 0 0\nmap_Kd a.png\n"}, "vt 0 0\nvt 1 1\n")
+    text = path.read_text().replace("f 1 2 3\n", "")
+    path.write_text(f"{text}f 1/1 2/2 3/2\nf 1/1 2/2 3\nf 1 2 3\n")
+    mesh = cr.load_mesh(path)
+    assert textures(mesh) == [GREEN, WHITE, WHITE]
+    assert first_corners(mesh) == [WHITE, RED, RED]
+
+
+@pytest.mark.parametrize(
+    ("options", "first", "last"),
+    [
+        ("", [0, 0], [1, 2]),
+        ("-s 3", [0, 0], [3, 2]),
+        ("-s 3 5 7", [0, 0], [3, 10]),
+        ("-o 3", [3, 0], [4, 2]),
+        ("-o 3 5 -s 2", [3, 5], [5, 7]),
+    ],
+)
+def test_coordinates_are_scaled_and_moved_along_each_axis(
+    tmp_path: Path, options: str, first: list[float], last: list[float]
+) -> None:
+    (tmp_path / "a.png").write_bytes(painted((0, 255, 0)))
+    library = f"newmtl m\nmap_Kd {options} a.png\n"
+    path = obj(tmp_path, {"a.mtl": library}, "vt 0 0\nvt 1 2\nf 1/1 2/2 3/2\n")
+    colours = surface_colours(cr.load_mesh(path))
+    assert colours is not None
+    assert colours.uv[1, :2].tolist() == [first, last]
+
+
 def test_weights_of_vertices_divide(tmp_path: Path) -> None:
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0 1\nv 2 0 0 2\nv 0 3 0\nv 0 0 4 0\nf 1 2 3\nf 1 2 4\n")

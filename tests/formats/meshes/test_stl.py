@@ -136,7 +136,7 @@ def test_an_ascii_file_that_is_cut_short_says_so(tmp_path: Path, load: Load) -> 
             "does not have three coordinates",
         ),
         (ascii_stl(point="  vertex {:.1f} {:.1f} x{:.1f}\n").encode(), "not a number"),
-        (b"solid", "got none"),
+        (b"solid", "has no faces: it does not end with endsolid"),
         (b"", "too early"),
         (b"nothing of the kind", "too early"),
     ],
