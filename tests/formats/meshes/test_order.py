@@ -425,6 +425,8 @@ def test_a_mirrored_part_keeps_its_outside_and_its_colours() -> None:
     colours = surface_colours(
         trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], vertex_colors=[RED, GREEN, BLUE])
     )
+    assert colours is not None
+    colours.uv[0] = [[0, 0], [1, 0], [0, 1]]
     mesh = ReadMesh(np.array(TRIANGLE), np.array([[0, 1, 2]]), colours, "mm", "y")
     for signs, corners in (((-1, 1, 1), [BLUE, GREEN, RED]), ((-1, -1, 1), [RED, GREEN, BLUE])):
         moved = mesh.transformed(np.diag([*signs, 1.0]))
