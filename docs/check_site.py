@@ -8,6 +8,7 @@ Nothing is fetched. Links to other hosts are not checked.
 
 import argparse
 import json
+import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -21,7 +22,7 @@ SEARCHED = {
     "Unity": "guides/blender-unity",
     "Blender": "guides/blender-unity",
     "ONNX": "guides/layers",
-    "unknown focal length": "guides/no-camera",
+    "unknown focal length": "guides/cameras",
 }
 """What people search for, and the page that they want."""
 
@@ -38,6 +39,7 @@ class Page(HTMLParser):
         self.links: list[str] = []
         self.undescribed: list[str] = []
         self.fetched: list[str] = []
+        self.dashed: list[str] = []
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
@@ -59,6 +61,9 @@ class Page(HTMLParser):
         ):
             self.undescribed.append(found.get("src") or "?")
 
+    def handle_data(self, data: str) -> None:
+        self.dashed += re.findall(r"\u2013[a-z][a-z-]+", data)
+
 
 def find_faults(root: Path) -> Iterator[str]:
     """One line for each broken link and each picture without alternative text."""
@@ -70,7 +75,12 @@ def find_faults(root: Path) -> Iterator[str]:
             yield f"{path}: {picture} has no alternative text"
         for address in page.fetched:
             yield f"{path}: {address} is fetched from elsewhere"
+        for option in page.dashed:
+            yield f"{path}: {option} begins with a dash that cannot be typed"
         for link in page.links:
+            if link.startswith("/"):
+                yield f"{path}: {link} is absolute"
+                continue
             parts = urlsplit(link)
             if parts.scheme or parts.netloc:
                 continue

@@ -54,8 +54,8 @@ def words_of(action: argparse.Action, formatter: argparse.HelpFormatter) -> str:
     return f"{names} {formatter._format_args(action, action.dest.upper())}"
 
 
-def rows(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """A row of the table for each argument and option."""
+def rows(parser: argparse.ArgumentParser) -> Iterator[tuple[str, str]]:
+    """Each argument and option as it is typed, and its meaning."""
     formatter = parser._get_formatter()
     for action in parser._actions:
         is_hidden = action.help == argparse.SUPPRESS or action.dest in COMMON
@@ -64,23 +64,42 @@ def rows(parser: argparse.ArgumentParser) -> Iterator[str]:
         help_text = formatter._expand_help(action) if action.help else ""
         needed = "required; " if action.required and action.option_strings else ""
         code = words_of(action, formatter).replace("|", "\\|")
-        yield f"| `{code}` | {cell(needed + help_text)} |"
+        yield code, cell(needed + help_text)
 
 
 def page() -> str:
-    """The page as Markdown."""
+    """The page as Markdown. An option that several commands have in one meaning is explained once,
+    below them."""
+    found = [
+        (name, summary, parser, list(rows(parser)))
+        for name, summary, parser in commands(build_parser())
+        if isinstance(parser, argparse.ArgumentParser)
+    ]
+    users: dict[tuple[str, str], list[str]] = {}
+    for name, _, _, table in found:
+        for row in table:
+            users.setdefault(row, []).append(name)
+    shared = {row: names for row, names in users.items() if len(names) > 1 and row[0][0] == "-"}
     parts = [HEAD]
-    for name, summary, parser in commands(build_parser()):
-        assert isinstance(parser, argparse.ArgumentParser)
-        table = list(rows(parser))
+    for name, summary, parser, table in found:
         parts.append(f"\n## curvireg {name}\n")
         description = cell(parser.description or "") or summary
         if description:
             parts.append(f"\n{description[0].upper()}{description[1:]}\n")
-        if table:
-            parts.append("\n| argument or option | meaning |\n|---|---|\n")
-            parts.append("\n".join(table) + "\n")
-    return "".join(parts)
+        own = [
+            f"| `{code}` | {meaning} |" for code, meaning in table if (code, meaning) not in shared
+        ]
+        if own:
+            parts.append("\n| argument or option | meaning |\n|---|---|\n" + "\n".join(own) + "\n")
+        others = [f"`{code.split()[0]}`" for code, meaning in table if (code, meaning) in shared]
+        if others:
+            parts.append(f"\n[Also](#options-of-several-commands) {', '.join(others)}.\n")
+    parts.append("\n## Options of several commands\n\n| option | meaning | of |\n|---|---|---|\n")
+    lines = [
+        f"| `{code}` | {meaning} | {', '.join(names)} |"
+        for (code, meaning), names in shared.items()
+    ]
+    return "".join([*parts, "\n".join(lines), "\n"])
 
 
 if __name__ == "__main__":

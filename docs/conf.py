@@ -1,6 +1,7 @@
 """Sphinx configuration: ``scripts/docs.sh`` builds the site from the pages, the docstrings and
 ``gallery``."""
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -42,6 +43,7 @@ html_math_renderer = "mathml"  # nothing is fetched from elsewhere
 html_theme = "furo"
 html_title = "curvireg_torch"
 html_copy_source = False
+smartquotes = False  # --azimuth stays as it is typed
 
 myst_heading_anchors = 4  # the same anchors as on GitHub
 
@@ -82,9 +84,9 @@ SHAPES = {"B", "C", "D", "F", "H", "K", "Module", "N", "Precision", "S", "T", "V
 types."""
 
 
-def site_links(text: str, file: Path) -> str:
+def site_links(text: str, file: Path, page: str) -> str:
     """Rewrite the links of ``file`` between files of the repository as links between pages of the
-    site."""
+    site, relative to ``page``."""
 
     def site_link(match: re.Match[str]) -> str:
         path = (file.parent / match[1]).resolve().relative_to(ROOT).as_posix()
@@ -93,7 +95,9 @@ def site_links(text: str, file: Path) -> str:
             path = "docs/index.md"
         elif path in COPIED_PAGES:
             path = f"docs/{COPIED_PAGES[path]}"
-        return f"](/{path.removeprefix('docs/')}" if path.startswith("docs/") else match[0]
+        if not path.startswith("docs/"):
+            return match[0]
+        return f"]({os.path.relpath(path.removeprefix('docs/'), Path(page).parent)}"
 
     return re.sub(r"\]\(([\w./+-]+\.(?:md|py))(?=[#)])", site_link, text)
 
@@ -101,7 +105,7 @@ def site_links(text: str, file: Path) -> str:
 def write_pages(app: Any, *_: Any) -> None:
     """Write the pages of ``docs/project``."""
     pages = {
-        page: site_links((ROOT / path).read_text("utf-8"), ROOT / path)
+        page: site_links((ROOT / path).read_text("utf-8"), ROOT / path, page)
         for path, page in COPIED_PAGES.items()
     }
     for page, text in {
@@ -117,7 +121,7 @@ def write_pages(app: Any, *_: Any) -> None:
 def rewrite_links(app: Any, page: str, source: list[str]) -> None:
     file = Path(app.env.doc2path(page))
     if file.suffix == ".md" and file.parent.name != "project":
-        source[0] = site_links(source[0], file)
+        source[0] = site_links(source[0], file, page)
 
 
 def resolve_short_names(app: Any, env: Any, node: Any, text: Any) -> Any:

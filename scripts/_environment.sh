@@ -23,6 +23,7 @@ new_enough "$venv/bin/python" && pip --version >/dev/null 2>&1 ||
 if ! "$venv/bin/python" -c 'import torch' 2>/dev/null; then
     index=https://download.pytorch.org/whl/cpu # asked beside the configured ones; no harm where it cannot be reached
     build= reason="a GPU is here"
+    echo "preparing $venv: asking the package index for torch" # which may take a while to answer
     if ! nvidia-smi -L >/dev/null 2>&1; then
         build=$(pip index versions torch --retries 0 --timeout 20 --extra-index-url "$index" 2>/dev/null |
             grep -o '[0-9][0-9.]*+cpu' | head -n 1 || true) # the newest; a tenth of a CUDA build and its libraries

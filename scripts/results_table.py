@@ -1,9 +1,10 @@
-"""Write the README's table of results from ``scripts/results/evaluation_*.json``.
+"""Write the tables of results, in words into the README and whole into docs/accuracy.md, from
+``scripts/results/evaluation_*.json``.
 
     python scripts/results_table.py --record DIR/summary.json NAME    store a summary of
     ``curvireg evaluate`` as NAME python scripts/results_table.py --compare DIR/summary.json ...
     print them beside the stored ones python scripts/results_table.py
-       write the table into the README
+       write the tables
 
 A stored summary contains the date and the commit at which it was recorded ("+": with uncommitted
 changes), so record it right after measuring.
@@ -36,6 +37,24 @@ BOP = (
 )
 
 
+WORDS = {
+    "hope_print": "Printed packages in clutter, with their print",
+    "hope": "The same packages, of a mesh without print",
+    "hope28": "27 household packages in clutter, of meshes without print",
+    "ycbv_mini": "Household objects in clutter (YCB-Video)",
+    "buddha": "A plaster figurine",
+    "dino": "A toy dinosaur",
+    "visp_boxes": "Boxes and cubes, of meshes without their print",
+    "lego": "A LEGO model",
+    "tless_tiago": "Industrial parts without texture (T-LESS)",
+    "tracebot": "Transparent canisters",
+    "lm": "Two figurines among clutter (LINEMOD)",
+    "lmo": "Small objects behind others (LINEMOD-Occlusion)",
+    "pascal3d_mini": "Cars, chairs and other things of the web, with another one's mesh and "
+    "without a camera (PASCAL3D+)",
+}
+"""What a set shows, in the order of the README's table."""
+
 LIGHTINGS = {"hope": 5, "hope_print": 5}  # per view; objects of these sets are not independent
 
 
@@ -59,7 +78,8 @@ def main() -> None:
     elif arguments.compare:
         print(comparison(arguments.compare, RESULTS))
     else:
-        update_page(REPOSITORY / "README.md", "results", table(RESULTS))
+        update_page(REPOSITORY / "README.md", "results", table_in_words(RESULTS))
+        update_page(REPOSITORY / "docs" / "accuracy.md", "sets", table(RESULTS))
 
 
 def record(summary: Path, name: str) -> Path:
@@ -100,12 +120,37 @@ def score(value: float | None, key: str) -> str:
     return degrees(value) if key.endswith("_err_deg") else percent(value)
 
 
+def stored_records(results: Path) -> list[dict[str, Any]]:
+    """The stored summaries, by name."""
+    paths = sorted(results.glob("evaluation_*.json"))
+    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+
+
+def table_in_words(results: Path) -> str:
+    """Markdown for readers who know none of the sets; sets without words are left out."""
+    records = {record["name"]: record for record in stored_records(results)}
+    confidences = results / "confidence.json"
+    sets = (
+        json.loads(confidences.read_text(encoding="utf-8"))["sets"] if confidences.exists() else []
+    )
+    of_set = {each["name"]: each for each in sets}
+    rows = [["objects", "number", "within 30°", "median error", "called reliable: of these right"]]
+    for name, words in WORDS.items():
+        if name not in records:
+            continue
+        summary = records[name]["summary"]
+        right = summary.get("acc_30_deg", summary.get("acc_pi_6"))
+        sure = of_set.get(name)
+        believed = "-" if sure is None else f"{sure['reliable']}: {sure['reliable_right']}"
+        values = [percent(right), degrees(summary["med_err_deg"])]
+        rows.append([words, counted(name, summary["n"]), *values, believed])
+    commits = sorted({records[name]["commit"] for name in WORDS if name in records})
+    return "\n".join([*table_lines(rows), "", f"Commit {', '.join(commits)}.", ""])
+
+
 def table(results: Path) -> str:
     """Markdown of all stored summaries."""
-    records = [
-        json.loads(path.read_text(encoding="utf-8"))
-        for path in sorted(results.glob("evaluation_*.json"))
-    ]
+    records = stored_records(results)
     parts = []
     for title, kind, (columns, definition), cells in (
         ("Viewpoints on PASCAL3D+", "pascal3d", PASCAL3D, pascal3d_cells),

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 FOLDER_FPS = 10.0  # frames per second of the overlay of a folder, or of a camera that does not tell
 
+FRAMES_TO_LOCK = 3  # after which a pose that is not believed is spoken of
 SCORES = ("confidence", "edge_support", "message")
 
 
@@ -153,6 +154,7 @@ class Tally:
     counts: Counter[str] = field(default_factory=Counter)
     first_message: str = ""  # why the first frame has no pose
     seconds_after_first: float = 0.0  # the first frame is registered
+    best_confidence: float = 0.0
     camera: str = ""  # in words, if its focal length is not known exactly
 
     @property
@@ -167,6 +169,17 @@ class Tally:
         else:
             self.first_message = pose.get("message", "")
         self.counts[pose["verdict"]] += 1
+        self.best_confidence = max(self.best_confidence, pose.get("confidence") or 0.0)
+
+    def doubt(self) -> str:
+        """What to say once, after the first frames, if the object was not found with certainty."""
+        from ..registration.following import BELIEVED_CONFIDENCE
+        from ..registration.words import two_decimals
+
+        if self.frames != FRAMES_TO_LOCK or self.best_confidence >= BELIEVED_CONFIDENCE:
+            return ""
+        best = two_decimals(self.best_confidence)
+        return f"not sure of the object yet (best confidence {best}); give --box or --start"
 
     @property
     def posed(self) -> int:
@@ -232,6 +245,8 @@ def _follow(
                 if table is not None:
                     table.add(_cells(pose))
                 tally.add(pose, took)
+                if doubt := tally.doubt():
+                    tqdm.write(f"curvireg: {doubt}", file=sys.stderr)
                 tally.camera = tally.camera or _camera_in_words(result)
                 if as_json:
                     print(json.dumps(pose, allow_nan=False), flush=True)

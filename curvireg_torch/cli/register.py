@@ -401,6 +401,11 @@ def _write_pose(
         chosen = {name: getattr(arguments, name) for name in ("stamp", "frame")}
         given = {name: value for name, value in chosen.items() if value is not None}
         write_ros(arguments.out, document, child=mesh.stem, **given)
+        if document["covariance"] is None:
+            print(
+                "curvireg: no pose_with_covariance.yaml, as this pose has no covariance",
+                file=sys.stderr,
+            )
 
 
 def _finish(arguments: argparse.Namespace, document: dict[str, Any]) -> None:
@@ -463,7 +468,7 @@ def _register_several(
 def print_result(document: Mapping[str, Any], out: Path) -> None:
     """Print a :func:`~curvireg_torch.registration.documents.result_document`; ``out`` is the folder
     of its files."""
-    from ..registration.words import remarks, two_decimals
+    from ..registration.words import measured, remarks, two_decimals
 
     confidence = NOT_CALIBRATED
     if document["confidence"] is not None:
@@ -483,10 +488,9 @@ def print_result(document: Mapping[str, Any], out: Path) -> None:
         print(line)
     _print_objects(document)
     if document["translation"] is not None:
-        print(
-            f"translation: {', '.join(f'{v:.4g}' for v in document['translation'])} "
-            f"{document['unit']}"
-        )
+        deviation = (document.get("camera") or {}).get("focal_deviation", 0.0)
+        numbers = ", ".join(measured(document["translation"], deviation))
+        print(f"translation: {numbers} {document['unit']}")
     if (deviations := document["standard_deviations"]) is not None:
         rotation, translation = (
             ", ".join("unknown" if v is None else f"{v:.2g}" for v in deviations[name])
@@ -585,6 +589,11 @@ def _advice(document: Mapping[str, Any]) -> str:
             f"the contours that were found leave its rotation open: take a sharper or closer "
             f"one, "
             f"and check {mesh}"
+        )
+    if document["verdict"] == "unsure":
+        return (
+            "look whether its contours fit in the overlay; a tight box, the --camera, --pose "
+            "upright or a pose prior make it surer"
         )
     return f"check that the box is tight, and {mesh}"
 

@@ -98,11 +98,15 @@ def compare(a: Run, b: Run) -> list[Comparison]:
     """
     for name in ("dataset", "root", "split"):
         if a.settings.get(name) != b.settings.get(name):
-            values = f"{a.settings.get(name)} and {b.settings.get(name)}"
-            raise InvalidInputError(f"compare: runs of different datasets: {name} {values}")
+            raise InvalidInputError(
+                f"compare: the {name} of one run is {a.settings.get(name)}, that of the other "
+                f"{b.settings.get(name)}; give two runs of the same dataset"
+            )
     keys = [key for key in a.errors if key in b.errors]
     if not keys:
-        raise InvalidInputError("compare: the runs have no object in common")
+        raise InvalidInputError(
+            "compare: the runs have no object in common; give two runs of the same objects"
+        )
     comparisons = []
     measures = DATASETS[a.dataset].scored.measures
     for score, (error, thresholds) in measures.items():

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from ..errors import CurviregError, ImageError, InvalidInputError, LostObjectError
+from ..geometry import rotation_error
 from ..geometry.calibration import Camera
+from ..geometry.cameras import point_in_cameras
 from ..geometry.pose_prior import PosePrior
 from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
@@ -28,12 +30,17 @@ TRUSTED_CONFIDENCE = 0.5
 KEPT_CONFIDENCE = 0.2
 # Confidence of a registration from which its pose is followed
 BELIEVED_CONFIDENCE = 0.5
+# Successive registrations that agree are followed from KEPT_CONFIDENCE on
+AGREEING_FRAMES = 3
+AGREEING_DEGREES = 15.0
+AGREEING_FRACTION = 0.1  # of the distance, by which the object's centre may have moved
 
 
 class Follower:
     """Registers frames one after the other: each starts from the pose of the frame before.
 
-    Frames are registered until a pose is believed, and tracked from then on (docs/method.md). Where
+    Frames are registered until a pose is believed, or three in a row agree, and tracked from then
+    on (docs/method.md). Agreement does not raise the confidence: a wrong pose may repeat. Where
     tracking is not trusted, contours are fitted around its pose and the result is compared with a
     registration (:func:`refine`); the more certain pose counts. Where neither finds the object, the
     frame is registered, and that pose is used only if it is reliable.
@@ -83,6 +90,8 @@ class Follower:
         self._tracker = Tracker(describer.contours, describer.hull, reliable=self._reliable)
         # confidence of the pose that tracking goes on from, if there is one
         self._base: float | None = None
+        # registrations in a row that agree, none of which is believed
+        self._agreeing: list[Tensor] = []
 
     @property
     def _fits_camera(self) -> bool:
@@ -184,13 +193,32 @@ class Follower:
         result = self.registrar(
             [image], None if box is None else [box], self.camera_matrix, prior=self.prior
         )[0]
-        if isinstance(result, Registration) and _confidence(result) >= least:
+        if isinstance(result, Registration) and (
+            _confidence(result) >= least or (self._base is None and self._is_repeated(result))
+        ):
             pose, K = result.projection
             with suppress(LostObjectError, ImageError):
                 self._start(replace(item, camera_matrix=K), pose, _confidence(result))
                 if self._fits_camera:
                     self.camera_matrix = result.camera
         return result
+
+    def _is_repeated(self, result: Registration) -> bool:
+        """Whether a pose that is not believed is about that of the frames before."""
+        if _confidence(result) < KEPT_CONFIDENCE:
+            self._agreeing = []
+            return False
+        pose = result.projection[0]
+        centre = self.registrar.describer.centre
+        if self._agreeing:
+            before = self._agreeing[-1]
+            at = point_in_cameras(pose, centre)
+            moved = torch.linalg.vector_norm(at - point_in_cameras(before, centre))
+            turned = float(rotation_error(pose[:3, :3], before[:3, :3]))
+            if turned > AGREEING_DEGREES or moved > AGREEING_FRACTION * at.norm():
+                self._agreeing = []
+        self._agreeing.append(pose)
+        return len(self._agreeing) >= AGREEING_FRAMES
 
     def _refined(self, item: ImageItem, starts: Tensor) -> Registration | FailedRegistration:
         """Refined poses; a registration that is not reliable does not raise the confidence."""

@@ -55,6 +55,53 @@ def camera_in_words(document: Mapping[str, Any]) -> list[str]:
     return [line] if line else []
 
 
+def used_camera_in_words(document: Mapping[str, Any]) -> str:
+    """The camera with which a pose was found; where its focal length is not known exactly, how far
+    away the object is, how certain that is, and why.
+
+    Example:
+        >>> camera = {"matrix": [[1450, 0, 960], [0, 1450, 540], [0, 0, 1]], "source": "given"}
+        >>> document = {"camera": {**camera, "focal_deviation": 0.0}, "camera_source": "file"}
+        >>> used_camera_in_words(document)
+        'camera: 1450 1450 960 540 px, from a calibration file'
+        >>> camera |= {"source": "estimated", "focal_deviation": 0.25}
+        >>> used_camera_in_words({"camera": camera, "translation": [0, 0, 0.555], "unit": "m"})
+        'about 0.56 m away, +- 25 %: the camera is unknown (give it)'
+    """
+    camera = document.get("camera")
+    if camera is None:
+        return ""
+    deviation = camera["focal_deviation"]
+    if not deviation or document["translation"] is None:
+        (fx, _, cx), (_, fy, cy), _ = camera["matrix"]
+        numbers = " ".join(f"{v:.5g}" for v in (fx, fy, cx, cy))
+        is_file = document.get("camera_source") == "file"
+        return f"camera: {numbers} px, {'from a calibration file' if is_file else 'as given'}"
+    reasons = {
+        "exif": "the camera is that of the file's EXIF",
+        "given": "the camera is known by its field of view",
+    }
+    reason = reasons.get(camera["source"], "the camera is unknown (give it)")
+    distance = measured(document["translation"], deviation)[2]
+    return f"about {distance} {document['unit']} away, +- {100 * deviation:.0f} %: {reason}"
+
+
+def measured(translation: Sequence[float], deviation: float = 0.0) -> list[str]:
+    """Components of a translation with the digits that its relative ``deviation`` leaves, at least
+    two; four where it is not known.
+
+    Example:
+        >>> measured([135.71, -216.84, 555.43], 0.25), measured([0.1, 0.0, 1.23456])
+        (['140', '-220', '560'], ['0.1', '0', '1.235'])
+    """
+    if not deviation:
+        return [f"{v:.4g}" for v in translation]
+    digits = max(2, 1 + math.floor(-math.log10(deviation)))
+    longest = max(map(abs, translation)) or 1.0
+    decimals = digits - 1 - math.floor(math.log10(longest))
+    return [f"{round(v, decimals) + 0.0:.{max(decimals, 0)}f}" for v in translation]
+
+
 def focal_length_in_words(
     camera: Mapping[str, Any], picture: Mapping[str, Any] | None = None
 ) -> str:

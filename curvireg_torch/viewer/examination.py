@@ -1,6 +1,7 @@
 """Which sides of the mesh on the page look alike: found in a thread, while nothing else is done."""
 
 import asyncio
+import math
 import time
 import traceback
 from functools import partial
@@ -48,8 +49,17 @@ class Examination:
         mesh = self.session.mesh
         if self.running or searching or mesh is None or self._is_current():
             return
+        self._begin(mesh, MAX_SECONDS)
+
+    def start_patiently(self) -> None:
+        """Examine the mesh again, without a limit."""
+        if not self.running and self.session.mesh is not None:
+            self.advice = ""
+            self._begin(self.session.mesh, math.inf)
+
+    def _begin(self, mesh: trimesh.Trimesh, seconds: float) -> None:
         self._subject = mesh, registrar_key(self.session.request())
-        self._deadline = time.monotonic() + MAX_SECONDS
+        self._deadline = time.monotonic() + seconds
         self._task = asyncio.create_task(self._run(*self._subject))
 
     def _is_current(self) -> bool:

@@ -6,8 +6,10 @@ from typing import Any
 
 from nicegui import ui
 
+from ..errors import CurviregError
+from .examination import TOO_LONG
 from .session import STATIC
-from .side import Answers, Inputs, Preview
+from .side import Answers, CameraPanel, Inputs, Preview, Space
 from .stage import Stage
 from .widgets import button, file_chooser, region, set_enabled, set_text, text
 from .workspace import Workspace
@@ -51,19 +53,27 @@ def build_page(workspace: Workspace) -> None:
         stage = Stage(workspace)
         with region("div", "side"):
             steps = Steps(workspace)
+            camera = CameraPanel(workspace)
             answers = Answers(workspace)
+            space = Space(workspace)
             preview = Preview(workspace)
             inputs = Inputs(workspace)
 
     async def refresh() -> None:
         workspace.examination.start_if_due(searching=workspace.searching)
         steps.refresh()
-        inputs.refresh()
-        await stage.refresh()
-        await answers.refresh()
-        await preview.refresh()
+        for part in (camera, inputs, stage, answers, space, preview):
+            await part.refresh()
 
-    ui.timer(TICK_SECONDS, refresh)
+    async def refresh_safely() -> None:
+        try:
+            await refresh()
+        except CurviregError as error:  # else all that comes after it would stand still
+            workspace.messages["page"] = session.without_folders(str(error))
+            steps.show_messages()
+
+    session = workspace.session
+    ui.timer(TICK_SECONDS, refresh_safely)
 
 
 class Steps:
@@ -97,6 +107,9 @@ class Steps:
                             self.no_photo = button(
                                 "Remove it", workspace.remove_photo, "no-photo", "quiet"
                             )
+                            self.restore = button(
+                                "Bring it back", workspace.restore_photo, "restore-photo", "quiet"
+                            )
                             self.no_rig = button(
                                 "Without the rig",
                                 lambda: workspace.open_rig(None),
@@ -105,6 +118,12 @@ class Steps:
                             )
                     if name == "mesh":
                         self.facts["advice"] = text("p", "", "facts", data_testid="mesh-advice")
+                        self.examine = button(
+                            "Look all the same",
+                            workspace.examination.start_patiently,
+                            "examine",
+                            "quiet below",
+                        )
                         self.use_mm = button(
                             "Use mm",
                             lambda: workspace.set_option("unit", "mm"),
@@ -128,22 +147,30 @@ class Steps:
     def _find(self) -> None:
         self.workspace.start_search()  # the task outlives the page
 
+    def show_messages(self) -> None:
+        """Show what the workspace has to say about each part."""
+        messages = {"rig": self.session.rig_gaps(), **self.workspace.messages}
+        messages["pose"] = self.workspace.pose_message()
+        for part, element in self.messages.items():
+            set_text(element, messages.get(part, ""))
+
     def refresh(self) -> None:
         """Show the state of the workspace."""
         session = self.session
         workspace = self.workspace
         shot = self.session.shot
-        for part, element in self.messages.items():
-            set_text(
-                element, workspace.messages.get(part, session.rig_gaps() if part == "rig" else "")
-            )
+        self.show_messages()
         done = {"photograph": shot.photo, "mesh": session.mesh_path, "box": shot.box or shot.result}
         for name, card in self.cards.items():
-            card.classes(**{"add" if done[name] else "remove": "done"})
+            doubtful = bool(done[name] and workspace.messages.get(name))
+            card.classes(**{"add" if done[name] and not doubtful else "remove": "done"})
+            card.classes(**{"add" if doubtful else "remove": "doubt"})
         set_text(self.facts["photograph"], self._describe_photo())
         set_text(self.facts["mesh"], self._describe_mesh())
         examining = EXAMINING if workspace.examination.running else ""
-        set_text(self.facts["advice"], workspace.examination.advice or examining)
+        advice = workspace.examination.advice
+        set_text(self.facts["advice"], advice or examining)
+        self.examine.set_visibility(advice == TOO_LONG)
         box = " ".join(f"{v:g}" for v in shot.box or ())
         set_text(self.facts["box"], box or (BOX_HINT_IN_RIG if shot.view else BOX_HINT))
         together = len(session.together())
@@ -154,6 +181,7 @@ class Steps:
         self.no_rig.set_visibility(session.rig_path is not None)
         self.no_box.set_visibility(shot.box is not None)
         self.no_photo.set_visibility(shot.photo is not None)
+        self.restore.set_visibility(session.removed is not None)
         self.use_mm.set_visibility(workspace.asks_for_unit and session.options.unit != "mm")
         words = (
             "Find the pose" if shot.box or shot.photo is None else "Find the object and its pose"

@@ -38,37 +38,35 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
             "cr.load_camera('CALIBRATION')).image"
         )
         photos = list(map(read.format, photos))
-    more = {
-        name: getattr(request, name)
-        for name in ("link", "textures")
-        if getattr(request, name) is not None
-    }
-    given = "".join(f", {name}={str(value)!r}" for name, value in more.items())
-    model = f"cr.load_mesh({mesh}, unit={request.unit!r}, up={request.up!r}{given})"
-    model = f"cr.ViewBank.load({mesh})" if request.meshes[0].suffix == ".safetensors" else model
-    pipeline = (
-        f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else "cr.Pipeline()"
+    of_mesh = _given(unit=request.unit, up=request.up)
+    of_registrar = _given(mesh_is=request.mesh_is)
+    if pipeline := _pipeline(request):
+        of_registrar = f", pipeline={pipeline}{of_registrar}"
+    of_parts = _given(
+        link=request.link, textures=None if request.textures is None else str(request.textures)
     )
-    pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
-    pipeline = f"{pipeline}.with_pose_prior({request.pose!r})" if request.pose else pipeline
-    pipeline = "None" if request.bank_decides and not request.pose else pipeline
+    is_bank = request.meshes[0].suffix == ".safetensors"
+    model = f"cr.load_mesh({mesh}{of_mesh}{of_parts})"
+    model = f"cr.ViewBank.load({mesh})" if is_bank else model
+    registrar = f"registrar = cr.Registrar({model}{of_registrar})"
     if result.photographs:
         call = [
+            registrar,
             f"cameras = {[row['camera']['matrix'] for row in rows]}",
             f"T_cam_from_world = {[row['T_cam_from_world'] for row in rows]}",
             f"photos, boxes = [{', '.join(photos)}], {list(boxes)}",
             "result = registrar.register_views(photos, boxes, cameras, T_cam_from_world)",
         ]
     else:
-        call = [
-            f"prior = {None if prior is None else f'cr.PosePrior(**{prior.to_dict()})'}",
-            f"box, camera = {request.box}, {result.document['inputs']['camera']}",
-            f"result = cr.register({photos[0]}, registrar, box=box, camera=camera, prior=prior)",
-        ]
+        given = _given(box=request.box, camera=result.document["inputs"]["camera"])
+        given += "" if prior is None else f", prior=cr.PosePrior(**{prior.to_dict()})"
+        if of_registrar or of_parts or is_bank:
+            call = [registrar, f"result = cr.register({photos[0]}, registrar{given})"]
+        else:
+            call = [f"result = cr.register({photos[0]}, {mesh}{given}{of_mesh})"]
     lines = [
         "import curvireg_torch as cr",
         "",
-        f"registrar = cr.Registrar({model}, pipeline={pipeline}, mesh_is={request.mesh_is!r})",
         *call,
         f"pose = result.hypotheses[{result.answer.number}].pose_dict()",
         *(
@@ -78,6 +76,20 @@ def python_program(shot: Shot, name: Callable[[Path], str]) -> str:
         ),
     ]
     return "\n".join([*lines, "print(pose)", ""])
+
+
+def _given(**values: Any) -> str:
+    """Arguments of a call without those that are not given."""
+    return "".join(f", {name}={value!r}" for name, value in values.items() if value is not None)
+
+
+def _pipeline(request: RegisterOptions) -> str:
+    """The pipeline of a request as Python, empty for the default one, or that of a bank."""
+    pipeline = f"cr.Pipeline.read({str(request.pipeline)!r})" if request.pipeline else ""
+    pipeline = f"cr.pipeline.PRESETS[{request.preset!r}]" if request.preset else pipeline
+    if request.pose:
+        return f"{pipeline or 'cr.Pipeline()'}.with_pose_prior({request.pose!r})"
+    return "" if request.bank_decides else pipeline
 
 
 def command_line(options: RegisterOptions, name: Callable[[Path], str], rig: str = "") -> str:

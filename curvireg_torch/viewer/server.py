@@ -233,7 +233,8 @@ def add_page(workspace: Workspace) -> None:
         try:
             if not length.isdigit() or int(length) > MAX_MESH_BYTES:
                 raise InvalidInputError(f"{name}: a file may have {MAX_MESH_BYTES:,} bytes")
-            await workspace.receive(name, int(length), request.stream())
+            is_first = request.headers.get("x-first", "1") == "1"
+            await workspace.receive(name, int(length), request.stream(), is_first=is_first)
         except InvalidInputError as error:
             workspace.messages["file"] = str(error)
             return PlainTextResponse(

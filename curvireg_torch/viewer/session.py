@@ -14,7 +14,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from ..data import read_photo
+from ..data import load_camera, read_photo
 from ..errors import (
     MAX_VIEWER_PHOTOGRAPHS,
     CurviregError,
@@ -55,6 +55,7 @@ class Session:
             changes it.
         folder: of uploaded files, which messages call by their names alone.
         shots, shot: the photographs, and the one that is shown; an empty one before the first.
+        removed: the photograph that was removed last, and its number.
         rig_path, rig: the file of a rig, and its rows; none if it could not be read.
         mesh_path, mesh, mesh_facts: the mesh, and what it is in words.
         searched: photographs in which a registration runs.
@@ -65,6 +66,7 @@ class Session:
     folder: Path | None = None
     shots: list[Shot] = field(default_factory=list)
     shot: Shot = field(default_factory=Shot)
+    removed: tuple[int, Shot] | None = None
     rig_path: Path | None = None
     rig: tuple[View, ...] = ()
     searched: tuple[Shot, ...] = ()
@@ -111,6 +113,7 @@ class Session:
         """Forget the photographs, the rig and the mesh."""
         self.shots = []
         self.shot = Shot()
+        self.removed = None
         self.mesh_path = None
         self.mesh = None
         self.rig_path = None
@@ -118,13 +121,28 @@ class Session:
 
     def open_photo(self, path: Path, box: Numbers | None = None) -> Shot:
         """Add a photograph, and show it; a box in it loses its distortion too."""
+        self._check_number(path)
+        self.shot = self._opened(path, box, self._row_of(path, self.shots), self.options.camera)
+        self.shots.append(self.shot)
+        return self.shot
+
+    def _check_number(self, path: Path) -> None:
         if len(self.shots) >= MAX_VIEWER_PHOTOGRAPHS:
             raise InvalidInputError(
                 f"{MAX_VIEWER_PHOTOGRAPHS} photographs are open; remove one", subject=path
             )
-        self.shot = self._opened(path, box, self._row_of(path, self.shots))
-        self.shots.append(self.shot)
-        return self.shot
+
+    def restore_photo(self) -> None:
+        """Open the photograph again that was removed last, with its box and its result, and show
+        it."""
+        if self.removed is None:
+            return
+        number, shot = self.removed
+        self._check_number(shot.path)
+        shot = self._open_again(shot, self._row_of(shot.path, self.shots), self.options.camera)
+        self.shots.insert(number, shot)
+        self.shot = shot
+        self.removed = None
 
     def remove_photo(self, shot: Shot) -> None:
         """Close a photograph; if it is shown, the next one is shown instead."""
@@ -132,14 +150,16 @@ class Session:
             return
         number = self.shots.index(shot)
         del self.shots[number]
+        self.removed = number, shot
         if shot is self.shot:
             self.shot = self.shots[min(number, len(self.shots) - 1)] if self.shots else Shot()
 
-    def _opened(self, path: Path, box: Numbers | None, view: View | None) -> Shot:
+    def _opened(
+        self, path: Path, box: Numbers | None, view: View | None, camera: Numbers | Camera | None
+    ) -> Shot:
         """A photograph and a box, those of a ``view`` of a rig if there is one, without the
         distortion of the camera, which must fit the photograph."""
         photo = read_photo(path)
-        camera = self.options.camera
         if view is not None:
             camera = view.camera
             box = box if box is not None or view.box is None else numbers(view.box)
@@ -156,10 +176,10 @@ class Session:
         notes = (*photo.notes, *["undistorted"] * camera.distorts)
         return Shot(path, replace(photo, image=image, notes=notes), box, view)
 
-    def _open_again(self, shot: Shot, view: View | None) -> Shot:
+    def _open_again(self, shot: Shot, view: View | None, camera: Numbers | Camera | None) -> Shot:
         """A photograph with another camera, or row of a rig. Its box stays unless distortion is
         removed, or no longer is; its result only where no rig is concerned."""
-        opened = self._opened(shot.path, None, view)
+        opened = self._opened(shot.path, None, view, camera)
         if opened.is_undistorted or shot.is_undistorted:
             return opened
         if view is not None or shot.view is not None:
@@ -173,7 +193,9 @@ class Session:
 
     def open_rig(self, path: Path | None) -> None:
         """Read a rig, as ``curvireg register --views`` does, or forget it; its rows belong to
-        photographs by their file names. A rig that cannot be used has no rows."""
+        photographs by their file names. A rig that cannot be used has no rows; one that cannot be
+        forgotten, as the camera does not fit its photographs, stays."""
+        before = self.rig_path, self.rig
         self.rig_path = path
         self.rig = ()
         try:
@@ -181,6 +203,9 @@ class Session:
             self._match_rig()
         except CurviregError as error:
             self.rig = ()
+            if path is None:
+                self.rig_path, self.rig = before
+                raise
             self._match_rig()
             folder = "" if path is None else path if path.is_dir() else path.parent
             subject = str(error.subject).replace(f"{folder}/", "")
@@ -211,7 +236,10 @@ class Session:
         shots: list[Shot] = []
         for shot in self.shots:
             view = self._row_of(shot.path, shots)
-            shots.append(self._open_again(shot, view) if view or shot.view else shot)
+            is_concerned = view is not None or shot.view is not None
+            shots.append(
+                self._open_again(shot, view, self.options.camera) if is_concerned else shot
+            )
         self._replace_shots(shots)
 
     def _row_of(self, path: Path, shots: Sequence[Shot]) -> View | None:
@@ -264,18 +292,23 @@ class Session:
         Boxes and results stay unless distortion is removed, or no longer is; after an error nothing
         has changed.
         """
-        before = self.options
-        self.options = replace(self.options, camera=camera, guess=guess)
         try:
-            calibrated = isinstance(camera, Camera) or isinstance(before.camera, Camera)
-            shots = [
-                self._open_again(shot, None) if calibrated and not shot.view else shot
-                for shot in self.shots
-            ]
-        except CurviregError:
-            self.options = before
-            raise
+            check_camera(camera, guess)
+        except InvalidInputError as error:  # of the option of this name
+            words = str(error).replace("--fov", "field of view")
+            raise InvalidInputError(words.removeprefix("--")) from error
+        calibrated = isinstance(camera, Camera) or isinstance(self.options.camera, Camera)
+        shots = [
+            self._open_again(shot, None, camera) if calibrated and not shot.view else shot
+            for shot in self.shots
+        ]
+        # at once: the page looks at them meanwhile
+        self.options = replace(self.options, camera=camera, guess=guess)
         self._replace_shots(shots)
+
+    def open_calibration(self, path: Path) -> None:
+        """Take the camera of a calibration file."""
+        self.set_camera(load_camera(path))
 
     def open_mesh(self, path: Path) -> None:
         """Check that a mesh or a bank can be used, and describe it; it replaces the one before."""
@@ -293,7 +326,7 @@ class Session:
         self.mesh_path = path
         self.mesh = mesh
         self.mesh_facts = facts
-        for shot in self.shots:
+        for shot in (*self.shots, *([self.removed[1]] if self.removed else [])):
             shot.result = None
         # boxes of a BOP scene are those of the mesh
         if self.rig_path is not None and self.rig_path.is_dir():

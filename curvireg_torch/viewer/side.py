@@ -1,21 +1,42 @@
 """The column beside the photograph: the answers to choose from, the model, and the inputs besides
 files and box."""
 
+import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import torch
 from nicegui import ui
 
 from ..errors import MAX_VIEWER_FACES
 from ..geometry import Camera, rotation_error
 from ..jobs.store import to_json
 from ..mesh import mesh_unit, mesh_up
-from ..registration.words import pose_in_words, remarks, two_decimals, view_in_words
+from ..registration.words import (
+    measured,
+    pose_in_words,
+    remarks,
+    two_decimals,
+    used_camera_in_words,
+    view_in_words,
+)
 from ..utils.choices import PRESET_NAMES, UNITS, UP_AXES
 from ..visualization.sheet import thumbnail
 from .shot import Answer, Numbers, Result, Shot, numbers
-from .widgets import button, file_chooser, fold, region, set_text, text
+from .widgets import (
+    button,
+    field,
+    file_chooser,
+    fold,
+    region,
+    set_enabled,
+    set_text,
+    show_value,
+    text,
+)
 from .workspace import Workspace
 
 DOWNLOADS = {
@@ -28,6 +49,8 @@ VERDICTS = {
     "unsure": "It may be another of the answers below, or none. Choose the one whose contours fit.",
     "no match": "Probably it is not right: check the mesh, its unit and the box, or choose "
     "another answer.",
+    "your choice": "You chose another answer than the first, which was {verdict}"
+    " ({confidence}). Its contours should fit better than those of the first.",
     "by hand": "You set this pose. How probable it is, nobody has measured.",
 }
 UNDISTORTED = (
@@ -40,10 +63,10 @@ NOT_IN_RIG = (
     "rig, and "
     "open all photographs."
 )
-PROBABILITY = "estimated probability that this answer is within 30 degrees of the truth"
+CONFIDENCE = "estimated probability that this answer is within 30 degrees of the truth"
 CAMERA_HINT = (
-    "With it the position is found. All photographs have the same: type it, or choose a "
-    "calibration."
+    "With it the distance is exact. All photographs have the same: type it and press Enter, or "
+    "choose a calibration."
 )
 UNIT_CHOICES: Mapping[str | None, str] = {
     None: "as the file says, else m",
@@ -68,7 +91,7 @@ class Answers:
         ) as self.section:
             with region("div", "verdict"):
                 self.word = text("h2", "", data_testid="verdict")
-                self.certainty = text("p", "", title=PROBABILITY, data_testid="certainty")
+                self.certainty = text("p", "", title=CONFIDENCE, data_testid="certainty")
                 with region("div", "row"):
                     for name in DOWNLOADS:
                         button(
@@ -84,6 +107,7 @@ class Answers:
                         type="button",
                         data_copy="python",
                     )
+                self.camera = text("p", "", "camera", data_testid="used-camera")
                 self.meaning = text("p", "", "facts")
                 self.repairs = region("div", "row", data_testid="repairs")
             self.cards = region(
@@ -128,12 +152,17 @@ class Answers:
         if shot.view is not None:
             pose = replace(pose, rotation=shot.projection[0][:3, :3])
         word = "by hand" if answer.edits else document["verdict"]
+        word = "your choice" if answer.number and not answer.edits else word
         set_text(self.word, word)
         self.word.classes(replace=f"badge {word.replace(' ', '-')}")
-        set_text(self.meaning, VERDICTS[word])
+        first = result.document
+        of_first = "unknown" if first["confidence"] is None else two_decimals(first["confidence"])
+        meaning = VERDICTS[word].format(verdict=first["verdict"], confidence=of_first)
+        set_text(self.meaning, meaning)
+        set_text(self.camera, used_camera_in_words(document))
         confidence = document["confidence"]
         set_text(
-            self.certainty, "" if confidence is None else f"probability {two_decimals(confidence)}"
+            self.certainty, "" if confidence is None else f"confidence {two_decimals(confidence)}"
         )
         mesh = result.registrar.bank.mesh
         front = (self.session.options.limits or {}).get("front")
@@ -144,13 +173,13 @@ class Answers:
         if pose.translation is not None:
             unit = mesh_unit(mesh) or "in the mesh's unit"
             frame = "translation" if shot.view is None else "translation in the world"
-            lines.append(
-                f"{frame} {', '.join(f'{v:.4g}' for v in pose.translation.tolist())} {unit}"
-            )
-        numbers = {"score": document["score"], "edge support": document["edge_support"]}
+            deviation = (document.get("camera") or {}).get("focal_deviation", 0.0)
+            numbers = ", ".join(measured(pose.translation.tolist(), deviation))
+            lines.append(f"{frame} {numbers} {unit}")
+        measures = {"score": document["score"], "edge support": document["edge_support"]}
         lines += [
             f"{name} {value:.2f}"
-            for name, value in numbers.items()
+            for name, value in measures.items()
             if value is not None and value == value
         ]
         if shot.view is not None:
@@ -232,23 +261,12 @@ class Inputs:
     def __init__(self, workspace: Workspace) -> None:
         self.workspace = workspace
         self.session = workspace.session
-        self.shown: tuple[Any, ...] = ()
         self.selects: dict[str, Any] = {}
         with fold("Mesh and method", "options", is_open=True):
             self._select("unit", "unit of the mesh", UNIT_CHOICES)
             self._select("up", "axis that points up", AXES)
             self._select("pose", "how it may stand", POSES)
             self._select("preset", "method", PRESETS)
-        with fold("Camera", "camera"):
-            text("p", CAMERA_HINT, "facts")
-            self.camera = ui.input("fx fy cx cy in px, or the horizontal field of view in degrees")
-            self.camera.props("dense data-testid=camera").on_value_change(self._typed)
-            self.camera_facts = text("p", "", "facts", data_testid="camera-facts")
-            with region("div", "row"):
-                file_chooser("From a file", "upload-camera")
-                self.exif = button(
-                    "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
-                )
         with fold("The same on the command line, and in Python", "command-line"):
             self.command = self._copied("command")
             self.python = self._copied("python")
@@ -267,40 +285,69 @@ class Inputs:
         select = ui.select(dict(choices), value=value, label=label, on_change=changed)
         self.selects[name] = select.props(f"dense options-dense data-testid={name}")
 
-    async def _typed(self) -> None:
-        typed = _typed_numbers(self.camera.value)
-        if typed is None or typed == self._camera():  # unfinished, or shown by refresh
-            return
-        camera = numbers(typed) if len(typed) == 4 else None
-        await self._set_camera(camera, None if camera else next(iter(typed), None))
-
-    async def _set_camera(
-        self, camera: Numbers | None = None, guess: str | float | None = None
-    ) -> None:
-        await self.workspace.run("page", lambda: self.session.set_camera(camera, guess), stop=True)
-
-    def _camera(self) -> tuple[float, ...]:
-        """What the field shows: four numbers, the field of view, or nothing."""
-        guess = self.session.request().guess
-        return self.session.request().camera or ((guess,) if isinstance(guess, float) else ())
-
-    def refresh(self) -> None:
+    async def refresh(self) -> None:
         """Show what changed in the session since the last time, here or in another window."""
         session = self.session
         view = self.session.shot.view
         set_text(self.command, session.command() or (UNDISTORTED if view is None else NOT_IN_RIG))
         set_text(self.python, "" if session.shot.answer is None else session.python())
-        now = (session.shot.path, view is None, session.options)
-        if now == self.shown:
-            return
-        self.shown, camera = now, self._camera()
-        if _typed_numbers(self.camera.value) != camera:
-            self.camera.value = " ".join(repr(value).removesuffix(".0") for value in camera)
         for name, select in self.selects.items():
-            select.value = getattr(session.options, name)
-        self.camera.set_enabled(view is None)
-        self.exif.set_visibility(session.has_exif and view is None)
-        set_text(self.camera_facts, self._describe_camera())
+            if select.value != getattr(session.options, name):
+                select.value = getattr(session.options, name)
+
+
+class CameraPanel:
+    """The camera of all photographs without a rig: two fields, each sent by Enter or on leaving it,
+    and where it is from."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.session = workspace.session
+        with fold("Camera", "camera"):
+            text("p", CAMERA_HINT, "facts")
+            self.matrix = field("fx fy cx cy in px", "camera", self._set_matrix)
+            self.view = field("or the horizontal field of view in degrees", "fov", self._set_view)
+            with region("div", "row"):
+                file_chooser("From a file", "upload-camera")
+                self.exif = button(
+                    "Guess from EXIF", lambda: self._set_camera(guess="exif"), "exif", "quiet"
+                )
+        self.facts = text("p", "", "facts", data_testid="camera-facts")
+        self.message = text("p", "", "message", data_testid="message-camera", role="alert")
+
+    async def _set_matrix(self, typed: str) -> None:
+        await self._set(typed, 4, "four numbers fx fy cx cy in px, such as 1450 1450 960 540")
+
+    async def _set_view(self, typed: str) -> None:
+        await self._set(typed, 1, "the horizontal field of view in degrees, such as 65")
+
+    async def _set(self, typed: str, count: int, expected: str) -> None:
+        found = typed_numbers(typed, count)
+        if found is None:
+            self.workspace.messages["camera"] = f"camera: expected {expected}, got {typed!r:.80}"
+        elif count == 4:
+            await self._set_camera(numbers(found) if found else None)
+        else:
+            await self._set_camera(guess=found[0] if found else None)
+
+    async def _set_camera(
+        self, camera: Numbers | None = None, guess: str | float | None = None
+    ) -> None:
+        change = partial(self.session.set_camera, camera, guess)
+        await self.workspace.run("camera", change, stop=True)
+
+    async def refresh(self) -> None:
+        """Show the camera of the session, wherever it was changed."""
+        request = self.session.request()
+        is_alone = self.session.shot.view is None
+        guess = (request.guess,) if isinstance(request.guess, float) else ()
+        show_value(self.matrix, request.camera or ())
+        show_value(self.view, guess)
+        for element in (self.matrix, self.view):
+            set_enabled(element, is_alone)
+        self.exif.set_visibility(self.session.has_exif and is_alone)
+        set_text(self.facts, self._describe_camera())
+        set_text(self.message, self.workspace.messages.get("camera", ""))
 
     def _describe_camera(self) -> str:
         camera = self.session.options.camera
@@ -331,13 +378,25 @@ class Inputs:
         return "unknown: the focal length is estimated, and the distance with it"
 
 
-def _typed_numbers(text: str | None) -> tuple[float, ...] | None:
-    """fx, fy, cx, cy, a field of view, or nothing; None while they are being typed."""
+def typed_numbers(text: str, count: int) -> tuple[float, ...] | None:
+    """The ``count`` numbers of a text, none of an empty one, or None of any other. They are
+    separated by blanks, semicolons or commas; where these are not needed for that, commas are
+    decimal ones.
+
+    Example:
+        >>> typed_numbers("536,8 538,2 310,4 241", 4), typed_numbers("300, 300, 160, 120", 4)
+        ((536.8, 538.2, 310.4, 241.0), (300.0, 300.0, 160.0, 120.0))
+        >>> typed_numbers("65,5°", 1), typed_numbers("", 1), typed_numbers("300 300", 4)
+        ((65.5,), (), None)
+    """
+    words = [word for word in re.split(r"[\s;]+|,\s+", text.strip().rstrip("°")) if word]
+    if len(words) == 1 and count > 1:
+        words = words[0].split(",")
     try:
-        found = tuple(float(word) for word in (text or "").replace(",", " ").split())
+        found = tuple(float(word.replace(",", ".")) for word in words)
     except ValueError:
         return None
-    return found if len(found) in (0, 4) or (len(found) == 1 and 1 < found[0] < 180) else None
+    return found if len(found) in (0, count) and all(map(math.isfinite, found)) else None
 
 
 class Preview:
@@ -419,3 +478,48 @@ class Preview:
                 scene.text(name, "font-weight: bold; color: #1b1f23").move(*end)
         scene.move_camera(1.6, -2.6, 1.3, 0, 0, 0, duration=0)
         self.scene = scene
+
+
+class Space:
+    """Camera, photograph and mesh in 3D, to be turned with the mouse; drawn when asked for."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self.workspace = workspace
+        self.session = workspace.session
+        self.shown: Answer | None = None
+        with fold("The answer in 3D", "space", is_open=True) as self.section:
+            self.place = region("div", "preview", data_testid="space")
+            button("Show camera, photograph and mesh", self._draw, "show-space", "quiet")
+
+    async def refresh(self) -> None:
+        """Forget what was drawn of another answer."""
+        shot = self.session.shot
+        self.section.set_visibility(shot.answer is not None and shot.view is None)
+        if self.shown is not None and self.shown is not shot.answer:
+            self.shown = None
+            self.place.clear()
+
+    async def _draw(self) -> None:
+        shot = self.session.shot
+        content = await self.workspace.run("pose", shot.glb)
+        if not content:
+            return
+        self.shown = shot.answer
+        url = self.workspace.serve("space.glb", content, "model/gltf-binary")
+        T, K = shot.projection
+        depth = float(shot.require_result().centre(T)[2])
+        metres = UNITS[mesh_unit(shot.require_result().registrar.bank.mesh) or "m"]
+        H, W = shot.size
+        corners = [(-0.5, -0.5), (W - 0.5, -0.5), (W - 0.5, H - 0.5), (-0.5, H - 0.5)]
+        rays = [
+            torch.linalg.solve(K.double(), K.new_tensor([x, y, 1]).double()) for x, y in corners
+        ]
+        self.place.clear()
+        look = {"grid": False, "background_color": "#c8ced3"}
+        with self.place, ui.scene(340, 240, **look) as scene:
+            # from glTF's axes, y up, to those of the scene, z up; the object is at distance 1
+            scene.gltf(url).rotate(math.pi / 2, 0, 0).scale(1.0 / (depth * metres))
+            for x, y, _ in (ray.tolist() for ray in rays):
+                scene.line([0, 0, 0], [x, 1.0, -y]).material("#0a6b35")
+            scene.text("camera", "font-weight: bold; color: #1b1f23").move(0, 0, 0)
+        scene.move_camera(-0.9, -0.5, 0.6, 0, 0.6, 0, duration=0)

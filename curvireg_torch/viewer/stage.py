@@ -26,12 +26,21 @@ THUMBNAIL_SIDE = 96  # px of the longer side of the small photographs
 LAYER_SIDE = 1400
 MOVING_SIDE = 480
 COMMIT_SECONDS = 0.5  # without wheel or keys, after which a moved pose becomes the answer
+ZOOMS = {
+    "out": ("−", "zoom out"),
+    "fit": ("⤢", "whole photograph or object"),
+    "in": ("+", "zoom in"),
+}
 HELP = {
     "box": "Drag to draw a box; drag its edges, corners or middle to correct it. Arrow keys move "
-    "it. The wheel zooms.",
-    "pose": "Drag the mesh to move it, drag beside it to turn it. Wheel: distance; with Shift: "
-    "roll. Arrow keys move, "
-    "with Shift turn.",
+    "it. The wheel zooms; Z shows the whole photograph or the object.",
+    "pose": "Drag the mesh to move it, drag beside it to turn it: the pointer shows which. Wheel: "
+    "distance; with Shift: roll. Arrow keys move, with Shift turn. Z shows the whole photograph or "
+    "the object.",
+}
+TOUCH_HELP = {
+    "box": "Draw with one finger; pinch to zoom.",
+    "pose": "One finger moves the mesh, or turns it beside it; pinch for distance and roll.",
 }
 
 
@@ -81,10 +90,11 @@ class Stage:
                         "Undo", self._undo, "undo", "quiet", title="Ctrl+Z; once more repeats it"
                     )
                     self.fit = button("Fit the contours", self._fit, "fit", "quiet")
-                    for name, symbol in {"out": "−", "fit": "⤢", "in": "+"}.items():
-                        zoom = {"type": "button", "data_zoom": name, "aria_label": f"zoom {name}"}
-                        text("button", symbol, "button quiet", **zoom)
+                    for name, (symbol, label) in ZOOMS.items():
+                        zoom = {"type": "button", "data_zoom": name, "aria_label": label}
+                        text("button", symbol, "button quiet", title=label, **zoom)
                     self.hint = text("p", "", "facts", data_testid="hint")
+                    self.touch_hint = text("p", "", "touch", data_testid="touch-hint")
                 with (
                     region("div", "viewport", tabindex="0", role="application") as self.viewport,
                     region("div", "canvas", data_testid="photograph") as self.canvas,
@@ -107,7 +117,7 @@ class Stage:
                     contours.on(
                         "change",
                         lambda e: self.lines.set_visibility(bool(e.args)),
-                        args=["target.checked"],
+                        js_handler="(event) => emit(event.target.checked)",
                     )
                     text("p", LEGEND, "facts")
         ui.on("stage", self._handle)
@@ -143,7 +153,7 @@ class Stage:
             self._change_box(what, point, float(what.get("reach", 0.0)) * W)
             self._draw_shapes()
         elif shot.answer is not None:
-            self._change_pose(what, point)
+            self._change_pose(what, point, float(what.get("reach", 0.0)))
             await self._follow()
 
     def _change_box(self, what: Any, point: Point, reach: float) -> None:
@@ -165,14 +175,14 @@ class Stage:
         elif kind == "remove":
             shot.set_box(None)
 
-    def _change_pose(self, what: Any, point: Point) -> None:
+    def _change_pose(self, what: Any, point: Point, reach: float) -> None:
         result, (T, K) = self.session.shot.require_result(), self.session.shot.projection
         kind = what["type"]
         T = T if self.moved is None else self.moved
         self._last_gesture = time.monotonic()
         try:
             if kind == "press":
-                self.pressed = T, point, not self._on_mesh(*point)
+                self.pressed = T, point, not self._on_mesh(*point, reach)
             elif kind == "move" and self.pressed is not None:
                 T, start, turns = self.pressed
                 self.moved = result.dragged(T, K, start, point, turns=turns)
@@ -191,12 +201,17 @@ class Stage:
         except InvalidInputError:  # the object would touch the camera: it stays
             return
 
-    def _on_mesh(self, x: float, y: float) -> bool:
-        """Whether the mesh is drawn at a pixel."""
+    def _on_mesh(self, x: float, y: float, reach: float) -> bool:
+        """Whether the mesh is drawn at a pixel, or within ``reach`` of it, in widths of the
+        photograph."""
         (rows, columns), (H, W) = self.mask.shape, self.session.shot.size
         row = int((y + 0.5) / H * rows)
         column = int((x + 0.5) / W * columns)
-        return 0 <= row < rows and 0 <= column < columns and bool(self.mask[row, column])
+        around = round(reach * columns)
+        near = self.mask[
+            max(row - around, 0) : row + around + 1, max(column - around, 0) : column + around + 1
+        ]
+        return bool(near.any())
 
     async def _follow(self) -> None:
         """Draw the pose that is being moved; poses that come meanwhile are dropped but for the
@@ -318,6 +333,7 @@ class Stage:
         self.canvas.props(f"data-mode={self.mode}")
         self.viewport.props(f'aria-label="Photograph. {HELP[self.mode]}"')
         self.hint.set_content(HELP[self.mode])
+        self.touch_hint.set_content(TOUCH_HELP[self.mode])
         for mode, element in self.modes.items():
             element.props(f"aria-pressed={'true' if mode == self.mode else 'false'}")
         set_enabled(self.modes["pose"], shot.answer is not None)
@@ -348,6 +364,9 @@ class Stage:
         draw = partial(pose_layers, registrar, projection, shot.size, LAYER_SIDE)
         if layers := await self.workspace.run("page", draw):
             self._show_layers(layers)
+            self.canvas.props(f'data-object="{_extent(self.mask)}"')
+            if self._changed("zoomed", shot.result):  # page.js then shows the object
+                self.canvas.props(f'data-answer="{time.monotonic()}"')
 
     def _show_layers(self, layers: tuple[bytes, bytes, np.ndarray]) -> None:
         self.mask = layers[2]
@@ -379,6 +398,16 @@ class Stage:
         self.shapes.set_content(
             f"<svg viewBox='-0.5 -0.5 {W} {H}' preserveAspectRatio='none'>{parts}</svg>"
         )
+
+
+def _extent(mask: np.ndarray) -> str:
+    """x0 y0 x1 y1 of what is true in a mask, in its widths and heights; "" of an empty one."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return ""
+    H, W = mask.shape
+    box = columns[0] / W, rows[0] / H, (columns[-1] + 1) / W, (rows[-1] + 1) / H
+    return " ".join(f"{v:.4f}" for v in box)
 
 
 def pose_layers(

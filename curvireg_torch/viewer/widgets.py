@@ -1,6 +1,6 @@
 """Plain HTML elements of the page: text, buttons, choosers of files, and parts that fold away."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -64,3 +64,18 @@ def file_chooser(label: str, test_id: str) -> None:
         region("input", "hidden-text", type="file", data_testid=test_id, accept=accept).props(
             "multiple"
         )
+
+
+def field(label: str, test_id: str, on_change: Callable[[str], Any]) -> Any:
+    """A field whose text is sent once, by Enter or when it is left."""
+    with region("label", "field"):
+        text("span", label)
+        element = region("input", type="text", data_testid=test_id, autocomplete="off")
+    send = "(event) => emit(event.target.value)"
+    return element.on("change", lambda event: on_change(str(event.args)), js_handler=send)
+
+
+def show_value(element: Any, values: Sequence[float]) -> None:
+    """Show numbers in a :func:`field`; ``page.js`` writes them once nobody types there."""
+    shown = " ".join(repr(value).removesuffix(".0") for value in values)
+    element.props(f'data-value="{shown}"')

@@ -9,14 +9,14 @@ import time
 import traceback
 import warnings
 import zipfile
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import replace
+from functools import partial
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from ..data import load_camera
 from ..errors import (
     MAX_ARCHIVE_FILES,
     MAX_MESH_BYTES,
@@ -26,9 +26,9 @@ from ..errors import (
     OutputError,
 )
 from ..jobs.options import RegisterOptions
-from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS
-from ..utils.pictures import PICTURE_NAMES
+from ..utils.choices import IMAGES, MESHES, MESHES_AND_BANKS, VIDEOS
 from .examination import Examination
+from .parts import PARTS, WAITING, place_part
 from .session import STATIC, UNPACKED, Session
 
 CALIBRATIONS = (".yaml", ".yml", ".xml", ".json", ".txt")
@@ -64,8 +64,8 @@ class Workspace:
     Attributes:
         session: inputs and results.
         examination: of the mesh.
-        messages: about a part of the work: "file", "photograph", "rig", "mesh", "pose", or the
-            "page" itself.
+        messages: errors and warnings about a part of the work: "file", "photograph", "rig", "mesh",
+            "camera", "pose", or the "page" itself.
         files: pictures and downloads by name, with their media types.
         receiving: folders, names and sizes of files that are being received.
         started: when the search began, in seconds of ``time.monotonic``.
@@ -77,6 +77,9 @@ class Workspace:
         self.folder = folder
         self.messages: dict[str, str] = {}
         self.asks_for_unit = False
+        self.refused_mesh: Path | None = None  # it may lack parts that come after it
+        self._warnings: dict[str, str] = {}  # about what is open; they outlive an error
+        self._failed_inputs: Any = None  # of the search whose error is shown
         self.files: dict[str, tuple[bytes, str]] = {}
         self.receiving = dict[Path, tuple[str, int]]()
         self.started = 0.0
@@ -91,32 +94,45 @@ class Workspace:
         """Whether a registration runs."""
         return self._search is not None
 
-    async def run(self, part: str, job: Callable[[], Any], *, stop: bool = False) -> Any:
+    async def run(
+        self, part: str, job: Callable[[], Any], *, stop: bool = False, keep: bool = False
+    ) -> Any:
         """Run a short job in a thread, perhaps after the search has stopped.
 
-        Returns its result or True, and None after an error, which becomes a message.
+        Returns its result or True, and None after an error, which becomes a message; errors of the
+        jobs before it go, unless ``keep``.
         """
         async with self._lock:  # no search begins before it is done
             if stop and self._search is not None and self._begun:  # else it waits for this job
                 self.stop()
                 await asyncio.wait({self._search})
+            if not keep:
+                self.forget_errors(part)
             result = await self._attempt(part, job)
             self._remove_unused()
             return result
 
+    def forget_errors(self, *parts: str) -> None:
+        """Show only the warnings about parts of the work, by default about all of it."""
+        for part in parts or tuple(self.messages):
+            self.messages.pop(part, None)
+            if warning := self._warnings.get(part):
+                self.messages[part] = warning
+
+    def pose_message(self) -> str:
+        """The error of the last search, until its inputs change."""
+        if self._failed_inputs != self.session.inputs():
+            self.messages.pop("pose", None)
+        return self.messages.get("pose", "")
+
     async def _attempt(self, part: str, job: Callable[[], Any]) -> Any:
-        self.messages.pop(part, None)
-        if part == "mesh":
-            self.asks_for_unit = False
         caught: list[Any] = []
         _caught.set(caught)
         try:
             result = await asyncio.to_thread(job)
             if part in ("photograph", "mesh", "rig"):  # what the search said is outdated
                 self.messages.pop("pose", None)
-            if caught:
-                self._note_unit(caught)
-                self._show(part, "; ".join(map(self.session.describe_warning, caught)))
+            self._keep_warnings(part, caught)
             return True if result is None else result
         except CurviregError as error:
             self._show(part, str(error.with_subject(self.session.name(error.subject))))
@@ -127,14 +143,23 @@ class Workspace:
             self._show(part, f"{type(error).__name__}: {error}; see the terminal")
         return None
 
-    def _note_unit(self, caught: Iterable[Any]) -> None:
-        """Remember whether one of the warnings asks for the unit of the mesh."""
-        kinds = {getattr(warning, "kind", "") for warning in caught}
-        self.asks_for_unit = self.asks_for_unit or "unit" in kinds
+    def _keep_warnings(self, part: str, caught: Sequence[Any]) -> None:
+        """Show the warnings about what has been opened in place of those about what was open."""
+        if part == "mesh":
+            self.asks_for_unit = any(getattr(each, "kind", "") == "unit" for each in caught)
+        former = self._warnings.pop(part, "")
+        if former and self.messages.get(part) == former:
+            del self.messages[part]
+        if caught:
+            words = "; ".join(map(self.session.describe_warning, caught))
+            self._warnings[part] = self.session.without_folders(words)
+            self._show(part, words)
 
     def _show(self, part: str, message: str) -> None:
-        """Show a message, in which uploaded files have their names alone."""
-        self.messages[part] = self.session.without_folders(message)
+        """Show a message below those that stand there; uploaded files have their names alone."""
+        shown = self.messages.get(part, "").splitlines()
+        lines = [*shown, *self.session.without_folders(message).splitlines()]
+        self.messages[part] = "\n".join(dict.fromkeys(lines))
 
     def start_search(self) -> asyncio.Task[None]:
         """Find the pose in the photograph that is shown, as soon as files are open; one search at a
@@ -154,7 +179,9 @@ class Workspace:
         try:
             async with self._lock:  # a photograph or a mesh may be opening
                 self._begun = True
+            self.forget_errors("pose")
             await self._attempt("pose", self.session.register)
+            self._failed_inputs = self.session.inputs()
         finally:
             self._search = None
 
@@ -169,11 +196,18 @@ class Workspace:
         for folder in self.folder.glob("upload-*"):
             shutil.rmtree(folder, ignore_errors=True)
 
-    async def receive(self, name: str, size: int, blocks: AsyncIterator[bytes]) -> None:
-        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh or
-        a calibration."""
-        stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
-        if stored + sum(each for _, each in self.receiving.values()) + size > MAX_VIEWER_BYTES:
+    async def receive(
+        self, name: str, size: int, blocks: AsyncIterator[bytes], *, is_first: bool = True
+    ) -> None:
+        """Store a file of ``size`` bytes, if there is room, and open it as a photograph, a mesh, a
+        part of one or a calibration. ``is_first`` of those that come together, it lets the errors
+        of former ones go."""
+        if is_first:
+            self.forget_errors()
+        if not self._has_room(size):
+            self.session.removed = None
+            self._remove_unused()
+        if not self._has_room(size):
             raise InvalidInputError(
                 f"{name}: all files have more than {MAX_VIEWER_BYTES:,} bytes; remove photographs"
             )
@@ -185,6 +219,11 @@ class Workspace:
         finally:
             del self.receiving[path.parent]
             self._remove_unused()
+
+    def _has_room(self, size: int) -> bool:
+        stored = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
+        coming = sum(each for _, each in self.receiving.values())
+        return stored + coming + size <= MAX_VIEWER_BYTES
 
     def _new_place(self, name: str) -> Path:
         """The path of an upload, in a folder of its own."""
@@ -212,16 +251,19 @@ class Workspace:
         session = self.session
         rig = self.session.rig_path
         kinds = (*IMAGES, *MESHES_AND_BANKS, *CALIBRATIONS, ".csv", ".zip")
-        self.messages.pop("file", None)
+        if await self._add_to_mesh(path):
+            return
         if suffix in kinds and self._before_sample is not None:
-            await self.run("file", self._leave_sample, stop=True)
-        if suffix not in kinds:
-            self.messages["file"] = (
-                f"{path.name}: neither a photograph ({PICTURE_NAMES}) nor a mesh "
-                f"({', '.join(MESHES)}, or a zip archive of one with its materials, pictures and "
-                f"buffers) nor a "
-                f"calibration ({', '.join(CALIBRATIONS)}) nor a rig (.csv, images.txt or "
-                f"scene_camera.json)"
+            await self.run("file", self._leave_sample, stop=True, keep=True)
+        if suffix in VIDEOS:
+            self._show("file", f"{path.name}: a video; curvireg follow {path.name} MESH follows it")
+        elif suffix in PARTS:
+            self._show("file", f"{path.name}: no open mesh names it; drop it with its mesh")
+        elif suffix not in kinds:
+            self._show(
+                "file",
+                f"{path.name}: neither a photograph (.jpg, .png, .heic, ...) nor a mesh (.obj, "
+                f".stl, .glb, .zip, ...), a calibration (.yaml, .json, ...) or a rig (.csv, ...)",
             )
         elif suffix == ".csv" or path.name in ("images.txt", "scene_camera.json"):
             if path.name == "scene_camera.json" and session.options.unit in (None, "m"):
@@ -235,14 +277,28 @@ class Workspace:
             path.replace((rig if rig.is_dir() else rig.parent) / path.name)
             await self.open_rig(rig)
         elif suffix in CALIBRATIONS:
-            await self.run("file", lambda: session.set_camera(load_camera(path)), stop=True)
+            camera = partial(session.open_calibration, path)
+            await self.run("camera", camera, stop=True, keep=True)
         elif suffix == ".zip":
-            if mesh := await self.run("mesh", lambda: unpack(path, path.parent / UNPACKED)):
-                await self.open_mesh(mesh)
+            unpacked = partial(unpack, path, path.parent / UNPACKED)
+            if mesh := await self.run("mesh", unpacked, keep=True):
+                await self.open_mesh(mesh, keep=True)
         elif suffix in MESHES_AND_BANKS:
-            await self.open_mesh(path)
+            await self.open_mesh(path, keep=True)
         else:
-            await self.open_photo(path)
+            await self.open_photo(path, keep=True)
+
+    async def _add_to_mesh(self, path: Path) -> bool:
+        """Put a material, a picture or a buffer beside the mesh that names it, and open this again;
+        False for any other file."""
+        for mesh in (self.refused_mesh, self.session.mesh_path):
+            if mesh is None or self.folder not in mesh.parents or path.suffix == mesh.suffix:
+                continue
+            if await asyncio.to_thread(place_part, path, mesh):
+                self.forget_errors("mesh")
+                await self.open_mesh(mesh)
+                return True
+        return False
 
     def _remove_unused(self) -> None:
         """Remove uploaded files that were replaced or refused."""
@@ -251,8 +307,10 @@ class Workspace:
             path
             for path in (
                 session.mesh_path,
+                self.refused_mesh,
                 session.rig_path,
                 *(shot.path for shot in session.shots),
+                *([session.removed[1].path] if session.removed else []),
             )
             if path
         ]
@@ -264,13 +322,17 @@ class Workspace:
         """Replace the rig; None: each photograph is registered alone."""
         await self.run("rig", lambda: self.session.open_rig(path), stop=True)
 
-    async def open_photo(self, path: Path) -> None:
+    async def open_photo(self, path: Path, *, keep: bool = False) -> None:
         """Add a photograph, and show it."""
-        await self.run("photograph", lambda: self.session.open_photo(path))
+        await self.run("photograph", lambda: self.session.open_photo(path), keep=keep)
 
-    async def open_mesh(self, path: Path) -> None:
+    async def open_mesh(self, path: Path, *, keep: bool = False) -> None:
         """Replace the mesh; a search for the former one is stopped."""
-        await self.run("mesh", lambda: self.session.open_mesh(path), stop=True)
+        self.refused_mesh = path if path.suffix.lower() in WAITING else None
+        opened = await self.run("mesh", lambda: self.session.open_mesh(path), stop=True, keep=keep)
+        if opened is not None:
+            self.refused_mesh = None
+            self._remove_unused()
 
     async def remove_photo(self) -> None:
         """Close the photograph that is shown; a search in it is stopped."""
@@ -280,6 +342,10 @@ class Workspace:
             lambda: self.session.remove_photo(shot),
             stop=shot in self.session.searched,
         )
+
+    async def restore_photo(self) -> None:
+        """Open the photograph again that was removed last."""
+        await self.run("photograph", self.session.restore_photo)
 
     async def set_option(self, name: str, value: Any) -> None:
         """Change an option; the mesh is opened again if it depends on it."""
@@ -299,13 +365,12 @@ class Workspace:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             self.session.load()
-        if caught:
-            self._note_unit(warning.message for warning in caught)
-            self.messages["mesh"] = "; ".join(str(warning.message) for warning in caught)
+        self._keep_warnings("mesh", [warning.message for warning in caught])
 
     async def load_sample(self) -> None:
         """Open the photograph of the sample, its mesh and its box."""
         self.messages.clear()
+        self._warnings.clear()
         self.asks_for_unit = False
         await self.run("file", self._open_sample, stop=True)
 

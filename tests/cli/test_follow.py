@@ -51,6 +51,36 @@ def follow(frames):
     return run
 
 
+@pytest.mark.parametrize(
+    ("confidences", "said"),
+    [
+        ((0.1, 0.2, 0.409, 0.3), ["", "", "not sure of the object yet (best confidence 0.40)", ""]),
+        ((0.1, 0.5, 0.3, 0.3), [""] * 4),
+        ((0.1, None, None), ["", "", "not sure of the object yet (best confidence 0.10)"]),
+    ],
+)
+def test_frames_without_a_certain_pose_are_spoken_of_once(confidences, said):
+    tally = Tally()
+    for confidence, words in zip(confidences, said, strict=True):
+        tally.add({"verdict": "unsure", "confidence": confidence}, 1.0)
+        assert tally.doubt() == (words and f"{words}; give --box or --start")
+
+
+def test_follow_says_that_it_is_not_sure(follow, tmp_path, monkeypatch, capsys):
+    call = Follower.__call__
+
+    def doubtful(self, *given):
+        found = call(self, *given)
+        object.__setattr__(found, "probabilities", (0.1, 0.0))
+        self._base = None
+        return found
+
+    monkeypatch.setattr(Follower, "__call__", doubtful)
+    follow("--camera", *CAMERA, "--out", tmp_path)
+    error = capsys.readouterr().err
+    assert error.count("curvireg: not sure of the object yet (best confidence 0.10)") == 1
+
+
 def test_follow_writes_a_pose_for_each_frame(frames, follow, tmp_path, capsys):
     _, scenes = frames
     assert follow("--camera", *CAMERA, "--out", tmp_path) == 0

@@ -108,6 +108,21 @@ def test_the_page_of_commands_is_current():
         assert f"| `{option}` |" in page
 
 
+def test_the_method_in_pictures_is_current() -> None:
+    """``python docs/make_pictures.py`` writes the page and its pictures."""
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    module = module_of_docs("make_pictures")
+    page = (DOCS / "method-pictures.md").read_text(encoding="utf-8")
+    assert page == module.page()
+    pictures = re.findall(r"\]\((images/[\w-]+\.webp)\)", page)
+    assert len(pictures) == 6
+    assert all((DOCS / picture).is_file() for picture in pictures)
+    for _, _, _, file in module.STEPS.values():
+        assert (ROOT / "curvireg_torch" / file).is_file(), (
+            f"the picture of the architecture: {file}"
+        )
+
+
 CHECK_SITE = module_of_docs("check_site")
 
 
@@ -133,6 +148,11 @@ def test_the_check_of_the_site_finds_faults(tmp_path: Path) -> None:
     assert not list(CHECK_SITE.find_faults(tmp_path))
     missing = list(CHECK_SITE.search_faults(tmp_path))
     assert [fault.split("'")[1] for fault in missing] == ["HEIC"]
+    (tmp_path / "index.html").write_text(head + '<p>give \u2013azimuth</p><a href="/a.html">x</a>')
+    assert [fault.split(": ")[1] for fault in CHECK_SITE.find_faults(tmp_path)] == [
+        "\u2013azimuth begins with a dash that cannot be typed",
+        "/a.html is absolute",
+    ]
     (tmp_path / "index.html").write_text(head + '<script src="https://cdn.org/a.js"></script>')
     (fault,) = CHECK_SITE.find_faults(tmp_path)
     assert fault.endswith("https://cdn.org/a.js is fetched from elsewhere")

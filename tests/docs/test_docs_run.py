@@ -32,7 +32,7 @@ SKIPPED = {
     r"(\S*/)?curvireg inspect": "a minute",  # tests/inspection runs it
     r"(\S*/)?curvireg view": "browser",  # tests/viewer/test_browser_use.py opens it
     r"scripts/test\.sh|python -m (coverage|mutmut)|python scripts/robustness/wrong_inputs\.py": "test suite",  # noqa: E501
-    r"python (scripts/results_table|docs/command_reference)": "writes into the project",
+    r"python (scripts/results_table|docs/(command_reference|make_pictures))": "writes into the project",  # noqa: E501
     r".*[ /=$][A-Z]+([ ./]|$)": "placeholder",
     r"curvireg register .*--field": "needs trained weights",
     r"curvireg .* /data/": "needs a generated benchmark",
@@ -41,6 +41,7 @@ SKIPPED = {
 # Trees with every defect that datasets/verify.py must report
 DEFECTIVE = ("data/PASCAL3D+_release1.1", "data/bop/lm", "data/web")
 AZIMUTHS = {"photo.jpg": 30.0, "front.jpg": 210.0, "left.jpg": 300.0, "above.jpg": 120.0}
+FIRST_PAGES = (ROOT / "README.md", DOCS / "getting-started.md")
 SLOW = {
     DOCS / "evaluation.md",
     *(DOCS / "guides" / name for name in ("several.md", "coming-from.md", "boxes.md")),
@@ -152,7 +153,11 @@ def run_command(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int | str:
 @pytest.mark.usefixtures("in_folder")
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else []) for p in PAGES if steps(p)],
+    [
+        pytest.param(p, marks=[pytest.mark.slow] if p in SLOW else [])
+        for p in PAGES
+        if steps(p) and p not in FIRST_PAGES
+    ],
     ids=lambda p: str(p.relative_to(ROOT)),
 )
 def test_page_runs(
@@ -178,3 +183,47 @@ def test_page_runs(
                 assert float(rotation_error(R, pose(30.0)[:3, :3])) < allowed
     for name in re.findall(r"`((?:out|results)/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
         assert Path(name).is_file(), f"the page promises {name}"
+
+
+@pytest.mark.parametrize("page", FIRST_PAGES, ids=lambda page: page.stem)
+def test_the_first_pages_run_on_the_files_of_the_demo_alone(
+    page: Path,
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Typed as they stand, in a folder that holds nothing else."""
+    monkeypatch.setenv("CURVIREG_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "page"}
+    registered = 0
+    for kind, text in steps(page):
+        if kind == "python":
+            capsys.readouterr()
+            exec(compile(text, page.name, "exec"), names)
+            check_printed(page, capsys.readouterr().out)
+        elif not any(re.match(start, re.sub(r"\s+#.*", "", text)) for start in SKIPPED):
+            words = split_command(text)
+            assert run_command(words, monkeypatch) == 0, (text, capsys.readouterr().err)
+            registered += "register" in words
+    demo, found = (
+        json.loads(path.read_text()) for path in sorted(Path("out").glob("*/result.json"))
+    )
+    R, truth = (
+        torch.tensor(rotation) for rotation in (found["rotation"], demo["truth"]["rotation"])
+    )
+    assert (registered, float(rotation_error(R, truth)) < 5.0) == (1, True)
+    for name in re.findall(r"`(out/[\w/.]+\.\w+)`", page.read_text(encoding="utf-8")):
+        assert Path(name).is_file(), f"the page promises {name}"
+
+
+def check_printed(page: Path, printed: str) -> None:
+    """The page shows what its block prints, but for the last digits."""
+    shown = re.search(r"```text\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    if shown is None:
+        return
+    texts = [re.sub(r"-?\d+(?:\.\d+)?", "#", text) for text in (shown[1], printed)]
+    assert texts[0] == texts[1]
+    numbers = [[float(n) for n in re.findall(r"-?\d+(?:\.\d+)?", t)] for t in (shown[1], printed)]
+    assert numbers[1] == pytest.approx(numbers[0], abs=0.06, rel=0.02)

@@ -3,6 +3,7 @@ are wrong."""
 
 import json
 import math
+from dataclasses import replace
 from unittest.mock import Mock
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from curvireg_torch import Registrar
 from curvireg_torch.errors import InvalidInputError, LostObjectError
 from curvireg_torch.geometry import rotation_from_axis_angle
+from curvireg_torch.geometry.cameras import pose_around
 from curvireg_torch.registration import FailedRegistration, Follower, following, refine
 from curvireg_torch.registration.following import BELIEVED_CONFIDENCE
 from curvireg_torch.synthetic import example_mesh, procedural_background, synthesize_photograph
@@ -77,6 +79,59 @@ def test_a_pose_that_is_not_believed_is_not_followed(monkeypatch, first):
         "tracked"
     )
     assert results[3].confidence <= 0.8
+
+
+@pytest.mark.parametrize(
+    ("answers", "follows"), [([0.4] * 3, True), ([0.4, 0.19, 0.4, 0.4], False)]
+)
+def test_registrations_that_agree_are_followed_without_more_confidence(
+    monkeypatch, answers, follows
+):
+    frames = sequence(len(answers) + 1)
+    registrar = truck_registrar()
+    answering(monkeypatch, registrar, answers)
+    follow = Follower(registrar, CAMERA)
+    for (image, box, _), answer in zip(frames, answers, strict=False):
+        assert follow(image, box).confidence == answer
+    assert (follow._base is not None) is follows
+    if follows:
+        result = follow(frames[-1][0])
+        assert result.confidence <= 0.4
+        degrees, position = errors(result, frames[-1][2])
+        assert (degrees < 4.0, position < 0.04) == (True, True)
+
+
+@pytest.mark.parametrize(("degrees", "part"), [(16.0, 0.0), (0.0, 0.11)])
+def test_registrations_that_disagree_are_not_followed(monkeypatch, degrees, part):
+    """The second is turned about the object's centre, or moved by a part of its distance."""
+    (image, box, _) = sequence(1)[0]
+    registrar = truck_registrar()
+    register = type(registrar).__call__
+    centre = registrar.describer.centre
+    calls = []
+
+    def call(self, images, boxes=None, camera_matrices=None, **options):
+        found = register(self, images, boxes, camera_matrices, **options)[0]
+        object.__setattr__(found, "probabilities", (0.4, 0.0))
+        T, K = found.projection
+        calls.append(T)
+        if len(calls) == 2:
+            turn = rotation_from_axis_angle(
+                torch.deg2rad(torch.tensor([0.0, degrees, 0.0], dtype=torch.float64))
+            )
+            at = (T[:3, :3] @ centre + T[:3, 3]) * (1.0 + part)
+            moved = pose_around(turn @ T[:3, :3], at, centre)
+            first = replace(found.hypotheses[0], projection=(moved, K))
+            object.__setattr__(found, "hypotheses", (first, *found.hypotheses[1:]))
+        return [found]
+
+    monkeypatch.setattr(type(registrar), "__call__", call)
+    follow = Follower(registrar, CAMERA)
+    for _ in range(4):
+        follow(image, box)
+    assert follow._base is None
+    follow(image, box)
+    assert follow._base == 0.4, "the last three agree"
 
 
 def test_confidence_is_a_fraction_of_that_of_the_first_pose_and_not_raised_by_the_same_frame(

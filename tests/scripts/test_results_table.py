@@ -57,6 +57,20 @@ def test_recorded_summary_becomes_a_row_of_the_table(tmp_path: Path, results: Pa
     assert "1 failed, 2 skipped" in table
 
 
+def test_the_table_in_words_names_what_a_set_shows(tmp_path: Path, results: Path) -> None:
+    for name in ("lego", "buddha", "cups"):
+        results_table.record(write_summary(tmp_path / name), name)
+    sets = [{"name": "buddha", "reliable": 5, "reliable_right": 4}]
+    (results / "confidence.json").write_text(json.dumps({"sets": sets}))
+    lines = results_table.table_in_words(results).splitlines()
+    assert lines[2:4] == [
+        "| A plaster figurine | 8 | 75.0 % | 3.2° | 5: 4 |",
+        "| A LEGO model | 8 | 75.0 % | 3.2° | - |",
+    ]
+    assert lines[4:] == ["", f"Commit {_shared.commit()}."]
+    assert list(results_table.WORDS)[-1] == "pascal3d_mini"
+
+
 def test_sets_of_several_lightings_count_views(tmp_path: Path, results: Path) -> None:
     results_table.record(write_summary(tmp_path / "run"), "hope")
     assert "| hope | 8 |" in results_table.table(results)  # 8 is no multiple of 5

@@ -4,6 +4,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,13 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def address(folder):
     """Address of a viewer that was started without a photograph."""
-    command = [sys.executable, "-m", "curvireg_torch", "view", "--no-browser"]
+    with running([sys.executable, "-m", "curvireg_torch", "view", "--no-browser"], folder) as found:
+        yield found
+
+
+@contextmanager
+def running(command, folder):
+    """Address of a viewer that a command starts, which ends without an error."""
     environment = {
         name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
     }

@@ -152,10 +152,12 @@ def test_the_card_that_is_clicked_is_the_answer_that_is_shown_and_saved(browser)
     for name, start in (("pose.glb", b"glTF"), ("overlay.png", b"\x89PNG")):
         browser.click(f"download-{name.replace('overlay.png', 'picture')}")
         assert browser.downloaded(name).startswith(start)
+    assert browser.text("verdict") == "your choice"
     browser.click("answer-1")
     browser.wait(
         lambda: browser.part("answer-1").get_attribute("aria-pressed") == "true", "the first again"
     )
+    assert browser.text("used-camera").endswith(": the camera is known by its field of view")
 
 
 def test_the_pose_is_corrected_on_the_photograph(browser):
@@ -363,7 +365,7 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     browser.click("exif")
     caption = "from the photograph's EXIF, 37 mm of a 35 mm camera"
     browser.wait(lambda: browser.text("camera-facts") == caption, "EXIF")
-    browser.part("camera").send_keys("65")
+    browser.part("fov").send_keys("65\n")
     browser.wait(lambda: "--fov 65" in browser.text("command"), "field of view")
     (folder / "notes.txt").write_text("nothing to see")
     browser.drop(folder / "broken.png", folder / "hostile.obj", folder / "notes.txt")
@@ -371,13 +373,13 @@ def test_files_are_dropped_together_chosen_again_and_named_when_they_are_wrong(b
     for part, name in (
         ("photograph", "broken.png"),
         ("mesh", "hostile.obj"),
-        ("file", "notes.txt"),
+        ("camera", "notes.txt"),
     ):
         assert browser.text(f"message-{part}").startswith(f"{name}: ")
         assert str(folder) not in browser.text(f"message-{part}")
     assert browser.text("photograph-facts") == "photo.png: 240 x 180 px", "the former one stays"
     browser.drop(folder / "photo.png")
-    browser.wait(lambda: browser.text("message-photograph") == "", "gone")
+    browser.wait(lambda: browser.messages() == [], "all gone with the next files")
     mesh = example_mesh()
     mesh.apply_scale(1000.0)
     mesh.export(folder / "large.ply")
@@ -424,6 +426,56 @@ def test_each_of_several_photographs_keeps_its_box(browser, folder):
     browser.picture("viewer-box", "step-box")
     browser.click("no-photo")
     browser.wait(lambda: not browser.part("strip").is_displayed(), "one photograph needs no strip")
+
+
+def test_an_answer_is_zoomed_to_and_the_pointer_shows_what_a_drag_does(browser, folder):
+    """The object is 60 px of 240; the key Z shows the whole photograph again."""
+    from selenium.webdriver import ActionChains
+
+    browser.emulate(1280, 800)
+    browser.drop(folder / "photo.png", folder / "truck.ply")
+    browser.wait(lambda: browser.text("mesh-facts").startswith("truck.ply: "), "mesh")
+    browser.wait(lambda: browser.text("photograph-facts").startswith("photo.png: "), "photograph")
+    canvas = browser.part("photograph")
+    browser.wait(lambda: canvas.find_element("css selector", "img").size["width"] > 100, "shown")
+    whole = canvas.size["width"]
+    browser.drag((60, 40), (180, 140), 240)
+    browser.wait(lambda: browser.box() is not None, "box")
+    browser.click("register")
+    browser.wait(lambda: browser.text("progress") == "done", "result")
+    browser.wait(lambda: canvas.get_attribute("data-object"), "its extent")
+    x0, y0, x1, y1 = map(float, canvas.get_attribute("data-object").split())
+    zoom = max(1.0, 0.6 / max(x1 - x0, y1 - y0))
+    assert zoom > 1.1, "the test needs a small object"
+    browser.wait(lambda: canvas.size["width"] == pytest.approx(zoom * whole, abs=3), "the object")
+    ActionChains(browser.driver).send_keys("z").perform()
+    browser.wait(lambda: canvas.size["width"] == whole, "the whole photograph")
+    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.wait(lambda: canvas.size["width"] > 1.05 * whole, "the object again")
+    browser.driver.find_element("css selector", "[data-zoom=fit]").click()
+    browser.wait(lambda: canvas.size["width"] == whole, "the whole photograph")
+
+    def aim(x, y):
+        middle = canvas.size["width"] / 2, canvas.size["height"] / 2
+        offset = round(2 * middle[0] * x - middle[0]), round(2 * middle[1] * y - middle[1])
+        ActionChains(browser.driver).move_to_element_with_offset(canvas, *offset).perform()
+        return canvas.get_attribute("data-aim")
+
+    assert aim((x0 + x1) / 2, (y0 + y1) / 2) == "move"
+    assert aim(0.02, 0.02) == "turn"
+    lines = canvas.find_elements("css selector", "img")[2]
+    assert lines.is_displayed()
+    browser.part("contours").click()
+    browser.wait(lambda: not lines.is_displayed(), "without contours")
+    browser.part("contours").click()
+    browser.wait(lambda: lines.is_displayed(), "with contours")
+    browser.click("show-space")
+    browser.wait(
+        lambda: browser.part("space").find_element("css selector", "canvas"), "the answer in 3D"
+    )
+    browser.click("no-photo")
+    browser.click("restore-photo")
+    browser.wait(lambda: browser.text("verdict"), "the photograph and its answer are back")
 
 
 def test_a_rig_file_makes_several_photographs_one_pose(browser, folder):

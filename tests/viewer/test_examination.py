@@ -26,7 +26,7 @@ def with_small_bank(workspace, folder):
     )
 
 
-async def until_done(workspace, seconds=30.0):
+async def until_done(workspace, seconds=300.0):
     deadline = time.monotonic() + seconds
     while not workspace.examination.advice and time.monotonic() < deadline:
         workspace.examination.start_if_due(searching=workspace.searching)

@@ -1,18 +1,22 @@
 import asyncio
+import time
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
+from nicegui import ui
 from nicegui.client import Client
 from nicegui.page import page
 
+from curvireg_torch.errors import InvalidInputError
 from curvireg_torch.geometry import Camera
 from curvireg_torch.jobs.options import RegisterOptions
-from curvireg_torch.viewer.page import Steps
-from curvireg_torch.viewer.side import Answers, Inputs, Preview
+from curvireg_torch.viewer.page import Steps, build_page
+from curvireg_torch.viewer.side import Answers, CameraPanel, Inputs, Preview
 from curvireg_torch.viewer.stage import Stage
 from curvireg_torch.viewer.workspace import Workspace
 from tests.viewer.test_session import write_scene
@@ -77,33 +81,89 @@ def test_messages_are_text_and_not_html(workspace, build):
 
 
 def test_typed_numbers_go_into_the_session(workspace, build):
+    panel = build(CameraPanel)
     inputs = build(Inputs)
     session = workspace.session
 
-    def typed(words):
-        inputs.camera.set_value(words)
-        asyncio.run(inputs._typed())
-        inputs.refresh()
+    def refresh():
+        asyncio.run(panel.refresh())
+        asyncio.run(inputs.refresh())
+
+    def typed(matrix=None, view=None):
+        asyncio.run(panel._set_view(view) if matrix is None else panel._set_matrix(matrix))
+        refresh()
         return session.options.camera, session.options.guess
 
-    for words in ("300 300 119.5", "3e", "300"):
-        assert typed(words) == (None, None), "not before it is complete"
+    def shown():
+        return [element.props.get("data-value") for element in (panel.matrix, panel.view)]
+
     assert typed("300, 300, 119.5 89.123456789") == ((300, 300, 119.5, 89.123456789), None)
-    assert typed("65.5") == (None, 65.5)
+    assert shown() == ["300 300 119.5 89.123456789", ""]
+    for words in ("300 300 119.5", "3e", "300", "nan 1 2 3", "0 300 119.5 89.5"):
+        assert typed(words) == ((300, 300, 119.5, 89.123456789), None), "refused"
+        assert panel.message.content.startswith("camera"), words
+        assert shown()[0] == "300 300 119.5 89.123456789"
+    assert typed("536,8 538,2 310,4 241") == ((536.8, 538.2, 310.4, 241.0), None)
+    assert panel.message.content == ""
+    assert typed(view="190") == ((536.8, 538.2, 310.4, 241.0), None)
+    assert "field of view" in panel.message.content
+    assert typed(view="65,5") == (None, 65.5)
+    assert shown() == ["", "65.5"]
+    assert typed(view="") == (None, None)
+    asyncio.run(panel._set_camera(guess="exif"))
+    refresh()
+    assert panel.facts.content.endswith("has no focal length")
     assert typed("") == (None, None)
-    asyncio.run(inputs._set_camera(guess="exif"))
-    inputs.refresh()
-    assert inputs.camera_facts.content.endswith("has no focal length")
     session.options = replace(session.options, camera=(300.0, 300.0, 119.5, 0.1 + 0.2), guess=None)
-    inputs.refresh()
-    assert inputs.camera.value == "300 300 119.5 0.30000000000000004"
+    refresh()
+    assert shown() == ["300 300 119.5 0.30000000000000004", ""], "from another window"
     asyncio.run(
-        inputs._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
+        panel._set_camera(Camera([[300.0, 0, 119.5], [0, 300, 89.5], [0, 0, 1]], (0.1, 0, 0, 0)))
     )
-    inputs.refresh()
-    assert inputs.camera_facts.content == "from a calibration file, without its distortion"
-    assert isinstance(typed(inputs.camera.value)[0], Camera), "what is shown is not typed"
+    refresh()
+    assert panel.facts.content == "from a calibration file, without its distortion"
     assert inputs.command.content.startswith("None: ")
+
+
+def test_what_is_typed_before_the_button_is_pressed_is_what_the_search_uses(
+    workspace, build, monkeypatch
+):
+    """On a slow server too: the search waits until the camera has been set."""
+    panel = build(CameraPanel)
+    session = workspace.session
+    set_camera = session.set_camera
+    used = []
+
+    def slow_camera(*camera):
+        time.sleep(0.3)
+        set_camera(*camera)
+
+    monkeypatch.setattr(session, "set_camera", slow_camera)
+    monkeypatch.setattr(session, "register", lambda: used.append(session.options.camera))
+
+    async def type_and_press():
+        typed = asyncio.create_task(panel._set_matrix("536.8 538.2 310.4 241"))
+        await asyncio.sleep(0)  # as two events of a browser come
+        await workspace.start_search()
+        await typed
+
+    asyncio.run(type_and_press())
+    assert used == [(536.8, 538.2, 310.4, 241.0)]
+
+
+def test_the_page_goes_on_after_an_error_of_one_of_its_parts(workspace, monkeypatch):
+    timers = []
+    monkeypatch.setattr(ui, "timer", lambda _, refresh: timers.append(refresh))
+    with Client(page(""), request=None):
+        build_page(workspace)
+        drawn = []
+        monkeypatch.setattr(Steps, "show_messages", lambda _: drawn.append(True))
+        monkeypatch.setattr(
+            CameraPanel, "refresh", Mock(side_effect=InvalidInputError("camera: of another size"))
+        )
+        asyncio.run(timers[0]())
+    assert workspace.messages["page"] == "camera: of another size"
+    assert drawn
 
 
 def test_clicks_on_the_model_mark_what_is_up_and_the_front_in_all_windows(workspace, build):

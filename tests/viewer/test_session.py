@@ -199,7 +199,9 @@ def test_the_python_program_gives_the_same_numbers(session, registered):
         patch.chdir(registered[1])
         patch.setenv("CURVIREG_CACHE", str(registered[1] / "cache"))
         names: dict = {}
-        exec(session.python(), names)
+        program = session.python()
+        exec(program, names)
+    assert "None" not in program, "no defaults"
     found = {
         name: torch.tensor(names["pose"][name], dtype=torch.float64)
         for name in ("rotation", "translation")

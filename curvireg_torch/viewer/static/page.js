@@ -3,11 +3,15 @@
   // --- Files: chosen, dropped anywhere, or pasted.
   const address = () => location.pathname.replace(/\/$/, "") + "/upload";
 
-  const isRig = (file) => /(^(images\.txt|scene_camera\.json)|\.csv)$/i.test(file.name);
+  // What belongs to a rig comes after it, and what a mesh names after the mesh.
+  const ORDER = [/(^(images\.txt|scene_camera\.json)|\.csv)$/i, /\.(obj|gltf|dae|urdf)$/i, /\.(?!mtl$|bin$)(?!png$|jpe?g$)\w+$/i, /\.mtl$/i];
+  const rank = (file) => (ORDER.findIndex((kind) => kind.test(file.name)) + ORDER.length + 1) % (ORDER.length + 1);
 
   async function sendFiles(files) {
-    for (const file of files.sort((a, b) => isRig(b) - isRig(a))) {  // what belongs to a rig comes after it
-      const headers = { "x-file-name": encodeURIComponent(file.name) };
+    let first = 1;
+    for (const file of files.sort((a, b) => rank(a) - rank(b))) {
+      const headers = { "x-file-name": encodeURIComponent(file.name), "x-first": first };
+      first = 0;
       await fetch(address(), { method: "POST", body: file, headers }).catch(() => {});  // the server shows the reason
     }
   }
@@ -76,14 +80,50 @@
     event.preventDefault();
   }, { passive: false });
 
-  addEventListener("click", (event) => {
-    const name = event.target.dataset?.zoom;
+  const PART_OF_VIEW = 0.6;  // which the object fills after an answer
+
+  function zoomToObject(canvas) {
+    const [x0, y0, x1, y1] = (canvas.dataset.object || "0 0 1 1").split(" ").map(Number);
+    const viewport = canvas.parentElement, frame = viewport.getBoundingClientRect();
+    zoomTo(canvas, PART_OF_VIEW / Math.max(x1 - x0, y1 - y0, 0.05), frame.left, frame.top);
+    viewport.scrollLeft = ((x0 + x1) / 2) * canvas.offsetWidth - viewport.clientWidth / 2;
+    viewport.scrollTop = ((y0 + y1) / 2) * canvas.offsetHeight - viewport.clientHeight / 2;
+  }
+
+  function zoomBy(name) {
     const canvas = document.querySelector(".canvas");
-    if (!event.target.matches?.("button[data-zoom]") || !canvas) return;
+    if (!canvas) return;
+    if (name === "fit" && zoomOf(canvas) === 1) return zoomToObject(canvas);
     const frame = canvas.parentElement.getBoundingClientRect();
     const zoom = { in: zoomOf(canvas) * 1.5, out: zoomOf(canvas) / 1.5, fit: 1 }[name];
     zoomTo(canvas, zoom, frame.left + frame.width / 2, frame.top + frame.height / 2);
+  }
+
+  addEventListener("click", (event) => {
+    if (event.target.matches?.("button[data-zoom]")) zoomBy(event.target.dataset.zoom);
   });
+  new MutationObserver((changes) => zoomToObject(changes[0].target))
+    .observe(document.body, { subtree: true, attributeFilter: ["data-answer"] });
+
+  // --- The pointer shows whether a drag would move the mesh or turn it: the server decides by the same outline.
+  const outline = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+  let opaque = null;
+
+  addEventListener("load", (event) => {
+    if (!event.target.matches?.(".canvas img:nth-child(2)")) return;
+    const [width, height] = [outline.canvas.width, outline.canvas.height] = [480, Math.round((480 * event.target.naturalHeight) / event.target.naturalWidth)];
+    outline.drawImage(event.target, 0, 0, width, height);
+    const alpha = outline.getImageData(0, 0, width, height).data;
+    opaque = (x, y) => x >= 0 && y >= 0 && x < width && y < height && alpha[4 * (y * width + x) + 3] > 0;
+  }, true);
+
+  function aim(event, canvas) {
+    if (!opaque || event.pointerType === "touch") return;
+    const frame = canvas.getBoundingClientRect(), scale = 480 / frame.width, reach = Math.round(10 * scale);
+    const [x, y] = [Math.floor((event.clientX - frame.left) * scale), Math.floor((event.clientY - frame.top) * scale)];
+    const steps = [-reach, -reach / 2, 0, reach / 2, reach].map(Math.round);
+    canvas.dataset.aim = steps.some((dx) => steps.some((dy) => opaque(x + dx, y + dy))) ? "move" : "turn";
+  }
 
   addEventListener("pointerdown", (event) => {
     const canvas = canvasOf(event.target);
@@ -113,6 +153,7 @@
 
   addEventListener("pointermove", (event) => {
     const canvas = canvasOf(event.target), before = pointers.get(event.pointerId);
+    if (canvas && !before && isPose(canvas)) aim(event, canvas);
     if (!canvas || !before) return;
     pointers.set(event.pointerId, event);
     if (pinch && pointers.size === 2) {
@@ -155,11 +196,23 @@
       if (arrow) what = { type: "nudge", dx: arrow[0], dy: arrow[1], shift: event.shiftKey };
       else if (event.key === "Delete" || event.key === "Backspace") what = { type: "remove" };
     }
+    if (event.key === "z" && !event.ctrlKey && !event.metaKey && !at.matches?.("input, textarea")) zoomBy("fit");
     if ((event.ctrlKey || event.metaKey) && event.key === "z" && !at.matches?.("input, textarea")) what = { type: "undo" };
     if (!what) return;
     event.preventDefault();
     emitEvent("stage", what);
   });
+
+  // --- Fields: what the server knows is written once nobody types there.
+  function fillFields() {
+    for (const field of document.querySelectorAll("input[data-value]")) {
+      const value = field.dataset.value;
+      if (field === document.activeElement || field.dataset.written === value) continue;
+      field.value = field.dataset.written = value;
+    }
+  }
+  new MutationObserver(fillFields).observe(document.body, { subtree: true, childList: true, attributeFilter: ["data-value"] });
+  addEventListener("focusout", () => setTimeout(fillFields));
 
   // --- Sliders that only change how the layers look.
   addEventListener("input", (event) => {
