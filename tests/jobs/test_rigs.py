@@ -234,3 +234,28 @@ def test_a_photograph_of_colmap_whose_name_is_a_number_is_no_line_of_points(tmp_
     (tmp_path / "cameras.txt").write_text(LINE)
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 7\n2 1 0 0 0 0 0 1 1 8\n")
     assert [view.name for view in read_rig(tmp_path)] == ["image 7", "image 8"]
+
+
+def test_an_object_that_a_photograph_of_bop_shows_twice_has_no_box_there(tmp_path):
+    """Which of the two is meant is not known: it is searched for."""
+    camera = {
+        "cam_K": [260.0, 0.0, 119.5, 0.0, 260.0, 89.5, 0.0, 0.0, 1.0],
+        "cam_R_w2c": torch.eye(3).flatten().tolist(),
+        "cam_t_w2c": [0.0, 0.0, 600.0],
+    }
+    objects = {"0": [2, 1], "1": [1, 1], "2": [2]}
+    truth = {key: [{"obj_id": number} for number in numbers] for key, numbers in objects.items()}
+    boxes = {
+        key: [{"bbox_obj": [10 * k, 5, 20, 30]} for k, _ in enumerate(numbers, start=1)]
+        for key, numbers in objects.items()
+    }
+    for name, content in (
+        ("scene_camera.json", dict.fromkeys(objects, camera)),
+        ("scene_gt.json", truth),
+        ("scene_gt_info.json", boxes),
+    ):
+        (tmp_path / name).write_text(json.dumps(content))
+    found = [view.box for view in read_rig(tmp_path, Path("obj_000001.ply"))]
+    assert found[0] is not None
+    assert float(found[0][0]) == pytest.approx(20.0, abs=1.0), "of the second object"
+    assert found[1:] == [None, None]
