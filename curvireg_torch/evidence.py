@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,7 +9,7 @@ from torch import Tensor
 from .utils.checks import check_number
 from .utils.rows import Rows
 
-__all__ = ["Evidence", "EvidenceWeights", "SeenPoses"]
+__all__ = ["Evidence", "EvidenceWeights"]
 
 
 @dataclass(frozen=True)
@@ -49,49 +48,12 @@ RANK_ALONE = EvidenceWeights.only(rank=1.0)
 """Weights with the mesh of a similar object: poses keep the order of the ranking."""
 
 
-class SeenPoses(Protocol):
-    """H poses of an object beside a photograph: what evidence is read from, each (H,) float64.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> one = torch.ones(1, dtype=torch.float64)
-        >>> names = ("rank", "similarity", "edge_support", "appearance", "keypoints", "contours")
-        >>> seen = SimpleNamespace(**dict.fromkeys(names, one))
-        >>> Evidence.of(seen).similarity.tolist()
-        [1.0]
-    """
-
-    @property
-    def rank(self) -> Tensor:
-        """Log S of the view that a pose started from, minus that of the best view."""
-
-    @property
-    def similarity(self) -> Tensor:
-        """Normalised correlation of the pose's view with the photograph."""
-
-    @property
-    def edge_support(self) -> Tensor:
-        """See :class:`.ContourFit`; NaN without the contour fit."""
-
-    @property
-    def appearance(self) -> Tensor:
-        """Log appearance score; 0 without that term."""
-
-    @property
-    def keypoints(self) -> Tensor:
-        """Number of keypoints that agree with a pose, beyond those that agree by chance."""
-
-    @property
-    def contours(self) -> Tensor:
-        """See ``contour_evidence``; 0 without the contour fit."""
-
-
 @dataclass(frozen=True)
 class Evidence(Rows):
     """What speaks for H poses, or for each of them in V photographs: float64, (H,) or (V, H).
     Hypotheses report it under these names.
 
-    A new kind of evidence is a field here, its measure in :meth:`of`, and its weight in
+    A new kind of evidence is a field here, its measure in :meth:`measured`, and its weight in
     :class:`EvidenceWeights`.
 
     Attributes:
@@ -124,16 +86,27 @@ class Evidence(Rows):
     contours: Tensor
 
     @classmethod
-    def of(cls, seen: SeenPoses) -> "Evidence":
-        """The evidence of poses beside a photograph, without details."""
+    def measured(
+        cls,
+        *,
+        rank: Tensor,
+        similarity: Tensor,
+        edge_support: Tensor,
+        appearance: Tensor,
+        keypoints: Tensor,
+        contours: Tensor,
+    ) -> "Evidence":
+        """The evidence of poses beside a photograph, without details, from measures (H,) of them:
+        the edge support may be NaN, ``keypoints`` is the number of those that agree, beyond those
+        that agree by chance."""
         return cls(
-            rank=seen.rank,
-            similarity=seen.similarity,
-            edge_support=seen.edge_support.nan_to_num(0.0),
-            appearance=seen.appearance.double(),
-            keypoints=seen.keypoints.log1p(),
-            details=torch.zeros_like(seen.similarity),
-            contours=seen.contours,
+            rank=rank,
+            similarity=similarity,
+            edge_support=edge_support.nan_to_num(0.0),
+            appearance=appearance.double(),
+            keypoints=keypoints.log1p(),
+            details=torch.zeros_like(similarity),
+            contours=contours,
         )
 
     @classmethod

@@ -1,7 +1,6 @@
 """Evidence: what its kinds are read from, and what they count for."""
 
 from dataclasses import fields
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -44,15 +43,15 @@ def test_a_similar_mesh_keeps_the_order_of_the_ranking():
 
 
 def test_evidence_is_read_from_poses():
-    seen = SimpleNamespace(
-        rank=torch.tensor([0.0, -1.0]).double(),
-        similarity=torch.tensor([0.7, 0.6]).double(),
-        edge_support=torch.tensor([0.4, torch.nan]).double(),
-        appearance=torch.tensor([0.5, -0.5]).double(),
-        keypoints=torch.tensor([0.0, 20.0]).double(),
-        contours=torch.tensor([0.3, 0.0]).double(),
-    )
-    read = Evidence.of(seen)
+    seen = {
+        "rank": torch.tensor([0.0, -1.0]).double(),
+        "similarity": torch.tensor([0.7, 0.6]).double(),
+        "edge_support": torch.tensor([0.4, torch.nan]).double(),
+        "appearance": torch.tensor([0.5, -0.5]).double(),
+        "keypoints": torch.tensor([0.0, 20.0]).double(),
+        "contours": torch.tensor([0.3, 0.0]).double(),
+    }
+    read = Evidence.measured(**seen)
     assert read.edge_support.tolist() == pytest.approx([0.4, 0.0])
     assert read.keypoints.expm1().tolist() == pytest.approx([0.0, 20.0])
     assert read.details.tolist() == [0.0, 0.0]

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ..rendering.contours import MeshContours
+from ..utils.rows import Rows
 from .contour_problem import ContourProblem
 from .edges import EdgeCrops
 from .least_squares import pixels
@@ -39,7 +40,7 @@ def compare_details(
 
 
 @dataclass(frozen=True)
-class ContourDetails:
+class ContourDetails(Rows):
     """Contour points of N poses in crops: ``uv`` (N, P, 2) px, ``strength`` (N, P) of the edges
     there, which are ``valid`` (N, P), and which are ``counted`` (N, P), as they lie in the
     photograph."""

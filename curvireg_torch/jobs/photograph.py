@@ -25,8 +25,8 @@ from ..pipeline import Pipeline
 from ..registration import FailedRegistration, Registrar, Registration
 from ..registration.detection import detect_items
 from ..registration.documents import detection_document, result_document
+from ..registration.hypotheses import projected_box
 from ..registration.inputs import image_item
-from ..registration.poses import projected_box
 from ..registration.refinement import refine_items
 from ..registration.registrar import ObjectLike
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike

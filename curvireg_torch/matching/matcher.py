@@ -29,7 +29,6 @@ from ..terms import (
     whole_box_shapes,
 )
 from ..utils.checks import as_boxes, check_pixels
-from ..utils.company import by_key, compute_together
 from ..utils.files import text_digest
 from ..utils.likes import BoxesLike
 from ..utils.precision import in_full_precision
@@ -249,45 +248,6 @@ class ViewMatcher(nn.Module):
         sizes = [(int(image.shape[-2]), int(image.shape[-1])) for image in images]
         return crops, whole_box_shapes(boxes, sizes)
 
-    def query_together(self, image: Tensor, box: Tensor) -> QueryFeatures:
-        """:meth:`query` of one photograph (C, H, W) with a box (4,), described with those that
-        other jobs of ``map_in_company`` have."""
-        image = image.to(self.bank.device)
-        return compute_together(self._described, self._crops([image], box[None]))
-
-    def _described(self, requests: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
-        if len(requests) == 1:
-            return [self.describe(*requests[0])]
-
-        def describe(some: Sequence[tuple[Tensor, Tensor]]) -> list[QueryFeatures]:
-            crops, shapes = (torch.cat(parts) for parts in zip(*some, strict=True))
-            return self.describe(crops, shapes).split()
-
-        return by_key(requests, lambda request: request[0].shape, describe)
-
-    def rank_together(self, query: QueryFeatures, allowed: Tensor | None = None) -> Ranking:
-        """:meth:`rank` of one photograph, with those that other jobs of ``map_in_company``
-        have; the ranking is on the CPU."""
-        return compute_together(self._ranked, (query, allowed))
-
-    def _ranked(self, requests: Sequence[tuple[QueryFeatures, Tensor | None]]) -> list[Ranking]:
-        if len(requests) == 1:
-            return self.rank(*requests[0]).split()
-
-        def rank(some: Sequence[tuple[QueryFeatures, Tensor | None]]) -> list[Ranking]:
-            together = QueryFeatures.cat([query for query, _ in some])
-            limits = [allowed for _, allowed in some if allowed is not None]
-            rankings = self.rank(together, torch.cat(limits) if limits else None).split()
-            for (query, _), known in zip(some, together.split(), strict=True):
-                query.computed.update(known.computed)
-            return rankings
-
-        def key(request: tuple[QueryFeatures, Tensor | None]) -> tuple[Any, ...]:
-            query, allowed = request
-            return (query.crops.shape, query.mask is None, allowed is None)
-
-        return by_key(requests, key, rank)
-
     def features(self, crops: Tensor) -> QueryFeatures:
         """Describe (B, 1 or 3, S, S) crops of boxes, without box jitter and shapes."""
         unknown = torch.full_like(crops[:, 0, 0, 0], torch.nan)
@@ -431,15 +391,33 @@ class ViewMatcher(nn.Module):
         return self._appearance.describe(pictures)
 
     @in_full_precision
-    def appearance_score(self, query: QueryFeatures, ranking: Ranking, features: Tensor) -> Tensor:
-        """(H,) float64 log scores of poses in one photograph, whose pictures have these features
-        (H, D), by the appearance term, minus that of the most similar view of its ranking."""
+    def appearance_scores(
+        self,
+        query: QueryFeatures,
+        rankings: Sequence[Ranking],
+        features: Tensor,
+        photograph: Tensor,
+    ) -> Tensor:
+        """(H,) float64 log scores of poses, each in a ``photograph`` (H,), whose pictures have
+        these features (H, D), by the appearance term, minus that of the most similar view of the
+        photograph's ranking."""
         assert self._appearance is not None
-        raw = self._appearance.compare(query, features)[0].cpu().double()
-        views = ranking.terms[Appearance.name][0].cpu().double()
-        views = views[views.isfinite()].expand(len(raw), -1)
-        scores = self._appearance.term.log_score(torch.cat([views, raw[:, None]], dim=1))
-        # positive if the pose is more similar than every view
+        similarity = self._appearance.compare(query, features).cpu().double()
+        raw = similarity[photograph, torch.arange(len(photograph))]
+        scores = torch.zeros_like(raw)
+        for number, ranking in enumerate(rankings):
+            mine = photograph == number
+            if bool(mine.any()):
+                scores[mine] = self._appearance_gain(raw[mine], ranking.terms[Appearance.name][0])
+        return scores
+
+    def _appearance_gain(self, raw: Tensor, views: Tensor) -> Tensor:
+        """(H,) log scores of raw ones (H,), minus the largest of the views' (N,), NaN for views
+        that were not compared: positive if a pose is more similar than every view."""
+        assert self._appearance is not None
+        known = views.cpu().double()
+        known = known[known.isfinite()].expand(len(raw), -1)
+        scores = self._appearance.term.log_score(torch.cat([known, raw[:, None]], dim=1))
         return scores[:, -1] - scores[:, :-1].amax(dim=1)
 
     @cached_property

@@ -5,6 +5,7 @@ given one that differs belongs to another picture: one of another size, cropped,
 with another lens or zoom. The pose is then wrong, though its contours lie on edges.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -15,11 +16,11 @@ from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import FocalPrior, fit_focal_length, focal_information, scaled_cameras
 from ..fitting.measured_fit import FULL_SIZE_RADII
 from ..rendering.contours import MeshContours
+from .block import Block
 from .focal import FULL_RADII, HALF_RADII, REPORTED_VARIANCE
-from .poses import Poses
+from .hypotheses import Hypotheses
 from .result import Registration
 from .target import Target
-from .work import Work
 
 CLEAR_DEVIATION = 0.15
 """Standard deviation of log f up to which a photograph determines its focal length."""
@@ -36,23 +37,42 @@ WIDE = 2.0
 """Largest change of log f, and deviation of a prior that does not matter."""
 
 
-def with_checked_camera(
-    target: Target, work: Work, crops: EdgeCrops, best: Poses, result: Registration
-) -> Registration:
-    """A result whose ``best`` pose is one, with a warning if it is reliable and the photograph
-    contradicts the focal length of its camera."""
-    if not result.reliable or work.item.camera_source == "estimated":
-        return result
-    gap, deviation = focal_gaps(
-        target.describer.contours, crops, best.cameras, best.T, best.crop_index
+def with_checked_cameras(
+    target: Target,
+    block: Block,
+    crops: EdgeCrops,
+    best: Hypotheses,
+    results: Sequence[Registration],
+) -> list[Registration]:
+    """Results of photographs, whose ``best`` poses are one in each, with a warning where one is
+    reliable and the photograph contradicts the focal length of its camera."""
+    found = list(results)
+    checked = torch.tensor(
+        [
+            place
+            for place, (result, item) in enumerate(zip(results, block.photographs, strict=True))
+            if result.reliable and item.camera_source != "estimated"
+        ],
+        dtype=torch.long,
     )
-    text = focal_contradiction(
-        float(best.cameras[0, 0, 0]),
-        float(gap),
-        float(deviation),
-        given_deviation=work.item.focal_deviation,
-    )
-    return result if text is None else replace(result, warnings=(*result.warnings, text))
+    if not len(checked):
+        return found
+    some = best[checked]
+    given = some.cameras, some.T, some.photograph
+    gaps, deviations = focal_gaps(target.describer.contours, crops, *given)
+    for place, camera, gap, deviation in zip(
+        checked.tolist(), some.cameras, gaps, deviations, strict=True
+    ):
+        text = focal_contradiction(
+            float(camera[0, 0]),
+            float(gap),
+            float(deviation),
+            given_deviation=block.photographs[place].focal_deviation,
+        )
+        if text is not None:
+            result = found[place]
+            found[place] = replace(result, warnings=(*result.warnings, text))
+    return found
 
 
 def focal_gaps(

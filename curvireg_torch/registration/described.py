@@ -1,187 +1,169 @@
-"""A photograph as poses are compared with it, and the poses beside it."""
+"""Photographs as poses are compared with them, and the evidence for poses beside them."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from ..evidence import Evidence
+from ..fitting.details import compared, contour_details
+from ..fitting.devices import on_device
 from ..fitting.edges import EdgeCrops
 from ..fitting.keypoints import KeypointMatches
-from ..fitting.together import details_together, evidence_together
+from ..fitting.measured_fit import contour_evidence
 from ..matching import Ranking
 from ..terms import Appearance, QueryFeatures
-from ..utils.company import by_key, compute_together
 from .framing import CropFrame
-from .poses import Poses
+from .hypotheses import Hypotheses
 from .target import Target
 
+BACKGROUND = 1.0  # of pictures of the mesh
 
-@dataclass(frozen=True)
-class DescribedPhotograph:
-    """A photograph as poses are compared with it.
+
+@dataclass(frozen=True, kw_only=True)
+class Described:
+    """P photographs as poses are compared with them.
 
     Attributes:
-        query: its box, described by the matcher.
-        ranking: of the views of the bank.
-        descriptor: (1, D) on a grid twice as fine as the bank's, or (H, D) if each pose has its own
-            box.
-        crops: of the box, for contour fits; None without them.
-        keypoints: those found in the box; None where they do not count.
-        frame: in which poses are compared with it; None: each fills a picture by itself, as a view
-            of the bank does.
+        query: their boxes, described by the matcher.
+        rankings: of the views of the bank, one for each photograph.
+        descriptor: (P, D) on a grid twice as fine as the bank's.
+        crops: of the boxes, for contour fits; None without them.
+        keypoints: those found in each box; None where they do not count.
+        frames: in which poses are compared with each photograph; None: each fills a picture by
+            itself, as a view of the bank does.
     """
 
     query: QueryFeatures
-    ranking: Ranking
+    rankings: Sequence[Ranking]
     descriptor: Tensor
     crops: EdgeCrops | None
-    keypoints: KeypointMatches | None
-    frame: CropFrame | None = field(default=None, kw_only=True)
+    keypoints: Sequence[KeypointMatches | None]
+    frames: Sequence[CropFrame | None]
 
-    @property
-    def printed(self) -> float:
+    def printed(self, photograph: int) -> float:
         """log (1 + n) with the number n of keypoints that a view of the mesh has; 0 where they do
-        not count."""
-        return 0.0 if self.keypoints is None else math.log1p(self.keypoints.per_view)
+        not count in a photograph."""
+        keypoints = self.keypoints[photograph]
+        return 0.0 if keypoints is None else math.log1p(keypoints.per_view)
 
 
-BACKGROUND = 1.0  # of pictures of the mesh
-VIEWS = "_described_views"  # attribute of ComparedPoses, computed on first use
-
-
-@dataclass(frozen=True)
-class ComparedPoses:
-    """H ``poses`` beside a ``photograph``: a :class:`.SeenPoses`."""
-
-    target: Target
-    photograph: DescribedPhotograph
-    poses: Poses
-
-    @property
-    def rank(self) -> Tensor:
-        return self.poses.rank
-
-    @property
-    def edge_support(self) -> Tensor:
-        return self.poses.edge_support
-
-    @property
-    def similarity(self) -> Tensor:
-        views, _ = self._views
-        descriptor = self.photograph.descriptor
-        products = F.normalize(views, dim=1) * F.normalize(descriptor, dim=1)
-        return products.sum(dim=1).double().cpu()
-
-    @property
-    def appearance(self) -> Tensor:
-        _, features = self._views
-        if features is None:
-            return torch.zeros(len(self.poses), dtype=torch.float64)
-        photograph = self.photograph
-        return self.target.matcher.appearance_score(photograph.query, photograph.ranking, features)
-
-    @property
-    def keypoints(self) -> Tensor:
-        keypoints = self.photograph.keypoints
-        if keypoints is None:
-            return torch.zeros(len(self.poses), dtype=torch.float64)
-        count = keypoints.agreeing(self.poses.T, self.poses.cameras)
-        return (count - self.target.pipeline.fit.chance_keypoints).clamp(min=0.0)
-
-    @property
-    def contours(self) -> Tensor:
-        crops = self.photograph.crops
-        poses = self.poses
-        if crops is None:
-            return torch.zeros(len(poses), dtype=torch.float64)
-        contours = self.target.describer.device_contours
-        return evidence_together(contours, crops, poses.cameras, poses.T, poses.crop_index)
-
-    @property
-    def _views(self) -> tuple[Tensor, Tensor | None]:
-        """(H, D) descriptors of the poses' views, and the features (H, F) of their pictures where
-        the appearance counts."""
-        # Not a cached property: in Python 3.11 its lock would keep other photographs waiting, which
-        # this one waits for.
-        known: dict[str, Any] = self.__dict__
-        if VIEWS not in known:
-            known[VIEWS] = compute_together(_views_of, self)
-        views: tuple[Tensor, Tensor | None] = known[VIEWS]
-        return views
-
-    @property
-    def views_key(self) -> tuple[int, bool, bool]:
-        """What poses have in common whose views are drawn together."""
-        photograph = self.photograph
-        has_appearance = Appearance.name in photograph.ranking.terms
-        return id(self.target.describer), has_appearance, photograph.frame is None
-
-
-def _views_of(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
-    return by_key(requests, lambda request: request.views_key, _views_of_one_mesh)
-
-
-def _views_of_one_mesh(requests: Sequence[ComparedPoses]) -> list[tuple[Tensor, Tensor | None]]:
-    target = requests[0].target
-    counts = [len(request.poses) for request in requests]
-    shaded = Appearance.name in requests[0].photograph.ranking.terms
-    T, K = _cameras(requests)
-    fields, pictures = target.describer.seen_by(T, K, shaded=shaded)
-    if requests[0].photograph.frame is not None:
-        inside = _inside(requests).to(fields.device)
-        fields = fields * inside
-        pictures = None if pictures is None else pictures.masked_fill(~inside, BACKGROUND)
-    views = target.describer.descriptor(fields)
-    if pictures is None:
-        return [(part, None) for part in views.split(counts)]
-    features = target.matcher.appearance_of(pictures)
-    return list(zip(views.split(counts), features.split(counts), strict=True))
-
-
-def _cameras(requests: Sequence[ComparedPoses]) -> tuple[Tensor, Tensor]:
-    """Poses (N, 4, 4) and camera matrices (N, 3, 3) of the pictures in which poses are compared."""
-    if requests[0].photograph.frame is not None:
-        cameras = [
-            request.photograph.frame.transform @ request.poses.cameras
-            for request in requests
-            if request.photograph.frame is not None
-        ]
-        return torch.cat([request.poses.T for request in requests]), torch.cat(cameras)
-    rotation = torch.cat([request.poses.rotation for request in requests])
-    distance = torch.cat([request.poses.distance for request in requests])
-    T, K, _ = requests[0].target.describer.cameras(rotation, distance)
-    return T, K
-
-
-def _inside(requests: Sequence[ComparedPoses]) -> Tensor:
-    """(N, 1, S, S) bool pixels of the frames of poses that lie in the photographs."""
-    return torch.cat(
-        [
-            request.photograph.frame.inside.expand(len(request.poses), 1, -1, -1)
-            for request in requests
-            if request.photograph.frame is not None
-        ]
+@torch.no_grad()
+def evidence_of(target: Target, described: Described, poses: Hypotheses) -> Evidence:
+    """The evidence of poses in their photographs, without details."""
+    views, features = _views(target, described, poses)
+    descriptor = F.normalize(described.descriptor, dim=1)[poses.photograph.to(views.device)]
+    similarity = (F.normalize(views, dim=1) * descriptor).sum(dim=1).double().cpu()
+    return Evidence.measured(
+        rank=poses.rank,
+        similarity=similarity,
+        edge_support=poses.edge_support,
+        appearance=_appearance(target, described, poses, features),
+        keypoints=counting_keypoints(target, described, poses),
+        contours=_contours(target, described, poses),
     )
 
 
-def evidence_of(target: Target, photograph: DescribedPhotograph, poses: Poses) -> Evidence:
-    """The evidence of poses in a photograph, without details."""
-    return Evidence.of(ComparedPoses(target, photograph, poses))
+def with_evidence(target: Target, described: Described, poses: Hypotheses) -> Hypotheses:
+    """Poses with their :func:`evidence_of`."""
+    return replace(poses, evidence=evidence_of(target, described, poses))
+
+
+def _views(target: Target, described: Described, poses: Hypotheses) -> tuple[Tensor, Tensor | None]:
+    """(N, D) descriptors of the poses' views, and the features (N, F) of their pictures where the
+    appearance counts."""
+    has_frame = torch.tensor([frame is not None for frame in described.frames])
+    in_frame = has_frame[poses.photograph] if len(has_frame) else poses.is_outside
+    parts = [part for part in (~in_frame, in_frame) if bool(part.any())] or [~in_frame]
+    found = [_views_alike(target, described, poses[part]) for part in parts]
+    views = torch.cat([view for view, _ in found])
+    features = [feature for _, feature in found if feature is not None]
+    together = torch.cat(features) if features else None
+    if len(parts) == 1:
+        return views, together
+    back = torch.cat([part.nonzero()[:, 0] for part in parts]).argsort().to(views.device)
+    return views[back], None if together is None else together[back]
+
+
+def _views_alike(
+    target: Target, described: Described, poses: Hypotheses
+) -> tuple[Tensor, Tensor | None]:
+    """The same of poses that are all compared in frames, or all by themselves."""
+    frames = [
+        frame
+        for frame in (described.frames[p] for p in poses.photograph.tolist())
+        if frame is not None
+    ]
+    shaded = bool(described.rankings) and Appearance.name in described.rankings[0].terms
+    if frames:
+        T = poses.T
+        K = torch.stack([frame.transform for frame in frames]) @ poses.cameras
+    else:
+        T, K, _ = target.describer.cameras(poses.rotation, poses.distance)
+    fields, pictures = target.describer.seen_by(T, K, shaded=shaded)
+    if frames:
+        inside = torch.stack([frame.inside for frame in frames]).to(fields.device)
+        fields = fields * inside
+        pictures = None if pictures is None else pictures.masked_fill(~inside, BACKGROUND)
+    views = target.describer.descriptor(fields)
+    return views, None if pictures is None else target.matcher.appearance_of(pictures)
+
+
+def _appearance(
+    target: Target, described: Described, poses: Hypotheses, features: Tensor | None
+) -> Tensor:
+    """(N,) log appearance scores; 0 without that term."""
+    if features is None:
+        return torch.zeros(len(poses), dtype=torch.float64)
+    return target.matcher.appearance_scores(
+        described.query, described.rankings, features, poses.photograph
+    )
+
+
+def counting_keypoints(target: Target, described: Described, poses: Hypotheses) -> Tensor:
+    """(N,) number of keypoints that agree with poses, beyond those that agree by chance."""
+    count = agreeing_keypoints(described, poses)
+    return (count - target.pipeline.fit.chance_keypoints).clamp(min=0.0)
+
+
+def agreeing_keypoints(described: Described, poses: Hypotheses) -> Tensor:
+    """(N,) float64 number of keypoints that agree with poses."""
+    count = torch.zeros(len(poses), dtype=torch.float64)
+    for photograph, keypoints in enumerate(described.keypoints):
+        rows = poses.of(photograph) if keypoints is not None else None
+        if rows is not None and keypoints is not None and len(rows):
+            agreeing = keypoints.agreeing(poses.T[rows], poses.cameras[rows])
+            count[rows] = agreeing.to(count)
+    return count
+
+
+def _contours(target: Target, described: Described, poses: Hypotheses) -> Tensor:
+    """(N,) see :func:`.contour_evidence`; 0 without the contour fit."""
+    if described.crops is None:
+        return torch.zeros(len(poses), dtype=torch.float64)
+    contours = target.describer.contours
+    given = poses.cameras, poses.T, poses.photograph
+    return on_device(contour_evidence, contours, described.crops, *given)
 
 
 def with_details(
-    target: Target, crops: EdgeCrops, poses: Poses, evidence: Evidence, best: int, rivals: Tensor
-) -> Evidence:
-    """The evidence of poses, ``rivals`` (R,) of which are compared in detail with the ``best``."""
-    index = torch.cat([torch.tensor([best]), rivals])
+    target: Target, crops: EdgeCrops, poses: Hypotheses, best: Tensor, rivals: Tensor
+) -> Hypotheses:
+    """Poses whose ``rivals`` (R,) are compared in detail with the best one (P,) of the same
+    photograph."""
+    index = torch.cat([best, rivals])
     some = poses[index]
-    contours = target.describer.device_contours
-    scores, _ = details_together(contours, crops, some.cameras, some.T, some.crop_index)
-    details = evidence.details.clone()
-    details[rivals] = details[best] + scores[1:, 0].to(details)
-    return replace(evidence, details=details)
+    contours = target.describer.contours
+    given = some.cameras, some.T, some.photograph
+    seen = on_device(contour_details, contours, crops, *given)
+    details = poses.evidence.details.clone()
+    for place, row in enumerate(best.tolist()):
+        others = (some.photograph == poses.photograph[row]).nonzero()[:, 0]
+        others = others[others >= len(best)]
+        if len(others):
+            scores, _ = compared(seen[torch.cat([torch.tensor([place]), others])])
+            details[index[others]] = details[row] + scores[1:, 0].to(details)
+    return replace(poses, evidence=replace(poses.evidence, details=details))

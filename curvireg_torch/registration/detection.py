@@ -17,18 +17,18 @@ from ..geometry.crops import box_iou, non_maximum_suppression
 from ..geometry.pose_prior import PosePrior
 from ..terms import QueryFeatures
 from ..utils.likes import CameraLike, ImagesLike
+from .block import keypoint_poses
 from .confidence import detection_probability
 from .detector import Proposals
 from .focal import usual_camera
+from .hypotheses import projected_box
 from .inputs import ImageItem, check_crop, image_items
-from .photograph import register
-from .poses import projected_box
 from .result import Detection, FailedRegistration, Registration
+from .stages import map_items, register
 from .target import Target
 from .tracker import boxes_at
 from .unknown_camera import limits_of
 from .words import corners, two_decimals
-from .work import keypoint_poses, map_items
 
 TEMPLATE_SIDE = 96  # Side of the template views in px
 SIZE_STEP = 2.0**0.5  # Factor between successive sizes of the object
@@ -90,9 +90,8 @@ def detect_items(
     """:func:`detect` in photographs that :func:`.inputs.image_items` has prepared."""
     if instances < 1:
         raise InvalidInputError(f"instances: expected >= 1, got {instances}")
-    _ = target.detector  # created once, before threads use it
     found = map_items(
-        target, items, lambda item, index: detect_item(target, item, index, instances=instances)
+        items, lambda item, index: detect_item(target, item, index, instances=instances)
     )
     return [[one] if isinstance(one, FailedRegistration) else one for one in found]
 
@@ -203,7 +202,7 @@ class Candidate:
         return cls(box, response, rival, query, score)
 
     def register(self, target: Target, item: ImageItem) -> "Found":
-        result = register(target, replace(item, box=self.box.float()), self.query)
+        (result,) = register(target, [replace(item, box=self.box.float())], self.query)
         box = projected_box(target.describer, result.projection)
         return Found(result, box, self.response, self.rival, self.score)
 

@@ -8,7 +8,6 @@ weak to tell.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -28,8 +27,8 @@ from ..fitting.measured_fit import FULL_SIZE_RADII, ContourFit, measured_fit
 from ..geometry.cameras import camera_matrix
 from ..geometry.conversions import cross_matrix
 from ..matching import ViewDescriber
+from .hypotheses import Hypotheses, placed
 from .inputs import ImageItem
-from .poses import Poses, placed, with_short_fit
 
 FIELDS_OF_VIEW = (12.0, 25.0, 45.0, 65.0, 85.0)
 """Degrees across the longer side of the photograph that are tried: factors of about 2 between focal
@@ -74,27 +73,19 @@ def _camera(size: tuple[int, int], focal: float) -> Tensor:
     return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
 
-def starts_of_fields(
-    describer: ViewDescriber,
-    crops: EdgeCrops,
-    starts: Sequence[Poses],
-    count: int,
-    *,
-    screening_weight: float,
-) -> Poses:
-    """Of ``starts``, the same views with each of several cameras, those that are fitted, with their
-    short fits and the most evidence first: the best view with each camera, and at least ``count``
-    views with their best camera."""
-    poses, support = with_short_fit(describer, crops, Poses.cat(starts))
-    evidence = (poses.rank + screening_weight * support).view(len(starts), -1)
-    views = evidence.shape[1]
-    of_field = evidence.argmax(dim=1) + views * torch.arange(len(starts))
+def best_of_fields(evidence: Tensor, count: int) -> Tensor:
+    """Indices of starts whose ``evidence`` (F, V) is that of V views with each of F cameras: those
+    that are fitted, the most evidence first. They are the best view with each camera, and at least
+    ``count`` views with their best camera."""
+    fields, views = evidence.shape
+    of_field = evidence.argmax(dim=1) + views * torch.arange(fields)
     best, field = evidence.max(dim=0)
     order = best.argsort(descending=True, stable=True)[:count]
     of_view = order + views * field[order]
     chosen = torch.cat([of_field, of_view]).unique()
     best_first = evidence.flatten()[chosen].argsort(descending=True, stable=True)
-    return poses[chosen[best_first]]
+    started: Tensor = chosen[best_first]
+    return started
 
 
 def focal_prior(item: ImageItem, cameras: Tensor) -> FocalPrior:
@@ -108,18 +99,18 @@ def focal_prior(item: ImageItem, cameras: Tensor) -> FocalPrior:
 
 
 def with_focal_length(
-    describer: ViewDescriber, crops: EdgeCrops, poses: Poses, item: ImageItem
-) -> Poses:
-    """Poses of a photograph fitted at full size together with their focal lengths."""
+    describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses, item: ImageItem
+) -> Hypotheses:
+    """Hypotheses of a photograph fitted at full size together with their focal lengths."""
     T = poses.T
     if item.camera_source == "estimated":
         half = ContourProblem.of(
-            describer.contours, crops, poses.cameras, poses.crop_index, factor=2
+            describer.contours, crops, poses.cameras, poses.photograph, factor=2
         )
         coarse = fit_focal_length(half, T, focal_prior(item, poses.cameras), HALF_RADII)
         poses = replace(poses, cameras=scaled_cameras(poses.cameras, coarse.log_zoom))
         T = coarse.state.T
-    full = ContourProblem.of(describer.contours, crops, poses.cameras, poses.crop_index)
+    full = ContourProblem.of(describer.contours, crops, poses.cameras, poses.photograph)
     fit = fit_focal_length(full, T, focal_prior(item, poses.cameras), FULL_RADII)
     support = fit.problem.edge_support(fit.state)
     measured: ContourFit = measured_fit(fit.problem, fit.state, support, poses.start_support)
@@ -127,7 +118,7 @@ def with_focal_length(
     return replace(poses, cameras=cameras).with_fit(measured, describer.centre)
 
 
-def zoomed(poses: Poses, focal: Tensor, centre: Tensor) -> Poses:
+def zoomed(poses: Hypotheses, focal: Tensor, centre: Tensor) -> Hypotheses:
     """Poses whose images keep size and place while their cameras get the focal lengths ``focal``
     (N,) in px."""
     log_zoom = (focal / poses.cameras[:, 0, 0]).log()
@@ -136,11 +127,11 @@ def zoomed(poses: Poses, focal: Tensor, centre: Tensor) -> Poses:
 
 
 def focal_covariance(
-    describer: ViewDescriber, crops: EdgeCrops, pose: Poses, item: ImageItem
+    describer: ViewDescriber, crops: EdgeCrops, pose: Hypotheses, item: ImageItem
 ) -> tuple[Tensor, float]:
     """(1, 6, 6) covariance of one fitted pose with the error of its focal length, and the standard
     deviation of that, as a fraction."""
-    full = ContourProblem.of(describer.contours, crops, pose.cameras, pose.crop_index)
+    full = ContourProblem.of(describer.contours, crops, pose.cameras, pose.photograph)
     state = full.state(pose.T)
     information, motion = focal_information(full, state, FULL_SIZE_RADII[-1])
     measured = REPORTED_VARIANCE * information.variance

@@ -16,8 +16,8 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability, check_tensor
 from ..utils.likes import ArrayLike, BoxLike, ImageLike
 from ..utils.threads import map_on_threads
+from .hypotheses import Hypotheses, hypothesis_of
 from .inputs import ImageItem, image_items
-from .poses import Poses, hypothesis_of
 from .refinement import refine_item
 from .registrar import Registrar
 from .result import FailedRegistration, Registration
@@ -235,7 +235,7 @@ class Follower:
         describer = self.registrar.describer
         T = tracked.state.T.clone()  # a tensor like any other, not one of inference mode
         none = torch.zeros(1, dtype=torch.long)
-        poses = Poses.at(T, item.K[None], describer.centre, none, none)
+        poses = Hypotheses.at(T, item.K[None], describer.centre, none, none)
         poses = replace(
             poses,
             view=torch.tensor([nearest_view(self.registrar, poses.rotation[0])]),

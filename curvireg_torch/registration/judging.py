@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..evidence import Evidence
-from .candidates import Candidates
+from .block import Block
 from .confidence import (
     are_near,
     confidence_features,
@@ -18,10 +18,10 @@ from .confidence import (
     undetermined_axes,
 )
 from .framing import border_sides, outside_fraction, outside_warnings
-from .poses import Poses, hypothesis_of
+from .hypotheses import Hypotheses, hypothesis_of
+from .inputs import ImageItem
 from .result import FailedRegistration, Registration
 from .target import Target
-from .work import Work
 
 OUTSIDE_MARGIN = 1.0
 """Score by which a pose outside the limits must be better to contradict them: 0.1 of similarity, or
@@ -30,33 +30,32 @@ of the evidence of contours."""
 
 def judged(
     target: Target,
-    work: Work,
-    found: Candidates,
-    *,
-    siblings: int = 0,
+    block: Block,
+    photograph: int,
+    poses: Hypotheses,
 ) -> Registration:
     """Hypotheses, best first, then its rivals, then those that are near the best or merged with
     another, and their probabilities.
 
     Args:
         target: the object.
-        work: the photograph.
-        found: the poses; those that merged with a better one have returned to their views.
-        siblings: how many of the last poses a symmetry of the shape makes of the best one, which a
-            feature of the mesh tells apart.
+        block: the photograph, among others.
+        photograph: its number in the block.
+        poses: those in it; those that merged with a better one have returned to their views.
     """
-    weights = target.score_weights(exact=work.exact)
-    poses = found.poses
-    evidence = found.evidence
-    outside = found.outside
-    distinct = found.distinct
+    weights = target.score_weights(exact=block.exact)
+    item = block.photographs[photograph]
+    ranking = block.rankings[photograph]
+    evidence = poses.evidence
+    outside = poses.is_outside
+    distinct = poses.is_distinct
     scores = evidence.scores(weights)
     order = (scores + torch.where(distinct, 0.0, -1e6)).argsort(descending=True, stable=True)
     own = order[~outside[order]]
     best = own[:1]
     # Poses that merged, and those near the best, which are right if it is, have no probability of
     # their own.
-    is_rival = distinct[own] & ~_near_best(work, poses[own], own >= len(poses) - siblings)
+    is_rival = distinct[own] & ~_near_best(block, poses[own])
     is_rival[0] = True
     rivals = own[is_rival]
     own = torch.cat([rivals, own[~is_rival]])
@@ -64,17 +63,17 @@ def judged(
     groups = (rivals, own[distinct[own]], own)
     compared = next((group for group in groups if len(group) > 1), own)
     reported = own[: target.pipeline.hypotheses].tolist()
-    fraction = _outside_fraction(target, work, poses[best])
-    near = are_near(target.bank.views.rotations, poses.rotation[best[0]], work.symmetries)
+    fraction = _outside_fraction(target, item, poses[best])
+    near = are_near(target.bank.views.rotations, poses.rotation[best[0]], block.symmetries)
     measured = confidence_features(
         evidence[compared],
         evidence[compared].scores(replace(weights, keypoints=0.0)),
-        ranking_share(work.ranking.scores[0], near),
-        printed=work.printed,
-        undetermined=undetermined_axes(poses.covariance[best[0]], work.symmetries),
+        ranking_share(ranking.scores[0], near),
+        printed=block.printed(photograph),
+        undetermined=undetermined_axes(poses.covariance[best[0]], block.symmetries),
         outside=fraction,
-        border=border_sides(work.item.box, work.item.size),
-        focal=work.item.focal_deviation,
+        border=border_sides(item.box, item.size),
+        focal=item.focal_deviation,
     )
     gain = _gain_outside(target, evidence, best, order[outside[order]])
     # limits that leave no rival do not make a pose uncertain
@@ -83,10 +82,9 @@ def judged(
         measured = {**measured, "margin": max(-gain, 0.0), "ranking_share": share}
     probabilities: tuple[float, ...] = ()
     if is_calibrated(target.pipeline):
-        any_right = probability_of_any(measured, exact=work.exact)
-        every = hypothesis_probabilities(any_right, scores[rivals], exact=work.exact)
+        any_right = probability_of_any(measured, exact=block.exact)
+        every = hypothesis_probabilities(any_right, scores[rivals], exact=block.exact)
         probabilities = (*every, *[0.0] * (len(own) - len(rivals)))[: len(reported)]
-    item = work.item
     with_camera = item.camera_matrix is not None
     hypotheses = [
         hypothesis_of(poses, h, evidence.named(h), with_camera=with_camera) for h in reported
@@ -94,10 +92,10 @@ def judged(
     return Registration(
         tuple(hypotheses),
         probabilities,
-        work.ranking,
+        ranking,
         measured,
         prior=item.prior,
-        prior_contradiction=_contradiction(target, work, poses[best], gain),
+        prior_contradiction=_contradiction(target, block, photograph, poses[best], gain),
         warnings=item.warnings + target.mesh_warnings + outside_warnings(fraction),
         notes=target.mesh_notes,
         camera=item.camera,
@@ -105,17 +103,18 @@ def judged(
     )
 
 
-def _near_best(work: Work, poses: Poses, is_sibling: Tensor) -> Tensor:
-    """(H,) bool: poses near the first one, up to symmetries of the object, which siblings (H,) are
-    not: a feature of the mesh tells them apart."""
+def _near_best(block: Block, poses: Hypotheses) -> Tensor:
+    """(H,) bool: poses near the first one, up to symmetries of the object, which siblings are not:
+    a feature of the mesh tells them apart."""
     R = poses.rotation
-    near = are_near(R, R[0], work.symmetries)
+    near = are_near(R, R[0], block.symmetries)
+    is_sibling = poses.is_sibling
     return torch.where(is_sibling | is_sibling[0], are_near(R, R[0]), near)
 
 
-def _outside_fraction(target: Target, work: Work, best: Poses) -> float:
+def _outside_fraction(target: Target, item: ImageItem, best: Hypotheses) -> float:
     """Fraction of the object that lies outside the photograph at the ``best`` pose."""
-    return outside_fraction(target.describer.hull, best.T[0], best.cameras[0], work.item.size)
+    return outside_fraction(target.describer.hull, best.T[0], best.cameras[0], item.size)
 
 
 def _gain_outside(
@@ -130,15 +129,19 @@ def _gain_outside(
     return float(Evidence.from_table(gained).scores(weights))
 
 
-def _contradiction(target: Target, work: Work, best: Poses, gain: float | None) -> str | None:
+def _contradiction(
+    target: Target, block: Block, photograph: int, best: Hypotheses, gain: float | None
+) -> str | None:
     """See :attr:`.Registration.prior_contradiction`."""
-    if work.limits is None:
+    limits = block.limits[photograph]
+    if limits is None:
         return None
-    K = work.item.camera_matrix
     placement = best.rotation, best.distance, best.view, best.rank
-    filling = Poses.in_box(target.describer, work.item.box, K, *placement)
+    boxes = block.boxes[photograph, None]
+    cameras = block.cameras[photograph, None]
+    filling = Hypotheses.in_boxes(target.describer, boxes, cameras, *placement)
     better = gain is not None and gain > OUTSIDE_MARGIN
-    return work.limits.contradiction(best, filling, better_outside=better)
+    return limits.contradiction(best, filling, better_outside=better)
 
 
 def better_of(

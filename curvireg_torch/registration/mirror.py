@@ -7,6 +7,7 @@ if the shape is nearly symmetric to the plane. Only one of the two has the photo
 contours.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -19,13 +20,12 @@ from ..geometry.cameras import transform
 from ..matching import Ranking
 from ..mesh.mesh import MIRROR
 from ..mesh.reflections import reflection_plane
-from .candidates import Candidates
+from .block import Block
 from .confidence import resolution
-from .described import DescribedPhotograph, evidence_of
-from .poses import Poses, placed, with_short_fit
+from .described import Described, evidence_of
+from .hypotheses import Hypotheses, placed, with_short_fit
 from .result import DETERMINING_KEYPOINTS, Registration
 from .target import Target
-from .work import Work
 
 LEAST_CONFIDENCE = 0.5  # from which an answer is compared
 DOUBT = 0.3  # factor of the confidence where the mirror image fits better
@@ -36,45 +36,61 @@ WARNING = (
 
 def compared_with_mirror_image(
     target: Target,
-    work: Work,
+    block: Block,
     crops: EdgeCrops,
-    best: Candidates,
-    result: Registration,
-) -> Registration:
-    """A result whose ``best`` pose is one. If it is probably right and the mirror image of the mesh
-    fits better, it gets a warning, and ``DOUBT`` of its confidence."""
-    is_printed = float(best.evidence.keypoints) >= DETERMINING_KEYPOINTS
+    best: Hypotheses,
+    results: Sequence[Registration],
+) -> list[Registration]:
+    """Results of photographs, whose ``best`` poses are one in each. Where it is probably right and
+    the mirror image of the mesh fits better, the result gets a warning, and ``DOUBT`` of its
+    confidence."""
+    likely = torch.tensor([(result.confidence or 0.0) >= LEAST_CONFIDENCE for result in results])
     # a print that is found is not mirrored
-    if (result.confidence or 0.0) < LEAST_CONFIDENCE or is_printed:
-        return result
-    gain = mirror_gain(target, work, crops, best)
-    if gain <= resolution(exact=True):
-        return result
-    probabilities = tuple(DOUBT * probability for probability in result.probabilities)
-    return replace(result, probabilities=probabilities, warnings=(*result.warnings, WARNING))
+    compared = (likely & (best.evidence.keypoints < DETERMINING_KEYPOINTS)).nonzero()[:, 0]
+    found = list(results)
+    if not len(compared):
+        return found
+    gain = mirror_gain(target, block, crops, best[compared])
+    for place in compared[gain > resolution(exact=True)].tolist():
+        result = found[place]
+        probabilities = tuple(DOUBT * probability for probability in result.probabilities)
+        warnings = (*result.warnings, WARNING)
+        found[place] = replace(result, probabilities=probabilities, warnings=warnings)
+    return found
 
 
-def mirror_gain(target: Target, work: Work, crops: EdgeCrops, best: Candidates) -> float:
-    """By how much the mirror image of the mesh scores more in a photograph than the mesh at its
-    ``best`` pose, by shape alone and after a short fit; 0 for a mesh that is its own mirror
+def mirror_gain(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses) -> Tensor:
+    """(N,) by how much the mirror image of the mesh scores more in a photograph than the mesh at
+    its ``best`` pose, by shape alone and after a short fit; 0 for a mesh that is its own mirror
     image."""
     plane = reflection_plane(target.bank.mesh)
     if plane is None:
-        return 0.0
+        return torch.zeros(len(best), dtype=torch.float64)
     image = target.mirror_image
     centre = image.describer.centre
-    starts = reflected_poses(best.poses, plane, target.describer.centre, centre)
-    fitted, _ = with_short_fit(image.describer, crops, starts)
-    photograph = DescribedPhotograph(
-        work.query, Ranking.none(), work.descriptor, crops, keypoints=None, frame=work.frame
+    starts = [
+        reflected_poses(one, plane, target.describer.centre, centre)
+        for one in (best[row] for row in torch.arange(len(best)).split(1))
+    ]
+    fitted, _ = with_short_fit(image.describer, crops, Hypotheses.cat(starts))
+    described = Described(
+        query=block.query,
+        rankings=[Ranking.none()] * len(block),
+        descriptor=block.descriptor,
+        crops=crops,
+        keypoints=[None] * len(block),
+        frames=block.frames,
     )
-    seen = evidence_of(image, photograph, placed(fitted, fitted.short_fit, centre))
+    seen = evidence_of(image, described, placed(fitted, fitted.short_fit, centre))
     weights = target.score_weights(exact=True)
     of_shape = EvidenceWeights.only(similarity=weights.similarity, contours=weights.contours)
-    return float(seen.scores(of_shape).max() - best.evidence.scores(of_shape))
+    highest = seen.scores(of_shape).view(len(best), -1).amax(dim=1)
+    return highest - best.evidence.scores(of_shape)
 
 
-def reflected_poses(pose: Poses, plane: Tensor, centre: Tensor, image_centre: Tensor) -> Poses:
+def reflected_poses(
+    pose: Hypotheses, plane: Tensor, centre: Tensor, image_centre: Tensor
+) -> Hypotheses:
     """Two poses at which the mirror image of a mesh is the mesh at one ``pose``, reflected through
     planes in its ``centre`` (3,): one that faces the camera, and that with the normal ``plane``
     (3,) in the model's frame. ``image_centre`` (3,) is the centre of the image."""

@@ -10,8 +10,8 @@ from ..geometry.pose_prior import object_frame
 from ..matching import ViewBank
 from ..mesh import mesh_up
 from ..mesh.mesh import mesh_centre, mesh_radius
+from .hypotheses import Hypotheses, placed
 from .inputs import ImageItem
-from .poses import Poses, placed
 
 # Degrees by which the limits are widened for views of a bank: each stands for the poses up to
 # halfway to the next
@@ -67,7 +67,7 @@ class Limits:
             raise InvalidInputError(f"prior: {message}")
         return allowed
 
-    def moved_inside(self, poses: Poses) -> Poses:
+    def moved_inside(self, poses: Hypotheses) -> Hypotheses:
         """Poses turned about the object's centre, and moved along the ray through it, as far as
         limits ask for."""
         beyond = self._excess(poses) > 0.0
@@ -86,13 +86,15 @@ class Limits:
         T = torch.where((beyond | far)[:, None, None], moved, poses.T)
         return placed(poses, T, self._centre)
 
-    def keeps(self, poses: Poses) -> Tensor:
+    def keeps(self, poses: Hypotheses) -> Tensor:
         """(H,) bool: whether poses leave the limits by no more than the tolerances."""
         return (self._excess(poses) <= FIT_TOLERANCE) & (
             self._distance_excess(poses) <= DISTANCE_TOLERANCE
         )
 
-    def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
+    def contradiction(
+        self, best: Hypotheses, filling: Hypotheses, *, better_outside: bool
+    ) -> str | None:
         """See :attr:`Registration.prior_contradiction`, of the best pose; ``filling`` is the same
         at the distance at which the mesh fills the box, ``better_outside`` whether a pose outside
         has a higher score."""
@@ -104,12 +106,12 @@ class Limits:
         )
         return "at the limit" if any(map(bool, at_limit)) else None
 
-    def _excess(self, poses: Poses) -> Tensor:
+    def _excess(self, poses: Hypotheses) -> Tensor:
         """(H,) degrees by which rotations in the photograph's camera miss the limits, negative
         within."""
         return self.prior.excess(poses.T[:, :3, :3], self._frame)
 
-    def _distance_excess(self, poses: Poses) -> Tensor:
+    def _distance_excess(self, poses: Hypotheses) -> Tensor:
         """(H,) fractions by which the distances of poses miss their limits, negative within; -1
         without limits."""
         away = torch.linalg.vector_norm(self._positions(poses.T), dim=1)

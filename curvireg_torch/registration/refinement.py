@@ -13,22 +13,21 @@ from ..matching import Ranking
 from ..utils.checks import as_numbers, check_pose, check_probability
 from ..utils.likes import ArrayLike, CameraLike, ImagesLike
 from .confidence import are_near, is_calibrated, refinement_confidence
-from .described import DescribedPhotograph, evidence_of
+from .described import Described, evidence_of
 from .focal import focal_covariance
-from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
-from .photograph import register
-from .poses import (
-    Poses,
+from .hypotheses import (
+    Hypotheses,
     distinct_poses,
     fit_poses,
     fit_texture_of,
     hypothesis_of,
 )
+from .inputs import MIN_BOX_SIDE, ImageItem, check_cameras, check_crop, image_items
 from .result import FailedRegistration, Registration
+from .stages import map_items, register
 from .starts import why_outside
 from .target import Target, nearest_view
 from .tracker import OUTSIDE, boxes_at
-from .work import map_items
 
 # Hypotheses of the registration that checks a refined pose, even if fewer are reported
 COMPARED = 5
@@ -102,9 +101,7 @@ def refine_items(
         raise InvalidInputError(
             f"refine: expected starts of {len(items)} photographs, got {len(starts)}"
         )
-    return map_items(
-        target, items, lambda item, i: refine_item(target, item, starts[i], limit=limits[i])
-    )
+    return map_items(items, lambda item, i: refine_item(target, item, starts[i], limit=limits[i]))
 
 
 def refine_item(
@@ -128,23 +125,30 @@ def refine_item(
     query = target.matcher.query(images, boxes.float())
     check_crop(query.crops[0])
     descriptors = describer.descriptor(query.field)
-    poses = Poses.at(
+    poses = Hypotheses.at(
         T, K.expand(len(T), 3, 3), describer.centre, each, torch.zeros(len(T), dtype=torch.float64)
     )
     views = torch.tensor([nearest_view(target, R) for R in poses.rotation])
-    poses = replace(poses, crop_index=each, view=views)
+    poses = replace(poses, photograph=each, view=views)
     mask = target.object_mask(query, [item] * len(T))
     crops = EdgeCrops.cut(images, boxes.float(), describer.settings.margin, mask)
     settings = target.pipeline.fit
     wide_angles = settings.wide_angles
     poses = fit_poses(describer, crops, poses, settings=settings, wide_angles=wide_angles)
 
-    photograph = DescribedPhotograph(query, Ranking.none(), descriptors, crops, keypoints=None)
+    described = Described(
+        query=query,
+        rankings=[Ranking.none()] * len(T),
+        descriptor=descriptors,
+        crops=crops,
+        keypoints=[None] * len(T),
+        frames=[None] * len(T),
+    )
     weights = target.score_weights(exact=True)
-    best = evidence_of(target, photograph, poses).scores(weights).argmax()[None]
-    if (fitted := fit_texture_of(describer, crops, poses, int(best))) is not None:
+    best = evidence_of(target, described, poses).scores(weights).argmax()[None]
+    if (fitted := fit_texture_of(describer, crops, poses[best])) is not None:
         poses = poses.replaced(best, fitted)
-    evidence = evidence_of(target, photograph, poses)
+    evidence = evidence_of(target, described, poses)
     scores = evidence.scores(weights)
     symmetries = target.symmetries_of(exact=True)
     distinct = distinct_poses(poses, scores, symmetries, angle=settings.same_pose_angle)
@@ -177,7 +181,7 @@ def refine_item(
     return Registration(
         hypotheses,
         probabilities,
-        photograph.ranking,
+        Ranking.none(),
         dict(features),
         warnings=warnings,
         notes=notes,
@@ -186,12 +190,13 @@ def refine_item(
     )
 
 
-def _registered_probability(target: Target, item: ImageItem, pose: Poses) -> float:
+def _registered_probability(target: Target, item: ImageItem, pose: Hypotheses) -> float:
     """Probability of one pose, that of the hypotheses within 30 degrees of it, in a registration of
     the box that it projects to, which its rotation does not influence."""
     boxes, _ = boxes_at(target.describer.hull, pose.T, pose.cameras, item.size)
     query = target.matcher.query([item.image], boxes.float())
-    found = register(target.with_hypotheses(COMPARED), replace(item, box=boxes[0].float()), query)
+    item = replace(item, box=boxes[0].float())
+    (found,) = register(target.with_hypotheses(COMPARED), [item], query)
     rotations = torch.stack([hypothesis.allocentric_rotation for hypothesis in found.hypotheses])
     near = are_near(rotations, pose.rotation[0], target.symmetries_of(exact=target.is_exact))
     return sum(p for p, is_near in zip(found.probabilities, near.tolist(), strict=True) if is_near)

@@ -20,16 +20,14 @@ from ..utils.choices import MESH_KINDS
 from ..utils.executors import Workers
 from ..utils.likes import ArrayLike, BoxesLike, CameraLike, ImagesLike, MaskLike, MeshLike
 from ..utils.precision import in_full_precision
-from ..utils.threads import map_on_threads
 from .detection import detect_item
 from .inputs import ImageItem, image_items
 from .judging import better_of
-from .photograph import register_item
 from .refinement import refine
 from .result import FailedRegistration, Registration
 from .several import register_views
+from .stages import map_items, register_photographs
 from .target import Target
-from .work import map_items
 from .workers import register_by_workers
 
 __all__ = ["Registrar"]
@@ -157,8 +155,7 @@ class Registrar(Target):
                 )
             bank = bank if device is None else bank.to(device)
             options: dict[str, Any] = {"pipeline": pipeline, "field": field, "renderer": renderer}
-            # Built on one thread, so that rounding does not depend on the number of threads.
-            matcher = map_on_threads(lambda bank: ViewMatcher(bank, **options), [bank])[0]
+            matcher = ViewMatcher(bank, **options)
         super().__init__(matcher, mesh_is=mesh_is, symmetries=symmetries, progress=progress)
         self.workers = Workers(workers, executor) if workers > 1 or executor is not None else None
         if self.workers is not None and self.bank.device.type != "cpu":
@@ -216,30 +213,23 @@ class Registrar(Target):
         """
         if self.workers is not None and len(items) > 1:
             return register_by_workers(self, self.workers, items, detects=detects)
-        for other in self.others:
-            other.share()
+        if not detects:
+            return register_photographs(self, items, self.others)
 
-        def register(item: ImageItem, index: int) -> Registration | FailedRegistration:
-            best = self._result_of(item, index, detects=detects)
+        def detected(item: ImageItem, index: int) -> Registration | FailedRegistration:
+            best = self._detected(item, index)
             for mesh_index, other in enumerate(self.others, 1):
-                rival = other._result_of(item, index, detects=detects)
-                best = better_of(best, rival, mesh_index)
+                best = better_of(best, other._detected(item, index), mesh_index)
             return best
 
-        if detects:
-            for target in (self, *self.others):
-                _ = target.detector  # created once, before threads use it
-        results: Results = map_items(self, items, register)
-        return results
+        found: Results = map_items(items, detected)
+        return found
 
-    def _result_of(
-        self, item: ImageItem, index: int, *, detects: bool
-    ) -> Registration | FailedRegistration:
-        """The registration of a photograph to this mesh alone, or why there is none."""
+    def _detected(self, item: ImageItem, index: int) -> Registration | FailedRegistration:
+        """The registration of a photograph without a box to this mesh alone, or why there is
+        none."""
         try:
-            if detects:
-                return detect_item(self, item, index)[0]
-            return register_item(self, item)
+            return detect_item(self, item, index)[0]
         except CurviregError as error:
             return FailedRegistration(error.with_subject("").of_image(index))
 

@@ -60,11 +60,11 @@ class Hypothesis:
             edges were found.
 
     Example:
-        >>> from curvireg_torch.registration.poses import Poses, hypothesis_of
+        >>> from curvireg_torch.registration.hypotheses import Hypotheses, hypothesis_of
         >>> T = torch.eye(4).double()[None]; T[:, 2, 3] = 5.0
         >>> view = torch.zeros(1, dtype=torch.long)
         >>> centre = torch.zeros(3).double()
-        >>> poses = Poses.at(T, torch.eye(3).double()[None], centre, view, view.double())
+        >>> poses = Hypotheses.at(T, torch.eye(3).double()[None], centre, view, view.double())
         >>> hypothesis = hypothesis_of(poses, 0, {"similarity": 0.8})
         >>> hypothesis.score, hypothesis.distance
         (0.8, 5.0)

@@ -25,10 +25,10 @@ from ..geometry.viewpoint import angles_between
 from ..rendering.contours import ContourPoints
 from ..terms import crop_photographs
 from .confidence import MAX_MARGIN, refinement_confidence
-from .described import DescribedPhotograph, evidence_of
+from .described import Described, evidence_of
 from .framing import shown_in
+from .hypotheses import Hypotheses
 from .inputs import ImageItem
-from .poses import Poses
 from .result import Hypothesis, Registration
 from .target import Target, nearest_view
 from .tracker import boxes_at
@@ -111,7 +111,7 @@ def in_frames(axes: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RigPhotograph(DescribedPhotograph):
+class RigPhotograph(Described):
     """A registered photograph.
 
     Attributes:
@@ -153,10 +153,10 @@ class RigPhotograph(DescribedPhotograph):
             box=box,
             crops=EdgeCrops.cut([image], boxes, settings.margin, mask),
             query=query,
-            ranking=result.ranking,
+            rankings=[result.ranking],
             descriptor=target.describer.descriptor(shown_in(frame, query.field)),
-            frame=frame,
-            keypoints=target.keypoint_matches(item, box) if target.uses_keypoints else None,
+            frames=[frame],
+            keypoints=[target.keypoint_matches(item, box) if target.uses_keypoints else None],
             result=result,
         )
 
@@ -306,7 +306,7 @@ class Rig:
         ranks = []
         views = self.target.bank.rotations.cpu().double()
         for photograph in self.photographs:
-            scores = photograph.ranking.scores[0].cpu().double()
+            scores = photograph.rankings[0].scores[0].cpu().double()
             log = scores.clamp(min=torch.finfo(torch.float64).tiny).log()
             angles = self.angles(self.allocentric(photograph, T)[0], views)
             near = angles <= angles.amin(dim=1, keepdim=True).clamp(min=SAME_ANGLE)
@@ -455,7 +455,9 @@ class Rig:
             cameras = photograph.K.expand(len(T), 3, 3)
             view = torch.zeros(len(T), dtype=torch.long)
             poses = replace(
-                Poses.at(photograph.camera @ T, cameras, self.describer.centre, view, ranks[v]),
+                Hypotheses.at(
+                    photograph.camera @ T, cameras, self.describer.centre, view, ranks[v]
+                ),
                 rotation=R,
                 distance=distance,
                 edge_support=support[v],

@@ -23,19 +23,17 @@ from .detection import detect
 from .framing import border_sides, outside_fraction
 from .inputs import (
     ImageItem,
-    OnDemand,
     check_cameras,
     copies_of,
     image_items,
     is_missing,
     rig_cameras,
 )
-from .photograph import register_item
 from .result import FailedRegistration, PhotographPose, Registration
 from .rig import ELSEWHERE, Answer, Found, Rig, RigPhotograph
+from .stages import register_photographs
 from .target import Target
 from .tracker import boxes_at
-from .work import map_items
 
 # Hypotheses of each photograph that are compared in all, even if fewer are reported
 JOINT_HYPOTHESES = 5
@@ -134,20 +132,30 @@ def _registered(
     """Some photographs registered alone: in their boxes, or in those around a world pose ``T`` (1,
     4, 4)."""
 
-    def register(item: ImageItem, k: int) -> RigPhotograph:
-        camera = cameras[chosen[k]]
-        if T is not None:
-            box, visible = boxes_at(target.describer.hull, camera @ T, item.K, item.size)
-            if not bool(visible):
-                raise LostObjectError(ELSEWHERE)
-            item = replace(item, box=box[0].float())
-        return RigPhotograph.of(target, item, register_item(target, item), chosen[k], camera)
+    placed = [_placed(target, items[i], cameras[i], T) for i in chosen]
+    results = register_photographs(target, placed)
+    found: Found = {}
+    for i, item, result in zip(chosen, placed, results, strict=True):
+        if isinstance(item, CurviregError):
+            found[i] = item
+        elif isinstance(result, FailedRegistration):
+            found[i] = result.error.with_subject("").of_image(i)
+        else:
+            found[i] = RigPhotograph.of(target, item, result, i, cameras[i])
+    return found
 
-    found = map_items(target, OnDemand(lambda k: items[chosen[k]], len(chosen)), register)
-    return {
-        i: r.error if isinstance(r, FailedRegistration) else r
-        for i, r in zip(chosen, found, strict=True)
-    }
+
+def _placed(
+    target: Target, item: ImageItem | CurviregError, camera: Tensor, T: Tensor | None
+) -> ImageItem | CurviregError:
+    """A photograph with its box, or with that around a world pose ``T`` (1, 4, 4)."""
+    if T is None or isinstance(item, CurviregError):
+        return item
+    try:
+        box, visible = boxes_at(target.describer.hull, camera @ T, item.K, item.size)
+    except CurviregError as error:
+        return error
+    return replace(item, box=box[0].float()) if bool(visible) else LostObjectError(ELSEWHERE)
 
 
 def _registration(target: Target, found: Found, cameras: Tensor, count: int) -> Registration:
@@ -237,7 +245,7 @@ def _joint_features(
         mean,
         total,
         sum(known) / len(known) if known else None,
-        printed=max(p.printed for p in rig.photographs),
+        printed=max(p.printed(0) for p in rig.photographs),
         undetermined=undetermined_axes(answer.covariance[0], rig.symmetries),
         outside=float(weights @ torch.tensor(outside).to(weights)),
         border=float(weights @ torch.tensor(border).to(weights)),

@@ -17,7 +17,6 @@ from ..matching import ViewDescriber, ViewMatcher
 from ..mesh import has_colours, mesh_radius, mesh_symmetries, mesh_warnings
 from ..mesh.mesh import mirrored
 from ..terms import QueryFeatures
-from ..utils.threads import map_on_threads
 from .detector import Detector
 from .framing import CropFrame, border_sides
 from .inputs import ImageItem
@@ -159,8 +158,7 @@ class Target:
     @cached_property
     def detector(self) -> Detector:
         """Proposes boxes where none are given."""
-        # one thread: rounding is always the same
-        return map_on_threads(lambda _: Detector(self.matcher), [0])[0]
+        return Detector(self.matcher)
 
     def object_mask(self, query: QueryFeatures, items: Sequence[ImageItem]) -> Tensor | None:
         """(B, 1, S, S) probability that pixels of the crops belong to the object: given, predicted,

@@ -1,6 +1,7 @@
 """Photographs whose focal length is not known exactly, within a registration; :mod:`.focal` has the
 mathematics."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -9,25 +10,25 @@ from torch import Tensor
 from ..errors import InvalidInputError
 from ..fitting.edges import EdgeCrops
 from ..fitting.focal_length import USUAL_DEVIATION
-from .candidates import Candidates
+from .block import Block, least_starts, poses_of_views
 from .confidence import are_near
-from .described import evidence_of
+from .described import with_evidence
 from .focal import (
+    FIELDS_OF_VIEW,
     FITTED,
     TRIED_VIEWS,
+    best_of_fields,
     focal_covariance,
     off_axis_angle,
     possible_cameras,
-    starts_of_fields,
     usual_camera,
     with_focal_length,
     zoomed,
 )
+from .hypotheses import Hypotheses, best_views, close_rivals, with_short_fit
 from .inputs import ImageItem
-from .poses import Poses, best_views, close_rivals
 from .priors import Limits
 from .target import Target
-from .work import Work, least_starts, poses_of_views
 
 OTHER_FOCAL = 0.2
 """Difference of log f from which a fit from another focal length may end elsewhere."""
@@ -53,57 +54,91 @@ def limits_of(target: Target, item: ImageItem) -> Limits:
     return Limits(usual, target.bank, off_centre=off_axis_angle(usual))
 
 
-def with_possible_cameras(target: Target, work: Work) -> Work:
-    """A photograph whose camera is unknown, with starts of several cameras, the best of which it
-    has."""
-    item = replace(work.item, focal_deviation=USUAL_DEVIATION, camera_source="estimated")
-    starts: Poses | None = None
-    K = usual_camera(item.size)
-    if work.crops is not None:
+def with_possible_cameras(target: Target, block: Block) -> tuple[Block, Hypotheses | None]:
+    """Photographs whose camera is unknown with the best of several, and their starts, which have
+    these; None without the contour fit, or where all cameras are known."""
+    unknown = [p for p, item in enumerate(block.photographs) if item.camera_matrix is None]
+    if not unknown:
+        return block, None
+    starts = (
+        None if block.crops is None else _starts_of_cameras(target, block, block.crops, unknown)
+    )
+    changed = {}
+    limits = list(block.limits)
+    keypoints = list(block.keypoints)
+    tried = block.tried_cameras.clone()
+    for p in unknown:
+        item = block.photographs[p]
+        K = usual_camera(item.size) if starts is None else starts.cameras[starts.of(p)[0]]
+        item = replace(
+            item,
+            camera_matrix=K,
+            focal_deviation=USUAL_DEVIATION,
+            camera_source="estimated",
+        )
+        changed[p] = item
+        limits[p] = None if item.prior is None else Limits(item, target.bank)
+        keypoints[p] = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+        tried[p] = starts is not None
+    block = replace(block, limits=limits, keypoints=keypoints, tried_cameras=tried)
+    return block.with_photographs(changed), starts
+
+
+def _starts_of_cameras(
+    target: Target, block: Block, crops: EdgeCrops, unknown: Sequence[int]
+) -> Hypotheses:
+    """Starts in photographs whose camera is ``unknown``: of the best views with several cameras,
+    those with the most evidence after a short fit, best first."""
+    parts = []
+    for p in unknown:
         view, rank = best_views(
-            work.ranking, target.bank, count=TRIED_VIEWS, symmetries=work.symmetries
+            block.rankings[p], target.bank, count=TRIED_VIEWS, symmetries=block.symmetries
         )
-        of_cameras = []
-        for camera in possible_cameras(item.size):
-            seen = replace(work, item=replace(item, camera_matrix=camera))
-            poses = poses_of_views(target, seen, view, rank)
-            of_cameras.append(poses if work.limits is None else work.limits.moved_inside(poses))
-        starts = starts_of_fields(
-            target.describer,
-            work.crops,
-            of_cameras,
-            least_starts(target),
-            screening_weight=target.pipeline.fit.screening_weight,
-        )
-        K = starts.cameras[0]
-    item = replace(item, camera_matrix=K)
-    limits = None if item.prior is None else Limits(item, target.bank)
-    keypoints = target.keypoint_matches(item, item.box) if target.uses_keypoints else None
-    return replace(work, item=item, limits=limits, keypoints=keypoints, starts=starts)
+        photograph = torch.full_like(view, p)
+        for camera in possible_cameras(block.photographs[p].size):
+            seen = replace(block.photographs[p], camera_matrix=camera)
+            parts.append(
+                poses_of_views(target, block.with_photographs({p: seen}), view, rank, photograph)
+            )
+    poses = block.moved_inside(Hypotheses.cat(parts))
+    poses, support = with_short_fit(target.describer, crops, poses)
+    evidence = poses.rank + target.pipeline.fit.screening_weight * support
+    chosen = []
+    for p in unknown:
+        rows = poses.of(p)
+        of_fields = evidence[rows].view(len(FIELDS_OF_VIEW), -1)
+        chosen.append(rows[best_of_fields(of_fields, least_starts(target))])
+    return poses[torch.cat(chosen)]
 
 
 def with_fitted_focal_lengths(
-    target: Target, work: Work, crops: EdgeCrops, found: Candidates
-) -> Candidates:
-    """The best poses and close rivals, each fitted together with its own focal length, where that
-    does not lower its score noticeably: where perspective tells nothing, a usual focal length is
-    better than one of those tried."""
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses
+) -> Hypotheses:
+    """The best poses and close rivals of photographs whose focal length is uncertain, each fitted
+    together with its own, where that does not lower its score noticeably: where perspective tells
+    nothing, a usual focal length is better than one of those tried."""
     weights = target.score_weights(exact=True)
-    scores = found.scores(weights)
-    inside = int((~found.outside).sum())
     behind = target.pipeline.fit.close_score
-    chosen = _to_be_fitted(work, found.poses, scores, inside, behind=behind)
-    index, focal = _focal_starts(chosen, found.poses.cameras[:, 0, 0])
-    starts = zoomed(found.poses[index], focal, target.describer.centre)
-    fitted = with_focal_length(target.describer, crops, starts, work.item)
-    new = evidence_of(target, work, fitted)
-    gain = new.scores(weights) - scores[index]
-    for h in chosen.tolist():
-        own = torch.where(index == h, gain, -torch.inf)
-        if float(own.max()) >= -SAME_SCORE:
+    for p, item in enumerate(block.photographs):
+        if not item.focal_deviation:
+            continue
+        rows = poses.of(p)
+        some = poses[rows]
+        scores = some.scores(weights)
+        tried = bool(block.tried_cameras[p])
+        chosen = _to_be_fitted(block, some, scores, tried=tried, behind=behind)
+        index, focal = _focal_starts(chosen, some.cameras[:, 0, 0])
+        starts = zoomed(some[index], focal, target.describer.centre)
+        fitted = with_focal_length(target.describer, crops, starts, item)
+        fitted = with_evidence(target, block, fitted)
+        gain = fitted.evidence.scores(weights) - scores[index]
+        kept = block.keeps(fitted)
+        for h in chosen.tolist():
+            own = torch.where(index == h, gain, -torch.inf)
             best = own.argmax()[None]
-            found = found.with_fitted(index[best], fitted[best], new[best], work.limits)
-    return found
+            if float(own.max()) >= -SAME_SCORE and bool(kept[best]):
+                poses = poses.with_poses(rows[index[best]], fitted[best])
+    return poses
 
 
 def _focal_starts(chosen: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
@@ -120,29 +155,38 @@ def _focal_starts(chosen: Tensor, focal: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _to_be_fitted(
-    work: Work, poses: Poses, scores: Tensor, inside: int, *, behind: float
+    block: Block, poses: Hypotheses, scores: Tensor, *, tried: bool, behind: float
 ) -> Tensor:
-    """(R,) indices of the best poses and, of an unknown camera, of a rival that differs from them
-    and, as its score is less than ``behind`` below, could be better with another focal length;
-    ``inside`` poses may be chosen."""
-    if work.starts is None:
+    """(R,) indices of the best poses of one photograph and, if cameras were ``tried``, of a rival
+    that differs from them and, as its score is less than ``behind`` below, could be better with
+    another focal length."""
+    inside = int((~poses.is_outside).sum())
+    if not tried:
         return scores.topk(min(1, inside)).indices
     best = scores.topk(min(FITTED, inside)).indices
-    rivals = close_rivals(poses, scores, work.symmetries, behind=behind)
+    rivals = close_rivals(poses, scores, block.symmetries, behind=behind)
     for index in best:
-        rivals = rivals[~are_near(poses.rotation[rivals], poses.rotation[index], work.symmetries)]
+        near = are_near(poses.rotation[rivals], poses.rotation[index], block.symmetries)
+        rivals = rivals[~near]
     return torch.cat([best, rivals[:1]])
 
 
 def with_focal_deviation(
-    target: Target, work: Work, crops: EdgeCrops, found: Candidates
-) -> tuple[Work, Candidates]:
-    """The photograph with the camera of the best pose and what is known of its focal length, and
-    the poses with the covariance that follows; the others have none."""
-    best = found.best(target.score_weights(exact=True))
-    poses = found.poses
-    covariance, deviation = focal_covariance(target.describer, crops, poses[best], work.item)
-    unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, best, covariance)
-    item = replace(work.item, camera_matrix=poses.cameras[int(best)], focal_deviation=deviation)
-    poses = replace(poses, covariance=unknown)
-    return replace(work, item=item), replace(found, poses=poses)
+    target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses
+) -> tuple[Block, Hypotheses]:
+    """Photographs whose focal length is uncertain with the camera of the best pose and what is
+    known of its focal length, and the poses with the covariance that follows; the others have
+    none."""
+    changed = {}
+    for row in poses.best(target.score_weights(exact=True)).split(1):
+        p = int(poses.photograph[row])
+        item = block.photographs[p]
+        if not item.focal_deviation:
+            continue
+        covariance, deviation = focal_covariance(target.describer, crops, poses[row], item)
+        unknown = torch.full_like(poses.covariance, torch.nan).index_copy(0, row, covariance)
+        is_here = (poses.photograph == p)[:, None, None]
+        poses = replace(poses, covariance=torch.where(is_here, unknown, poses.covariance))
+        K = poses.cameras[int(row)]
+        changed[p] = replace(item, camera_matrix=K, focal_deviation=deviation)
+    return block.with_photographs(changed), poses

@@ -17,12 +17,11 @@ from curvireg_torch.geometry.viewpoint import rotation_from_viewpoint
 from curvireg_torch.matching import ViewDescriber
 from curvireg_torch.mesh.mesh import as_mesh, extreme_points, mesh_centre
 from curvireg_torch.pipeline import BankSettings, FitSettings
-from curvireg_torch.registration import photograph as photograph_module
-from curvireg_torch.registration import work
+from curvireg_torch.registration import block, stages
 from curvireg_torch.registration.confidence import KEYPOINT_PROBABILITY, detection_probability
 from curvireg_torch.registration.detection import detect, propose
+from curvireg_torch.registration.hypotheses import fit_poses, placed
 from curvireg_torch.registration.inputs import image_items
-from curvireg_torch.registration.poses import fit_poses, placed
 from curvireg_torch.rendering import render_colour
 from curvireg_torch.synthetic import procedural_background
 
@@ -196,8 +195,8 @@ def test_a_fit_that_leaves_the_keypoints_is_not_kept(monkeypatch):
             describer.centre,
         )
 
-    monkeypatch.setattr(work, "fit_poses", fit_elsewhere)
-    monkeypatch.setattr(photograph_module, "fit_texture_of", lambda *_: None)
+    monkeypatch.setattr(block, "fit_poses", fit_elsewhere)
+    monkeypatch.setattr(stages, "fit_texture_of", lambda *_: None)
     result = registrar()([photograph(T)], box_of(T)[None], K)[0]
     assert float(rotation_error(result.rotation, T[:3, :3])) < 3.0
     assert result.edge_support > 0.0
@@ -264,7 +263,7 @@ def test_meshes_without_colours_and_photographs_without_a_camera_have_no_keypoin
     )
     assert grey.keypoint_matches(item) is None
     assert registrar().keypoint_matches(replace(item, camera_matrix=None)) is None
-    poses, count = work.keypoint_poses(grey, None)
+    poses, count = block.keypoint_poses(grey, None)
     assert len(poses) == len(count) == 0
 
 

@@ -10,8 +10,8 @@ from curvireg_torch.fitting import focal_length
 from curvireg_torch.fitting.edges import EdgeCrops
 from curvireg_torch.geometry import rotation_error
 from curvireg_torch.registration import focal, unknown_camera
+from curvireg_torch.registration.hypotheses import Hypotheses, projected_box
 from curvireg_torch.registration.inputs import image_item
-from curvireg_torch.registration.poses import Poses, projected_box
 from curvireg_torch.synthetic import example_mesh, random_pose, synthesize_photograph
 from tests._support.scenes import SIZE, learned_registrar, truck_registrar
 from tests.fitting.test_focal_length import NEAR, near_scene
@@ -22,7 +22,7 @@ def test_covariance_and_deviation_of_the_focal_length():
     describer = truck_registrar().describer
     crops = EdgeCrops.cut([image], box[None], 0.1)
     one = torch.zeros(1, dtype=torch.long)
-    poses = Poses.at(
+    poses = Hypotheses.at(
         T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))
@@ -96,7 +96,7 @@ def test_zoomed_poses_keep_their_images():
     T = near_scene()[2]
     describer = truck_registrar().describer
     one = torch.zeros(1, dtype=torch.long)
-    poses = Poses.at(T[None], NEAR[None], describer.centre, one, one.double())
+    poses = Hypotheses.at(T[None], NEAR[None], describer.centre, one, one.double())
     moved = focal.zoomed(poses, torch.tensor([2.0 * float(NEAR[0, 0])]), describer.centre)
     assert float(moved.cameras[0, 0, 0]) == pytest.approx(2.0 * float(NEAR[0, 0]))
     assert float(moved.distance[0]) > 1.9 * float(poses.distance[0])
@@ -138,7 +138,7 @@ def test_the_deviation_joins_prior_and_photograph():
     describer = truck_registrar().describer
     crops = EdgeCrops.cut([image], box[None], 0.1)
     one = torch.zeros(1, dtype=torch.long)
-    poses = Poses.at(
+    poses = Hypotheses.at(
         T[None], NEAR[None], describer.centre, one, torch.zeros(1, dtype=torch.float64)
     )
     poses = replace(poses, covariance=torch.zeros(1, 6, 6, dtype=torch.float64))

@@ -13,9 +13,8 @@ from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.matching import Ranking
 from curvireg_torch.pipeline import PRESETS, Pipeline
-from curvireg_torch.registration.candidates import Candidates
+from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.judging import better_of, judged
-from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.result import FailedRegistration, Registration
 from tests._support.scenes import CAMERA, SIZE
 
@@ -31,12 +30,12 @@ def turned(*degrees: float) -> Tensor:
     return torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
 
 
-def poses_at(*degrees: float, x: float = 0.0) -> Poses:
+def poses_at(*degrees: float, x: float = 0.0) -> Hypotheses:
     R = turned(*degrees)
     H = len(R)
     T = transform(R, torch.tensor([x, 0.0, 5.0]).double().expand(H, 3))
     rank = torch.zeros(H, dtype=torch.float64)
-    return Poses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
+    return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
 
 
 def evidence_of(**columns: list[float]) -> Evidence:
@@ -50,15 +49,17 @@ class Limits:
     """Limits that remember what they are asked."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[Poses, bool]] = []
+        self.asked: list[tuple[Hypotheses, bool]] = []
 
-    def contradiction(self, best: Poses, filling: Poses, *, better_outside: bool) -> str | None:
+    def contradiction(
+        self, best: Hypotheses, filling: Hypotheses, *, better_outside: bool
+    ) -> str | None:
         self.asked.append((best, better_outside))
         return "better outside" if better_outside else None
 
 
 def judgement(
-    poses: Poses,
+    poses: Hypotheses,
     evidence: Evidence,
     *,
     distinct: list[bool] | None = None,
@@ -87,13 +88,23 @@ def judgement(
         camera=None,
     )
     ranking = Ranking(torch.tensor([scores or [1.0, 0.5, 0.25]]), torch.arange(3)[None], {})
-    known = {"limits": None, "symmetries": None}
-    known |= {name: changes.pop(name) for name in list(changes) if name in known}
+    limits = changes.pop("limits", None)
+    symmetries = changes.pop("symmetries", None)
     vars(item).update(changes)
-    work: Any = SimpleNamespace(exact=True, item=item, ranking=ranking, printed=printed, **known)
+    block: Any = SimpleNamespace(
+        exact=True,
+        photographs=[item],
+        rankings=[ranking],
+        printed=lambda _: printed,
+        limits=[limits],
+        symmetries=symmetries,
+        boxes=item.box[None].double(),
+        cameras=CAMERA[None],
+    )
     are_outside = torch.tensor(outside or [False] * H)
     are_distinct = torch.tensor(distinct or [True] * H)
-    return judged(target, work, Candidates(poses, evidence, are_outside, are_distinct))
+    poses = replace(poses, evidence=evidence, is_outside=are_outside, is_distinct=are_distinct)
+    return judged(target, block, 0, poses)
 
 
 def order_of(result: Registration) -> list[int]:

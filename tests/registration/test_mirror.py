@@ -7,7 +7,7 @@ import trimesh
 from curvireg_torch import Registrar, ViewBank, sample_views
 from curvireg_torch.mesh.mesh import MIRROR, mesh_centre, mirrored
 from curvireg_torch.registration import mirror
-from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.poses import poses as random_poses
 from tests._support.scenes import CAMERA, learned_registrar, scene
 
@@ -21,10 +21,10 @@ def chiral_mesh() -> trimesh.Trimesh:
     return trimesh.util.concatenate(parts)
 
 
-def placed_at(T: torch.Tensor, mesh: trimesh.Trimesh) -> Poses:
+def placed_at(T: torch.Tensor, mesh: trimesh.Trimesh) -> Hypotheses:
     nothing = torch.zeros(len(T))
     cameras = CAMERA.expand(len(T), 3, 3)
-    return Poses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())
+    return Hypotheses.at(T, cameras, mesh_centre(mesh), nothing.long(), nothing.double())
 
 
 def test_mirrored_mesh_is_inside_out_nowhere():
@@ -57,7 +57,7 @@ def test_confidence_falls_where_the_mirror_image_fits_better(monkeypatch):
     image, box, _ = scene(0)
     known = learned_registrar()
     for gain, is_doubted in ((-1.0, False), (0.4, False), (1.5, True)):
-        monkeypatch.setattr(mirror, "mirror_gain", lambda *_, gain=gain: gain)
+        monkeypatch.setattr(mirror, "mirror_gain", lambda *_, gain=gain: torch.tensor([gain]))
         result = known([image], box[None], CAMERA)[0]
         assert (mirror.WARNING in result.warnings) == is_doubted
         assert result.reliable != is_doubted
@@ -70,8 +70,9 @@ def test_mirrored_mesh_is_told_from_the_mesh(monkeypatch):
     measure = mirror.mirror_gain
 
     def recorded(*given):
-        gains.append(measure(*given))
-        return gains[-1]
+        gain = measure(*given)
+        gains.extend(gain.tolist())
+        return gain
 
     monkeypatch.setattr(mirror, "mirror_gain", recorded)
     image, box, _ = scene(0)

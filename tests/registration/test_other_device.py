@@ -1,17 +1,14 @@
-from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
 import torch
 
 import curvireg_torch as cr
-from curvireg_torch.registration import work
 from curvireg_torch.rendering.contours import MeshContours
 from curvireg_torch.rendering.visibility import FaceTests
 from curvireg_torch.rendering.zbuffer import DeviceRenderer
 from curvireg_torch.synthetic import example_mesh
 from curvireg_torch.terms import Appearance
-from curvireg_torch.utils import company
 from tests._support.scenes import CAMERA, learned_registrar, scene
 
 VIEWS = cr.sample_views(azimuth_step=45, elevations=[0, 30])
@@ -19,16 +16,9 @@ AGREES = 0.05  # degrees
 
 
 @pytest.fixture
-def elsewhere(monkeypatch):
-    """A device whose tensors do not mix with those of the CPU, also on the threads of a company."""
+def elsewhere():
+    """A device whose tensors do not mix with those of the CPU."""
     support = pytest.importorskip("tests._support.other_device", exc_type=AttributeError)
-
-    @contextmanager
-    def on_a_thread():
-        with support.other_device():
-            yield
-
-    monkeypatch.setattr(company, "full_precision", on_a_thread)
     with support.other_device() as device, torch.no_grad():
         yield device
 
@@ -77,7 +67,7 @@ def test_a_bank_of_another_device_has_the_same_views(elsewhere):
 
 
 @pytest.mark.slow
-def test_photographs_in_company_have_the_poses_that_they_have_alone(monkeypatch):
+def test_photographs_in_a_block_have_the_poses_that_they_have_alone(monkeypatch):
     """The backend of devices, on the CPU."""
     images, boxes = photographs(3)
     expected = learned_registrar()(images, boxes, CAMERA)
@@ -86,7 +76,6 @@ def test_photographs_in_company_have_the_poses_that_they_have_alone(monkeypatch)
     monkeypatch.setattr("curvireg_torch.rendering.contours._visibility", FaceTests)
     describer.__dict__["contours"] = MeshContours(describer.view_mesh)
     describer.view_renderer = DeviceRenderer(example_mesh(), "cpu")
-    monkeypatch.setattr(work, "map_on_threads", company.map_in_company)
     together = registrar(images, boxes, CAMERA)
     check_agreement(together, expected)
     alone = [registrar(images[k : k + 1], boxes[k : k + 1], CAMERA)[0] for k in range(3)]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from curvireg_torch.geometry import rotation_error, rotation_from_axis_angle
 from curvireg_torch.matching import Ranking
-from curvireg_torch.registration.poses import Poses, best_views, distinct_poses
+from curvireg_torch.registration.hypotheses import Hypotheses, best_views, distinct_poses
 from tests._support.scenes import CAMERA, scene, truck_bank, truck_registrar
 
 
@@ -18,11 +18,11 @@ def rotation(x: float, y: float, z: float) -> Tensor:
     return rotation_from_axis_angle(torch.deg2rad(torch.tensor([x, y, z], dtype=torch.float64)))
 
 
-def poses(degrees: list[float]) -> Poses:
+def poses(degrees: list[float]) -> Hypotheses:
     """Poses that differ by rotations about one axis."""
     number = torch.arange(len(degrees))
     R = torch.stack([rotation(0.0, angle, 0.0) for angle in degrees])
-    return Poses(**{**{f.name: number for f in fields(Poses)}, "rotation": R})
+    return Hypotheses(**{**{f.name: number for f in fields(Hypotheses)}, "rotation": R})
 
 
 def test_distinct_poses():
@@ -47,11 +47,13 @@ def test_best_views_are_distinct_and_ranked_relative_to_the_best():
 def test_poses_fill_their_box():
     describer, (_, box, T) = truck_registrar().describer, scene(0)
     none = torch.zeros(1, dtype=torch.long)
-    exact = Poses.at(T[None], CAMERA[None], describer.centre, none, none)
+    exact = Hypotheses.at(T[None], CAMERA[None], describer.centre, none, none)
     torch.testing.assert_close(
         exact.distance, (T[:3, :3] @ describer.centre + T[:3, 3]).norm()[None]
     )
-    again = Poses.in_box(describer, box, CAMERA, exact.rotation, exact.distance, none, none)
+    again = Hypotheses.in_boxes(
+        describer, box[None], CAMERA[None], exact.rotation, exact.distance, none, none
+    )
     assert float(rotation_error(again.T[0, :3, :3], T[:3, :3])) < 2.0
     assert float((again.T[0, :3, 3] - T[:3, 3]).norm() / T[:3, 3].norm()) < 0.03
     torch.testing.assert_close(

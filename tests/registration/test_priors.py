@@ -15,8 +15,8 @@ from curvireg_torch.geometry import (
     viewpoint_from_rotation,
 )
 from curvireg_torch.geometry.pose_prior import PosePrior
+from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.poses import Poses
 from curvireg_torch.registration.priors import Limits
 from tests._support.scenes import CAMERA, learned_registrar, scene, truck_bank, truck_registrar
 
@@ -69,7 +69,7 @@ def test_limits_hold_in_the_camera_of_the_photograph():
     assert bool(allowed[distances < 7.5].all())
 
 
-def pose_at(away=1.5, degrees=0.0) -> Poses:
+def pose_at(away=1.5, degrees=0.0) -> Hypotheses:
     """A pose whose centre is so far away, off the optical axis, rotated about the axis."""
     describer = truck_registrar().describer
     index = torch.zeros(1, dtype=torch.long)
@@ -82,7 +82,7 @@ def pose_at(away=1.5, degrees=0.0) -> Poses:
         away * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
         - pose[0, :3, :3] @ describer.centre
     )
-    return Poses.at(pose, CAMERA[None], describer.centre, index, one)
+    return Hypotheses.at(pose, CAMERA[None], describer.centre, index, one)
 
 
 def test_fitted_poses_up_to_three_degrees_outside_are_kept_and_within_a_degree_of_a_limit_lie_at_it():  # noqa: E501
@@ -105,7 +105,15 @@ def test_poses_are_turned_into_all_limits_about_their_centre():
     rotation = truck_bank().rotations.double()[::7]
     view = torch.arange(len(rotation))
     box = torch.tensor([200.0, 20.0, 238.0, 60.0])
-    poses = Poses.in_box(describer, box, CAMERA, rotation, torch.ones(len(view)), view, 0.0 * view)
+    poses = Hypotheses.in_boxes(
+        describer,
+        box.expand(len(view), 4),
+        CAMERA.expand(len(view), 3, 3),
+        rotation,
+        torch.ones(len(view)),
+        view,
+        0.0 * view,
+    )
     moved = limits.moved_inside(poses)
     assert float(COMBINED.excess(moved.T[:, :3, :3]).max()) < 0.01
     assert limits.moved_inside(moved).T.equal(moved.T)

@@ -12,20 +12,19 @@ from curvireg_torch.evidence import Evidence, EvidenceWeights
 from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import refits
-from curvireg_torch.registration.candidates import Candidates
-from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.hypotheses import Hypotheses
 from tests._support.scenes import CAMERA
 
 MOVE = 1e-3
 
 
-def poses_at(*degrees: float) -> Poses:
+def poses_at(*degrees: float) -> Hypotheses:
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(angle, 30.0, 0.0).double() for angle in degrees])
     H = len(R)
     T = transform(R, torch.tensor([0.0, 0.0, 5.0]).double().expand(H, 3))
     rank = torch.zeros(H, dtype=torch.float64)
-    return Poses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
+    return Hypotheses.at(T, CAMERA.expand(H, 3, 3), torch.zeros(3).double(), torch.arange(H), rank)
 
 
 def evidence_of(*similarity: float) -> Evidence:
@@ -43,10 +42,12 @@ class Refits:
         self.fitted: list[list[int]] = []
         self.compared: list[tuple[int, list[int]]] = []
         monkeypatch.setattr(refits, "fitted_poses", self.fit)
-        monkeypatch.setattr(refits, "evidence_of", self.measure)
+        monkeypatch.setattr(refits, "with_evidence", self.measure)
         monkeypatch.setattr(refits, "with_details", self.compare)
 
-    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, refit: bool) -> Poses:
+    def fit(
+        self, target: Any, block: Any, crops: Any, starts: Hypotheses, *, refit: bool
+    ) -> Hypotheses:
         assert refit
         self.fitted.append(starts.view.tolist())
         T = starts.T.clone()
@@ -54,18 +55,21 @@ class Refits:
         T[moves, 0, 3] += MOVE
         return replace(starts, T=T)
 
-    def measure(self, target: Any, work: Any, poses: Poses) -> Evidence:
-        return evidence_of(*[self.new.get(view, 1.0) for view in poses.view.tolist()])
+    def measure(self, target: Any, block: Any, poses: Hypotheses) -> Hypotheses:
+        new = evidence_of(*[self.new.get(view, 1.0) for view in poses.view.tolist()])
+        return replace(poses, evidence=new)
 
     def compare(
-        self, target: Any, crops: Any, poses: Poses, evidence: Evidence, best: int, rivals: Tensor
-    ) -> Evidence:
-        self.compared.append((best, rivals.tolist()))
-        return replace(evidence, details=torch.ones_like(evidence.details))
+        self, target: Any, crops: Any, poses: Hypotheses, best: Tensor, rivals: Tensor
+    ) -> Hypotheses:
+        self.compared.append((int(best), rivals.tolist()))
+        evidence = poses.evidence
+        details = torch.ones_like(evidence.details)
+        return replace(poses, evidence=replace(evidence, details=details))
 
     def run(
         self,
-        poses: Poses,
+        poses: Hypotheses,
         evidence: Evidence,
         outside: list[bool] | None = None,
         symmetries: Tensor | None = None,
@@ -74,12 +78,14 @@ class Refits:
         target: Any = SimpleNamespace(
             score_weights=lambda **_: EvidenceWeights(), pipeline=Pipeline()
         )
-        work: Any = SimpleNamespace(limits=None, symmetries=symmetries)
+        block: Any = SimpleNamespace(
+            symmetries=symmetries, keeps=lambda poses: torch.ones(len(poses), dtype=torch.bool)
+        )
         crops: Any = None
         excluded = torch.tensor(outside or [False] * len(poses))
-        before = Candidates.of(poses, evidence, excluded)
-        after = refits.fitted_again(target, work, crops, before)
-        return (after.poses.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
+        before = replace(poses, evidence=evidence, is_outside=excluded)
+        after = refits.refitted(target, block, crops, before)
+        return (after.T != poses.T).flatten(1).any(dim=1).tolist(), after.evidence
 
 
 def test_the_best_pose_and_its_close_rivals_are_fitted_again(monkeypatch):

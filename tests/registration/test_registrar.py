@@ -17,7 +17,7 @@ from curvireg_torch import (
 )
 from curvireg_torch.errors import CurviregError, ImageError, InvalidInputError, LostObjectError
 from curvireg_torch.evidence import Evidence
-from curvireg_torch.fitting import contour_fit, together
+from curvireg_torch.fitting import contour_fit
 from curvireg_torch.geometry import box_iou, rotation_from_viewpoint, transform
 from curvireg_torch.matching import distinct_views
 from curvireg_torch.mesh import mesh_centre, mesh_radius
@@ -25,8 +25,9 @@ from curvireg_torch.pipeline import PRESETS, FitSettings
 from curvireg_torch.registration import (
     FailedRegistration,
     Follower,
-    photograph,
-    work,
+    block,
+    hypotheses,
+    stages,
 )
 from curvireg_torch.registration import described as described_module
 from curvireg_torch.registration import registrar as registrar_module
@@ -118,14 +119,14 @@ def test_failed_photographs_do_not_affect_others(tmp_path):
 
 
 def test_three_hypotheses_are_fitted_even_if_one_is_reported(monkeypatch):
-    fit_poses = work.fit_poses
+    fit_poses = block.fit_poses
     counts = []
 
     def counted(describer, images, poses, **options):
         counts.append(len(poses))
         return fit_poses(describer, images, poses, **options)
 
-    monkeypatch.setattr(work, "fit_poses", counted)
+    monkeypatch.setattr(block, "fit_poses", counted)
     assert len(truck_registrar(hypotheses=1)([IMAGE], BOX[None], CAMERA)[0].hypotheses) == 1
     assert counts == [3, 1], "the best is fitted twice"
 
@@ -156,7 +157,7 @@ def test_edge_support_makes_a_view_of_low_rank_a_hypothesis(
         ranking, scores=scores, order=scores.argsort(dim=1, descending=True, stable=True)
     )
     monkeypatch.setattr(type(registrar.matcher), "rank", lambda *_: lowered)
-    result = photograph.register(registrar, item, query)
+    (result,) = stages.register(registrar, [item], query)
     assert (float(rotation_error(result.rotation, TRUTH[:3, :3])) < 4) == right
     assert len(result.hypotheses) == registrar.pipeline.hypotheses
 
@@ -171,19 +172,19 @@ def test_starts_have_one_short_fit_and_a_pose_that_stays_is_described_once(
     short_fit = contour_fit.short_fit
     fits = []
     described = []
-    measure = Evidence.of
+    measure = Evidence.measured
 
     def counted(contours, crops, K, T, *index):
         fits.append(len(T))
         return short_fit(contours, crops, K, T, *index)
 
-    def measured(seen):
-        described.append(len(seen.rank))
-        return measure(seen)
+    def measured(**seen):
+        described.append(len(seen["rank"]))
+        return measure(**seen)
 
-    for module in (contour_fit, together):
+    for module in (contour_fit, hypotheses):
         monkeypatch.setattr(module, "short_fit", counted)
-    monkeypatch.setattr(Evidence, "of", measured)
+    monkeypatch.setattr(Evidence, "measured", measured)
     monkeypatch.setattr(contour_fit, "SAME_POSE_SHIFT", shift)
     registrar([IMAGE], BOX[None], CAMERA)
     assert fits == [FitSettings().screened_views, 1]
@@ -192,22 +193,22 @@ def test_starts_have_one_short_fit_and_a_pose_that_stays_is_described_once(
 
 @pytest.mark.parametrize(("support", "kept"), [(0.0, False), (1.0, True)])
 def test_the_second_fit_of_the_best_pose_counts_if_it_scores_higher(monkeypatch, support, kept):
-    fit_poses = work.fit_poses
+    fit_poses = block.fit_poses
 
     def pretended(describer, crops, poses, **options):
         fitted = fit_poses(describer, crops, poses, **options)
         other = replace(
             fitted, T=fitted.T + 1e-9, edge_support=torch.full_like(fitted.rank, support)
         )
-        return other if options.get("again") else fitted
+        return other if options.get("refit") else fitted
 
-    def contours(compared):
-        mine = compared.poses.edge_support == support
-        return torch.where(mine, 2.0 * support, measure(compared))
+    def contours(target, described, poses):
+        mine = poses.edge_support == support
+        return torch.where(mine, 2.0 * support, measure(target, described, poses))
 
-    measure = described_module.ComparedPoses.contours.fget
-    monkeypatch.setattr(work, "fit_poses", pretended)
-    monkeypatch.setattr(described_module.ComparedPoses, "contours", property(contours))
+    measure = described_module._contours
+    monkeypatch.setattr(block, "fit_poses", pretended)
+    monkeypatch.setattr(described_module, "_contours", contours)
     result = truck_registrar()([IMAGE], BOX[None], CAMERA)[0]
     assert (result.edge_support == support) == kept
 
@@ -222,14 +223,14 @@ def test_default_dtype_does_not_matter():
 
 
 def test_an_error_inside_a_fit_fails_its_photograph_alone(monkeypatch):
-    fit_poses = work.fit_poses
+    fit_poses = block.fit_poses
 
     def fail(describer, crops, poses, **options):
         if float(crops.crops.amax()) <= 0.25:
             raise CurviregError("no fit")
         return fit_poses(describer, crops, poses, **options)
 
-    monkeypatch.setattr(work, "fit_poses", fail)
+    monkeypatch.setattr(block, "fit_poses", fail)
     results = truck_registrar()([IMAGE, 0.25 * IMAGE, IMAGE], BOX.repeat(3, 1), CAMERA)
     assert [result.ok for result in results] == [True, False, True]
     assert str(results[1].error) == "image 1: no fit"
@@ -372,7 +373,7 @@ def test_corrected_result_is_kept_if_it_agrees_better(monkeypatch, better, evide
         )
     )
     answers = iter([first, other])
-    monkeypatch.setattr(photograph, "_register_box", lambda *_: next(answers))
+    monkeypatch.setattr(stages, "register_boxes", lambda *_: [next(answers)])
     result = registrar([IMAGE], WRONG[None], CAMERA)[0]
     assert (result is first) != better
     assert (result.corrected_box is None) != better

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from curvireg_torch import Registrar, ViewBank
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.fitting import together
 from curvireg_torch.fitting.keypoints import KeypointMatches
 from curvireg_torch.geometry import (
     PosePrior,
@@ -22,7 +21,7 @@ from curvireg_torch.geometry import (
 )
 from curvireg_torch.mesh.mesh import principal_rotation
 from curvireg_torch.pipeline import PRESETS, BankSettings, Pipeline, ViewPolicy
-from curvireg_torch.registration import photograph, search, work
+from curvireg_torch.registration import block, hypotheses, search, stages
 from curvireg_torch.terms import Appearance
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -199,24 +198,24 @@ def test_preset_paper_runs_the_stages_of_the_paper_and_no_other(monkeypatch):
         raise AssertionError("not a stage of the paper")
 
     for module, name in (
-        (work, "fit_poses"),
-        (photograph, "with_short_fit"),
-        (photograph, "with_edge_support"),
-        (photograph, "fit_texture_of"),
-        (photograph, "EdgeCrops"),
+        (block, "fit_poses"),
+        (stages, "with_short_fit"),
+        (stages, "with_edge_support"),
+        (stages, "fit_texture_of"),
+        (stages, "EdgeCrops"),
     ):
         monkeypatch.setattr(module, name, refused)
-    monkeypatch.setattr(together, "fit_to_edges", refused)
+    monkeypatch.setattr(hypotheses, "fit_to_edges", refused)
     monkeypatch.setattr(KeypointMatches, "agreeing", refused)
     monkeypatch.setattr(Appearance, "build", refused)
     monkeypatch.setattr(Registrar, "object_mask", refused)
-    stages: list[str] = []
+    shown: list[str] = []
     bank = ViewBank.build(
-        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: stages.append(x[0])
+        truck_bank().mesh, pipeline=PRESETS["paper"], progress=lambda *x: shown.append(x[0])
     )
     image, box, _ = scene(0)
-    result = Registrar(bank, progress=lambda *x: stages.append(x[0]))([image], box[None], CAMERA)[0]
-    assert list(dict.fromkeys(stages)) == ["bank", "ranking", "search"]
+    result = Registrar(bank, progress=lambda *x: shown.append(x[0]))([image], box[None], CAMERA)[0]
+    assert list(dict.fromkeys(shown)) == ["bank", "ranking", "search"]
     assert list(result.ranking.terms) == ["hog", "repeatability"]
     assert len(result.hypotheses) == 1
     assert result.confidence is None

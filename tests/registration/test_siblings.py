@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -16,8 +17,7 @@ from curvireg_torch.geometry import (
     transform,
 )
 from curvireg_torch.registration import siblings
-from curvireg_torch.registration.candidates import Candidates
-from curvireg_torch.registration.poses import Poses
+from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.shape_symmetries import TellingSymmetries
 from curvireg_torch.registration.siblings import Siblings
 from tests._support.scenes import CAMERA
@@ -30,10 +30,11 @@ def four(similarity: list[float], compare: list[list[float]], angles: list[float
     T = transform(R, torch.tensor([0.0, 0.0, 5.0]).double().expand(len(R), 3))
     index = torch.zeros(len(T), dtype=torch.long)
     rank = torch.zeros(len(T), dtype=torch.float64)
-    poses = Poses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
+    poses = Hypotheses.at(T, CAMERA.expand(len(T), 3, 3), torch.zeros(3).double(), index, rank)
     different = ~torch.eye(len(T), dtype=torch.bool)
     details = torch.tensor(compare, dtype=torch.float64)
-    return Siblings(poses, evidence(*similarity), details, different, EvidenceWeights())
+    poses = replace(poses, evidence=evidence(*similarity))
+    return Siblings(poses, details, different, EvidenceWeights())
 
 
 def evidence(*similarity: float) -> Evidence:
@@ -56,30 +57,30 @@ def test_the_rival_is_the_best_other_sibling_that_is_far_and_looks_different():
     equal = [[0.0] * 4] * 4
     family = four(rows, equal, [0, 20, 100, 200])
     fitted = evidence(0.9)
-    rival = family.rival(0, fitted, notable=False)
-    assert torch.equal(rival.found.poses.T[0], family.poses.T[2]), "the nearer one is no rival"
-    assert float(rival.found.evidence.similarity) == pytest.approx(0.8)
-    assert not rival.feature_is_hidden
+    rival, is_hidden = family.rival(0, fitted, notable=False)
+    assert torch.equal(rival.T[0], family.poses.T[2]), "the nearer one is no rival"
+    assert float(rival.evidence.similarity) == pytest.approx(0.8)
+    assert not is_hidden
     alike = family.look_different.clone()
     alike[0, 2] = False
-    rival = replace(family, look_different=alike).rival(0, fitted, notable=False)
-    assert torch.equal(rival.found.poses.T[0], family.poses.T[3])
-    assert float(rival.found.evidence.similarity) == pytest.approx(0.7)
-    assert rival.feature_is_hidden
+    rival, is_hidden = replace(family, look_different=alike).rival(0, fitted, notable=False)
+    assert torch.equal(rival.T[0], family.poses.T[3])
+    assert float(rival.evidence.similarity) == pytest.approx(0.7)
+    assert is_hidden
     told = [[0.0] * 4, [0.0] * 4, [-0.5, 0, 0, 0], [-2.0, 0, 0, 0]]
-    rival = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
-    assert float(rival.found.evidence.details) == -0.5
+    rival, _ = four(rows, told, [0, 20, 100, 200]).rival(0, fitted, notable=False)
+    assert float(rival.evidence.details) == -0.5
 
 
 def test_siblings_that_look_alike_are_rivals_if_the_hidden_feature_is_notable():
     family = four([0.80, 0.79, 0.70], [[0.0] * 3] * 3, [0, 20, 100])
     family = replace(family, look_different=torch.zeros(3, 3, dtype=torch.bool))
-    small = family.rival(0, evidence(0.9), notable=False)
-    assert len(small.found) == 0
-    assert small.feature_is_hidden
-    notable = family.rival(0, evidence(0.9), notable=True)
-    assert torch.equal(notable.found.poses.T[0], family.poses.T[2])
-    assert notable.feature_is_hidden
+    small, is_hidden = family.rival(0, evidence(0.9), notable=False)
+    assert len(small) == 0
+    assert is_hidden
+    notable, is_hidden = family.rival(0, evidence(0.9), notable=True)
+    assert torch.equal(notable.T[0], family.poses.T[2])
+    assert is_hidden
 
 
 def turns_about_z(count: int) -> Tensor:
@@ -93,52 +94,59 @@ class Case:
     siblings of the best have the similarities ``measured``, a sibling that is fitted 0.95."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, measured: list[float]) -> None:
-        self.fitted: list[Poses] = []
+        self.fitted: list[Hypotheses] = []
         self.symmetries = turns_about_z(3)
         self.poses = four([0.0] * 3, [[0.0] * 3] * 3, [0, 40, 80]).poses
         different = ~torch.eye(3, dtype=torch.bool)
         monkeypatch.setattr(siblings, "fitted_poses", self.fit)
-        monkeypatch.setattr(
-            siblings, "details_together", lambda *_: (torch.zeros(3, 3).double(), different)
-        )
+        monkeypatch.setattr(siblings, "on_device", lambda *_: torch.arange(3))
+        monkeypatch.setattr(siblings, "compared", lambda _: (torch.zeros(3, 3).double(), different))
         monkeypatch.setattr(
             siblings,
-            "evidence_of",
-            lambda _, __, poses: evidence(*measured) if len(poses) == 3 else evidence(0.95),
+            "with_evidence",
+            lambda _, __, poses: replace(
+                poses, evidence=evidence(*measured) if len(poses) == 3 else evidence(0.95)
+            ),
         )
 
-    def fit(self, target: Any, work: Any, crops: Any, starts: Poses, *, refit: bool) -> Poses:
+    def fit(
+        self, target: Any, block: Any, crops: Any, starts: Hypotheses, *, refit: bool
+    ) -> Hypotheses:
         assert refit
         self.fitted.append(starts)
         moved = starts.T.clone()
         moved[:, 0, 3] += 1e-3
         return replace(starts, T=moved)
 
-    def run(self, keeps: list[bool] | None = None) -> tuple[Poses, Evidence, siblings.Rival]:
+    def run(self, keeps: list[bool] | None = None) -> tuple[Hypotheses, Evidence, Hypotheses]:
         """``keeps``: what the limits say, one call after the other."""
         target: Any = SimpleNamespace(
             telling_symmetries=TellingSymmetries(self.symmetries),
-            describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
+            describer=SimpleNamespace(contours=None, centre=torch.zeros(3).double()),
             score_weights=lambda **_: EvidenceWeights(),
         )
         answers = iter(keeps or [])
-        limits = SimpleNamespace(keeps=lambda poses: torch.tensor([next(answers)] * len(poses)))
-        work: Any = SimpleNamespace(limits=limits if keeps else None)
+        block: Any = MagicMock()
+        block.__len__.return_value = 1
+        block.keeps = lambda poses: torch.tensor([next(answers, True)] * len(poses))
         crops: Any = None
         outside = torch.tensor([True, False, False])
-        before = Candidates.of(self.poses, evidence(0.99, 0.9, 0.5), outside)
-        after, rival = siblings.with_siblings(target, work, crops, before)
-        return after.poses, after.evidence, rival
+        given = evidence(0.99, 0.9, 0.5)
+        before = replace(self.poses, evidence=given, is_outside=outside)
+        after, rival, _ = siblings.with_siblings(target, block, crops, before)
+        assert not bool(rival.is_outside.any())
+        assert bool(rival.is_sibling.all())
+        return after, after.evidence, rival
 
 
 def test_the_best_pose_stays_and_its_sibling_is_its_rival(monkeypatch):
     case = Case(monkeypatch, [0.80, 0.75, 0.70])
     poses, changed, rival = case.run()
-    assert poses is case.poses
+    assert torch.equal(poses.T, case.poses.T)
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
     # a symmetry turns the model, before it is posed
-    torch.testing.assert_close(rival.found.poses.T[0], case.poses.T[1] @ case.symmetries[1])
-    assert float(rival.found.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
+    torch.testing.assert_close(rival.T[0], case.poses.T[1] @ case.symmetries[1])
+    assert float(rival.evidence.similarity) == pytest.approx(0.9 + 0.75 - 0.80)
     assert not case.fitted
 
 
@@ -150,8 +158,8 @@ def test_a_better_sibling_is_fitted_and_the_pose_before_is_its_rival(monkeypatch
     assert float(poses.T[1, 0, 3] - start.T[0, 0, 3]) == pytest.approx(1e-3)
     assert torch.equal(poses.T[[0, 2]], case.poses.T[[0, 2]])
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.95, 0.5])
-    torch.testing.assert_close(rival.found.poses.T[0], case.poses.T[1])
-    assert float(rival.found.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
+    torch.testing.assert_close(rival.T[0], case.poses.T[1])
+    assert float(rival.evidence.similarity) == pytest.approx(0.95 + 0.80 - 0.90)
 
 
 def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
@@ -159,12 +167,12 @@ def test_siblings_outside_the_limits_count_as_neither(monkeypatch):
     poses, changed, rival = case.run(keeps=[False, False])
     assert torch.equal(poses.T, case.poses.T)
     assert changed.similarity.tolist() == pytest.approx([0.99, 0.9, 0.5])
-    assert len(rival.found) == 0
+    assert len(rival) == 0
 
 
 def test_meshes_without_a_telling_feature_have_no_siblings(monkeypatch):
     case = Case(monkeypatch, [0.80, 0.75, 0.70])
     case.symmetries = torch.eye(4).double()[None]
     poses, _, rival = case.run()
-    assert poses is case.poses
-    assert len(rival.found) == 0
+    assert torch.equal(poses.T, case.poses.T)
+    assert len(rival) == 0

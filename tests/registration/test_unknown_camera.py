@@ -21,10 +21,9 @@ from curvireg_torch.geometry import rotation_from_viewpoint, transform
 from curvireg_torch.geometry.cameras import point_in_cameras
 from curvireg_torch.pipeline import Pipeline
 from curvireg_torch.registration import focal, unknown_camera
-from curvireg_torch.registration.candidates import Candidates
+from curvireg_torch.registration.block import Block
+from curvireg_torch.registration.hypotheses import Hypotheses
 from curvireg_torch.registration.inputs import ImageItem
-from curvireg_torch.registration.poses import Poses
-from curvireg_torch.registration.work import Work
 from tests._support.scenes import CAMERA, SIZE
 
 NOTHING: Any = None
@@ -32,12 +31,12 @@ CENTRE = torch.tensor([0.3, -0.2, 0.4], dtype=torch.float64)
 BOX = torch.tensor([60.0, 40.0, 180.0, 140.0])
 
 
-def poses_at(count: int, *, K: Tensor = CAMERA, rank: list[float] | None = None) -> Poses:
+def poses_at(count: int, *, K: Tensor = CAMERA, rank: list[float] | None = None) -> Hypotheses:
     """Of the views 0, 1, ..., turned about the vertical axis."""
     R = torch.stack([rotation_from_viewpoint(70.0 * k, 30.0, 0.0).double() for k in range(count)])
     T = transform(R, torch.tensor([0.1, 0.0, 5.0]).double().expand(count, 3))
     ranks = torch.tensor(rank or [0.0] * count, dtype=torch.float64)
-    return Poses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
+    return Hypotheses.at(T, K.expand(count, 3, 3), CENTRE, torch.arange(count), ranks)
 
 
 def evidence_of(*similarity: float) -> Evidence:
@@ -63,25 +62,18 @@ def test_the_angle_to_the_centre_of_the_box():
     assert focal.off_axis_angle(item) == pytest.approx(math.degrees(math.atan(130.0 / 260.0)))
 
 
-def test_starts_are_the_best_view_of_each_camera_and_the_best_views(monkeypatch):
+def test_starts_are_the_best_view_of_each_camera_and_the_best_views():
     """Of three cameras and four views; the short fits of the second camera reach most."""
     support = torch.tensor(
         [[0.20, 0.30, 0.10, 0.10], [0.50, 0.10, 0.45, 0.10], [0.10, 0.15, 0.10, 0.40]]
     ).double()
-    given = [poses_at(4, K=(1.0 + k) * CAMERA, rank=[0.0, -1.0, -2.0, -3.0]) for k in range(3)]
-    monkeypatch.setattr(
-        focal, "with_short_fit", lambda _, __, poses: (poses, support.flatten().clone())
-    )
     ranked = support * 20.0 - torch.arange(4)
-    chosen = focal.starts_of_fields(NOTHING, NOTHING, given, 2, screening_weight=20.0)
-    camera = (chosen.cameras[:, 0, 0] / CAMERA[0, 0] - 1.0).round().int().tolist()
-    found = list(zip(camera, chosen.view.tolist(), strict=True))
+    found = [divmod(place, 4) for place in focal.best_of_fields(ranked, 2).tolist()]
     # the best view of each camera, and the third view with its best camera, the second best of all
     expected = [(1, 0), (1, 2), (0, 1), (2, 3)]
     assert found == sorted(expected, key=lambda place: -float(ranked[place]))
-    every = focal.starts_of_fields(NOTHING, NOTHING, given, 4, screening_weight=20.0)
-    assert len(every) == 4
-    assert every.view.sort().values.tolist() == [0, 1, 2, 3]
+    every = focal.best_of_fields(ranked, 4)
+    assert sorted((every % 4).tolist()) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(("source", "factors"), [("estimated", [2, 1]), ("exif", [1])])
@@ -146,32 +138,37 @@ def refitted(
     evidence: Evidence,
     new: dict[int, float],
     *,
-    starts: Any,
+    tried_cameras: bool,
     outside: list[bool] | None = None,
 ) -> tuple[list[int], list[int], Evidence]:
     """Views that were fitted with their focal lengths, those that changed, and the evidence."""
     poses = poses_at(len(evidence))
     tried: list[int] = []
 
-    def fit(_: Any, __: Any, some: Poses, ___: Any) -> Poses:
+    def fit(_: Any, __: Any, some: Hypotheses, ___: Any) -> Hypotheses:
         tried.extend(some.view.tolist())
         return replace(some, cameras=2.0 * some.cameras)
 
-    def measure(_: Any, __: Any, some: Poses) -> Evidence:
-        return evidence_of(*[new[view] for view in some.view.tolist()])
+    def measure(_: Any, __: Any, some: Hypotheses) -> Hypotheses:
+        return replace(some, evidence=evidence_of(*[new[view] for view in some.view.tolist()]))
 
     monkeypatch.setattr(unknown_camera, "with_focal_length", fit)
-    monkeypatch.setattr(unknown_camera, "evidence_of", measure)
+    monkeypatch.setattr(unknown_camera, "with_evidence", measure)
     target: Any = SimpleNamespace(
         score_weights=lambda **_: EvidenceWeights(),
         describer=SimpleNamespace(centre=CENTRE),
         pipeline=Pipeline(),
     )
-    work: Any = SimpleNamespace(starts=starts, item=None, limits=None, symmetries=None)
+    block: Any = SimpleNamespace(
+        tried_cameras=torch.tensor([tried_cameras]),
+        photographs=[SimpleNamespace(focal_deviation=0.1)],
+        symmetries=None,
+        keeps=lambda some: torch.ones(len(some), dtype=torch.bool),
+    )
     excluded = torch.tensor(outside or [False] * len(poses))
-    before = Candidates.of(poses, evidence, excluded)
-    after = unknown_camera.with_fitted_focal_lengths(target, work, NOTHING, before)
-    differ = (after.poses.cameras != poses.cameras).flatten(1).any(dim=1)
+    before = replace(poses, evidence=evidence, is_outside=excluded)
+    after = unknown_camera.with_fitted_focal_lengths(target, block, NOTHING, before)
+    differ = (after.cameras != poses.cameras).flatten(1).any(dim=1)
     return tried, differ.nonzero()[:, 0].tolist(), after.evidence
 
 
@@ -179,17 +176,17 @@ def test_fitted_focal_lengths_may_lower_scores_a_little(monkeypatch):
     """By 0.2, which is 0.02 of similarity."""
     evidence = evidence_of(0.6, 0.9, 0.8)
     new = {0: 0.6, 1: 0.885, 2: 0.775}
-    tried, changed, after = refitted(monkeypatch, evidence, new, starts="several cameras")
+    tried, changed, after = refitted(monkeypatch, evidence, new, tried_cameras=True)
     assert (tried, changed) == ([1, 2], [1])
     assert after.similarity.tolist() == pytest.approx([0.6, 0.885, 0.8])
-    assert refitted(monkeypatch, evidence, new, starts=None)[0] == [1], "of a known camera"
+    assert refitted(monkeypatch, evidence, new, tried_cameras=False)[0] == [1], "of a known camera"
     excluded = [False, True, False]
-    tried, changed, _ = refitted(monkeypatch, evidence, new, starts="some", outside=excluded)
+    tried, changed, _ = refitted(monkeypatch, evidence, new, tried_cameras=True, outside=excluded)
     assert (tried, changed) == ([2, 0], [0])
     excluded = [True, True, False]
-    assert refitted(monkeypatch, evidence, new, starts="some", outside=excluded)[0] == [2]
+    assert refitted(monkeypatch, evidence, new, tried_cameras=True, outside=excluded)[0] == [2]
     close = evidence_of(0.7, 0.9, 0.8)
-    assert refitted(monkeypatch, close, new, starts="some")[0] == [1, 2, 0], "a close rival"
+    assert refitted(monkeypatch, close, new, tried_cameras=True)[0] == [1, 2, 0], "a close rival"
 
 
 def test_fits_also_begin_from_the_focal_length_of_another_pose():
@@ -213,15 +210,15 @@ def test_only_the_best_pose_has_a_covariance_and_its_camera_is_the_photographs(m
     best = torch.full((1, 6, 6), 2.0, dtype=torch.float64)
     monkeypatch.setattr(unknown_camera, "focal_covariance", lambda *_: (best, 0.07))
     target: Any = SimpleNamespace(score_weights=lambda **_: EvidenceWeights(), describer=None)
-    item = ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA)
-
-    given: dict[str, Any] = {field.name: None for field in fields(Work)} | {"item": item}
+    item = replace(ImageItem(torch.zeros(3, *SIZE), BOX, CAMERA), focal_deviation=0.1)
+    given: dict[str, Any] = {field.name: None for field in fields(Block)}
+    block = Block(**given | {"photographs": [item]})
     outside = torch.tensor([False, False, True])
-    before = Candidates.of(poses, evidence_of(0.7, 0.8, 0.9), outside)
-    work, found = unknown_camera.with_focal_deviation(target, Work(**given), NOTHING, before)
-    after = found.poses
-    assert work.item.focal_deviation == 0.07
-    assert torch.equal(work.item.camera_matrix, poses.cameras[1])
+    before = replace(poses, evidence=evidence_of(0.7, 0.8, 0.9), is_outside=outside)
+    block, after = unknown_camera.with_focal_deviation(target, block, NOTHING, before)
+    (photograph,) = block.photographs
+    assert photograph.focal_deviation == 0.07
+    assert torch.equal(photograph.camera_matrix, poses.cameras[1])
     assert bool(after.covariance[[0, 2]].isnan().all())
     assert torch.equal(after.covariance[1], best[0])
 

@@ -1,0 +1,530 @@
+"""A registration, stage by stage, each for a block of photographs at once: describe, rank, start,
+screen, fit, refit, judge."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..errors import CurviregError
+from ..fitting.edges import EdgeCrops
+from ..matching import Ranking
+from ..terms import QueryFeatures
+from ..utils.precision import exact_convolutions
+from ..utils.segments import order_within, place_within
+from .block import Block, fitted_poses, keypoint_poses, least_starts, poses_of_views
+from .camera_check import with_checked_cameras
+from .confidence import are_near
+from .described import with_evidence
+from .focal import FINISHED
+from .framing import shown_in, whole_boxes
+from .hypotheses import (
+    Hypotheses,
+    best_views,
+    common_score,
+    distinct_poses,
+    fit_texture_of,
+    projected_box,
+    with_edge_support,
+    with_short_fit,
+)
+from .inputs import ImageItem, check_crop
+from .judging import better_of, judged
+from .mirror import compared_with_mirror_image
+from .priors import Limits
+from .refits import refitted
+from .result import FailedRegistration, Registration
+from .search import search
+from .siblings import with_siblings
+from .target import Target
+from .unknown_camera import (
+    limits_of,
+    with_fitted_focal_lengths,
+    with_focal_deviation,
+    with_possible_cameras,
+)
+
+Result = Registration | CurviregError
+
+BLOCK = {"cpu": 8}
+"""Photographs in a block by the kind of device: on a CPU more of them take more memory and no less
+time."""
+BLOCK_OF_DEVICE = 64
+
+
+def register_photographs(
+    target: Target,
+    items: Sequence[ImageItem | CurviregError],
+    others: Sequence[Target] = (),
+) -> list[Registration | FailedRegistration]:
+    """Register photographs with boxes, in blocks, each to the best of the target and ``others``;
+    one that cannot be registered fails alone. Items are read on demand, so that few are in
+    memory."""
+    size = BLOCK.get(target.bank.device.type, BLOCK_OF_DEVICE)
+    results: list[Registration | FailedRegistration] = []
+    with exact_convolutions():
+        for first in range(0, len(items), size):
+            some = [items[k] for k in range(first, min(first + size, len(items)))]
+            best = _register_block(target, some, first)
+            for mesh_index, other in enumerate(others, 1):
+                rivals = _register_block(other, some, first)
+                pairs = zip(best, rivals, strict=True)
+                best = [better_of(one, rival, mesh_index) for one, rival in pairs]
+            results += best
+    return results
+
+
+def _register_block(
+    target: Target, items: Sequence[ImageItem | CurviregError], first: int
+) -> list[Registration | FailedRegistration]:
+    """Register a few photographs; the ``first`` one's index is that of the caller."""
+    results: list[Registration | FailedRegistration] = []
+    registered = _with_corrected_boxes(target, items, register_boxes(target, items))
+    for index, (item, result) in enumerate(zip(items, registered, strict=True), first):
+        if isinstance(item, CurviregError):
+            results.append(FailedRegistration(item))
+        elif isinstance(result, CurviregError):
+            results.append(_failure(result, index))
+        else:
+            results.append(result)
+    return results
+
+
+def map_items(
+    items: Sequence[ImageItem | CurviregError], function: Callable[[ImageItem, int], Any]
+) -> list[Any]:
+    """Results of ``function(item, index)`` for photographs one by one, a
+    :class:`FailedRegistration` for each error. Items are read on demand, so that few are in
+    memory."""
+    results = []
+    with exact_convolutions():
+        for index in range(len(items)):
+            item = items[index]
+            try:
+                if isinstance(item, CurviregError):
+                    raise item
+                results.append(function(item, index))
+            except CurviregError as error:
+                failed = isinstance(item, CurviregError)
+                results.append(FailedRegistration(error) if failed else _failure(error, index))
+    return results
+
+
+def _failure(error: CurviregError, index: int) -> FailedRegistration:
+    return FailedRegistration(error.with_subject("").of_image(index))
+
+
+def _with_corrected_boxes(
+    target: Target, items: Sequence[ImageItem | CurviregError], results: Sequence[Result]
+) -> list[Result]:
+    """Results, with those of another box where the pose asks for one in which it is seen better."""
+    found = list(results)
+    changed: dict[int, ImageItem] = {}
+    for index, (item, result) in enumerate(zip(items, results, strict=True)):
+        if isinstance(item, ImageItem) and isinstance(result, Registration):
+            box = _other_box(target, item, result)
+            if box is not None:
+                changed[index] = replace(item, box=box.float())
+    weights = target.score_weights(exact=True)
+    others = register_boxes(target, list(changed.values()))
+    for index, other in zip(changed, others, strict=True):
+        result = found[index]
+        if not isinstance(other, Registration) or not isinstance(result, Registration):
+            continue
+        before = common_score(result.hypotheses[0], weights)
+        if common_score(other.hypotheses[0], weights) > before:
+            box = projected_box(target.describer, result.projection)
+            found[index] = replace(other, corrected_box=box)
+    return found
+
+
+def _other_box(target: Target, item: ImageItem, result: Registration) -> Tensor | None:
+    """The box of the pose that was found, if the photograph shows another part in it."""
+    # Without a camera, poses are derived from their boxes.
+    if not (target.pipeline.box_jitter and target.pipeline.contours and result.camera is not None):
+        return None
+    box = projected_box(target.describer, result.projection)
+    # in a frame and without one, similarities mean different things
+    alike = target.has_frame(item.box, item.size) == target.has_frame(box, item.size)
+    return box if alike and item.shows_other_part(box) else None
+
+
+def register_boxes(target: Target, items: Sequence[ImageItem | CurviregError]) -> list[Result]:
+    """Register photographs in their boxes. Those with a mask and those without are blocks of their
+    own: a mask weights the edges of all."""
+    found: dict[int, Result] = {
+        k: item for k, item in enumerate(items) if isinstance(item, CurviregError)
+    }
+    for has_mask in (False, True):
+        alike = {
+            k: item
+            for k, item in enumerate(items)
+            if isinstance(item, ImageItem) and (item.mask is not None) == has_mask
+        }
+        together = _register_alike(target, list(alike.values()))
+        found.update(zip(alike, together, strict=True))
+    return [found[k] for k in range(len(items))]
+
+
+def _register_alike(target: Target, items: Sequence[ImageItem]) -> list[Result]:
+    """Register photographs together; where that fails, each alone, so that an error is that of its
+    own photograph."""
+    if not items:
+        return []
+    try:
+        query = describe(target, items)
+        return list(register(target, items, query))
+    except CurviregError as error:
+        if len(items) == 1:
+            return [error]
+    shown = [_shown(target, item) for item in items]
+    usable = [item for item in shown if isinstance(item, ImageItem)]
+    if len(usable) == len(items):
+        return [_register_alike(target, [item])[0] for item in items]
+    registered = iter(_register_alike(target, usable))
+    return [next(registered) if isinstance(one, ImageItem) else one for one in shown]
+
+
+def _shown(target: Target, item: ImageItem) -> ImageItem | CurviregError:
+    """A photograph whose box can be described, or why it cannot."""
+    try:
+        describe(target, [item])
+    except CurviregError as error:
+        return error
+    return item
+
+
+@torch.no_grad()
+def register(
+    target: Target, photographs: Sequence[ImageItem], query: QueryFeatures
+) -> list[Registration]:
+    """Register photographs: rank, start, screen, fit, refit, judge.
+
+    Args:
+        target: the object.
+        photographs: P of them.
+        query: the same, cropped and described by the matcher.
+    """
+    block = rank(target, photographs, query)
+    starts = None
+    if block.exact:
+        block, starts = with_possible_cameras(target, block)
+    if target.pipeline.search:
+        return _searched(target, block)
+    begun = start(target, block, starts)
+    poses = begun
+    if block.crops is not None:
+        target.report_progress("contours")
+        poses = fit(target, block, block.crops, begun)
+    poses = with_evidence(target, block, poses)
+    rivals = poses[:0]
+    feature_is_hidden = [False] * len(block)
+    if block.crops is not None and block.exact:
+        poses = refit(target, block, block.crops, poses)
+        poses, rivals, feature_is_hidden = with_siblings(target, block, block.crops, poses)
+        poses = _with_texture(target, block, block.crops, poses)
+    poses = _merged(target, block, poses)
+    # Unlike another view, repeated ones started near the pose that they merged with: they are no
+    # rivals.
+    other = (poses.is_distinct | ~begun.is_repeated).nonzero()[:, 0]
+    poses = _with_views_again(target, block, poses[other], begun[other])
+    if block.crops is not None:
+        block, poses = with_focal_deviation(target, block, block.crops, poses)
+    results = judge(target, block, Hypotheses.cat([poses, rivals]), feature_is_hidden)
+    if block.crops is None or not block.exact:
+        return results
+    compared = Hypotheses.cat([poses, rivals])
+    best = compared[compared.best(target.score_weights(exact=True))]
+    results = compared_with_mirror_image(target, block, block.crops, best, results)
+    return with_checked_cameras(target, block, block.crops, best, results)
+
+
+def describe(target: Target, items: Sequence[ImageItem]) -> QueryFeatures:
+    """Crop and describe the boxes of photographs; one that shows nothing is refused."""
+    boxes = torch.stack([item.box for item in items])
+    query = target.matcher.query([item.image for item in items], boxes)
+    for crop in query.crops:
+        check_crop(crop)
+    return query
+
+
+def rank(target: Target, photographs: Sequence[ImageItem], query: QueryFeatures) -> Block:
+    """Compare the views of the bank with photographs."""
+    for _ in photographs:
+        target.report_progress("ranking")
+    exact = target.is_exact
+    limits = [None if item.prior is None else limits_of(target, item) for item in photographs]
+    boxes = torch.stack([item.box for item in photographs])
+    crops = None
+    if target.pipeline.contours:
+        mask = target.object_mask(query, photographs)
+        images = [item.image for item in photographs]
+        crops = EdgeCrops.cut(images, boxes, target.bank.settings.margin, mask)
+    frames = [target.frame_of(item.box, item.size) for item in photographs]
+    fields = [shown_in(frame, field) for frame, field in zip(frames, query.field, strict=True)]
+    keypoints = [
+        target.keypoint_matches(item, item.box) if target.uses_keypoints else None
+        for item in photographs
+    ]
+    return Block(
+        query=query,
+        rankings=_rankings(target, query, limits),
+        descriptor=target.describer.descriptor(torch.stack(fields)),
+        crops=crops,
+        keypoints=keypoints,
+        frames=frames,
+        photographs=photographs,
+        limits=limits,
+        exact=exact,
+        symmetries=target.symmetries_of(exact=exact),
+        tried_cameras=torch.zeros(len(photographs), dtype=torch.bool),
+    )
+
+
+def _rankings(
+    target: Target, query: QueryFeatures, limits: Sequence[Limits | None]
+) -> list[Ranking]:
+    """The ranking of each photograph."""
+    allowed = None
+    if any(one is not None for one in limits):
+        everything = torch.ones(len(target.bank), dtype=torch.bool)
+        allowed = torch.stack([everything if one is None else one.allowed() for one in limits])
+    rankings = target.matcher.rank(query, allowed).split()
+    return [
+        replace(ranking, allowed=None, outside=None) if one is None else ranking
+        for ranking, one in zip(rankings, limits, strict=True)
+    ]
+
+
+def start(target: Target, block: Block, starts: Hypotheses | None) -> Hypotheses:
+    """Poses that fits begin from, those of each photograph together: the most promising distinct
+    views, ``starts`` of several cameras, poses on which keypoints agree, and the best view outside
+    the limits."""
+    parts = [_promising(target, block)]
+    if starts is not None:
+        parts.append(starts)
+    poses = _grouped(Hypotheses.cat(parts))
+    poses = replace(poses, is_repeated=_are_repeated(poses.view, poses.photograph))
+    if block.crops is not None and block.exact:
+        poses = _with_keypoints(target, block, poses)
+    outside = {
+        p: int(ranking.outside)
+        for p, ranking in enumerate(block.rankings)
+        if block.limits[p] is not None and ranking.outside is not None
+    }
+    places = [p for p, view in outside.items() if view >= 0]
+    if not places:
+        return poses
+    view = torch.tensor([outside[p] for p in places])
+    no_rank = torch.zeros(len(places), dtype=torch.float64)
+    other = poses_of_views(target, block, view, no_rank, torch.tensor(places))
+    other = replace(other, is_outside=torch.ones_like(other.is_outside))
+    return _grouped(Hypotheses.cat([poses, other]))
+
+
+def _grouped(poses: Hypotheses) -> Hypotheses:
+    """Poses in the order of their photographs."""
+    return poses[poses.photograph.argsort(stable=True)]
+
+
+def _promising(target: Target, block: Block) -> Hypotheses:
+    """Poses of the most promising distinct views of photographs whose camera is known."""
+    count = least_starts(target)
+    screened = count
+    if block.crops is not None and block.exact:
+        screened = max(target.pipeline.fit.screened_views, count)
+    places = (~block.tried_cameras).nonzero()[:, 0].tolist()
+    rankings = [block.rankings[p] for p in places]
+    boxes = block.boxes
+    poses = _of_best_views(target, block, rankings, places, boxes[places], screened)
+    if block.crops is None:
+        return poses
+    photographs = torch.bincount(poses.photograph, minlength=len(block))
+    few = (photographs <= count)[poses.photograph]
+    parts = [poses[few], _screened(target, block.crops, poses[~few], count)]
+    beyond = _beyond_the_border(target, block, screened)
+    if beyond is not None:
+        parts.append(_screened(target, block.crops, beyond, count))
+    return Hypotheses.cat(parts)
+
+
+def _beyond_the_border(target: Target, block: Block, count: int) -> Hypotheses | None:
+    """Poses of the best views in the larger boxes of photographs whose border cuts theirs."""
+    larger = [
+        (p, box)
+        for p, item in enumerate(block.photographs)
+        if block.frames[p] is not None and not bool(block.tried_cameras[p])
+        for box in whole_boxes(item.box, item.size)
+    ]
+    if not larger:
+        return None
+    places = [p for p, _ in larger]
+    boxes = torch.stack([box for _, box in larger])
+    query = target.matcher.query([block.photographs[p].image for p in places], boxes)
+    rankings = _rankings(target, query, [block.limits[p] for p in places])
+    return _of_best_views(target, block, rankings, places, boxes, count)
+
+
+def _of_best_views(
+    target: Target,
+    block: Block,
+    rankings: Sequence[Ranking],
+    places: Sequence[int],
+    boxes: Tensor,
+    count: int,
+) -> Hypotheses:
+    """Poses of the ``count`` best distinct views of each of R rankings, of the photographs
+    ``places`` with ``boxes`` (R, 4)."""
+    found = [
+        best_views(ranking, target.bank, count=count, symmetries=block.symmetries)
+        for ranking in rankings
+    ]
+    which = torch.arange(len(places)).repeat_interleave(
+        torch.tensor([len(view) for view, _ in found], dtype=torch.long)
+    )
+    no_view = torch.zeros(0, dtype=torch.long)
+    view = torch.cat([no_view, *(view for view, _ in found)])
+    rank = torch.cat([no_view.double(), *(rank for _, rank in found)])
+    photograph = torch.tensor(places, dtype=torch.long)[which]
+    poses = poses_of_views(target, block, view, rank, photograph, boxes[which])
+    return block.moved_inside(poses)
+
+
+def _screened(target: Target, crops: EdgeCrops, poses: Hypotheses, count: int) -> Hypotheses:
+    """The ``count`` poses of each photograph with the largest sum of rank and weighted edge support
+    after a short fit, best first."""
+    if not len(poses):
+        return poses
+    poses, support = with_short_fit(target.describer, crops, poses)
+    score = poses.rank + target.pipeline.fit.screening_weight * support
+    order = order_within(score, poses.photograph)
+    return poses[order[place_within(score, poses.photograph)[order] < count]]
+
+
+def _with_keypoints(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
+    """The best pose on which keypoints agree in place of the views near it."""
+    parts = [poses]
+    dropped = torch.zeros(len(poses), dtype=torch.bool)
+    for p, (matches, limits) in enumerate(zip(block.keypoints, block.limits, strict=True)):
+        if matches is None:
+            continue
+        found, _ = keypoint_poses(target, matches)
+        found = found if limits is None else found[limits.keeps(found)]
+        if len(found):
+            rows = poses.of(p)
+            near = are_near(poses.rotation[rows], found.rotation[0], block.symmetries)
+            dropped[rows[near]] = True
+            where = torch.tensor([p])
+            one = replace(found[:1], photograph=where, is_repeated=torch.tensor([True]))
+            parts.append(one)
+    return _grouped(Hypotheses.cat([poses[~dropped], *parts[1:]]))
+
+
+def _are_repeated(views: Tensor, photograph: Tensor) -> Tensor:
+    """(N,) bool: whether a view (N,) is among those before it of the same ``photograph`` (N,)."""
+    equal = (views == views[:, None]) & (photograph == photograph[:, None])
+    return equal.tril(diagonal=-1).any(dim=1)
+
+
+def fit(target: Target, block: Block, crops: EdgeCrops, starts: Hypotheses) -> Hypotheses:
+    """Fit the contours of the starts, those without a short fit after one."""
+    unknown = starts.short_fit[:, 0, 0].isnan().nonzero()[:, 0]
+    if len(unknown):
+        fitted, _ = with_short_fit(target.describer, crops, starts[unknown])
+        starts = starts.replaced(unknown, fitted)
+    finish = torch.where(block.tried_cameras, FINISHED, target.pipeline.fit.finished_fits)
+    # at the border as many poses of larger boxes compete
+    in_frame = torch.tensor([frame is not None for frame in block.frames])
+    finish = torch.where(in_frame, 2 * finish, finish)[starts.photograph]
+    return fitted_poses(target, block, crops, starts, short_fits=starts.short_fit, finish=finish)
+
+
+def refit(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
+    """Fit the best poses and their rivals further, with their focal lengths where these are
+    uncertain."""
+    poses = with_fitted_focal_lengths(target, block, crops, poses)
+    return refitted(target, block, crops, poses)
+
+
+def _with_texture(target: Target, block: Block, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
+    """Fit the best pose of each photograph to the mesh's colours as well."""
+    for row in poses.best(target.score_weights(exact=True)).split(1):
+        fitted = fit_texture_of(target.describer, crops, poses[row])
+        if fitted is not None and bool(block.keeps(fitted)):
+            poses = poses.with_poses(row, with_evidence(target, block, fitted))
+    return poses
+
+
+def _merged(target: Target, block: Block, poses: Hypotheses) -> Hypotheses:
+    """Poses that end where a better one of the photograph does are not distinct."""
+    is_distinct = poses.is_distinct.clone()
+    weights = target.score_weights(exact=block.exact)
+    angle = target.pipeline.fit.same_pose_angle
+    for p in range(len(block)):
+        rows = poses.of(p)
+        rows = rows[~poses.is_outside[rows]]
+        some = poses[rows]
+        scores = some.evidence.scores(weights)
+        is_distinct[rows] = distinct_poses(some, scores, block.symmetries, angle=angle)
+    return replace(poses, is_distinct=is_distinct)
+
+
+def _with_views_again(
+    target: Target, block: Block, poses: Hypotheses, starts: Hypotheses
+) -> Hypotheses:
+    """Put poses that merged, or whose fit is not trusted, back to the views that they started
+    from."""
+    back = (~_kept(target, block, poses)).nonzero()[:, 0]
+    if not len(back):
+        return poses
+    restored = starts[back]
+    if block.crops is not None:
+        restored = with_edge_support(target.describer, block.crops, restored)
+    return poses.with_poses(back, with_evidence(target, block, restored))
+
+
+def _kept(target: Target, block: Block, poses: Hypotheses) -> Tensor:
+    """(N,) bool: poses that do not return to their views."""
+    kept = poses.is_distinct
+    if target.pipeline.contours and not block.exact:
+        # Where the contours of a similar object do not fit, the view has the smaller error.
+        kept = kept & poses.fit.trustworthy
+    return kept & (block.keeps(poses) | poses.is_outside)
+
+
+def judge(
+    target: Target, block: Block, poses: Hypotheses, feature_is_hidden: Sequence[bool]
+) -> list[Registration]:
+    """The answer in each photograph."""
+    results = []
+    for p, is_hidden in enumerate(feature_is_hidden):
+        result = judged(target, block, p, poses[poses.of(p)])
+        results.append(replace(result, feature_is_hidden=is_hidden))
+    return results
+
+
+def _searched(target: Target, block: Block) -> list[Registration]:
+    """The results of the paper's search, and further distinct views of the rankings, in their
+    order."""
+    target.report_progress("search")
+    block = replace(block, exact=False)
+    results = []
+    for p, (ranking, query) in enumerate(zip(block.rankings, block.query.split(), strict=True)):
+        count = target.pipeline.hypotheses
+        poses = _of_best_views(target, block, [ranking], [p], block.boxes[p : p + 1], count)
+        rotation, distance = search(target.matcher, query, ranking)
+        found = Hypotheses.in_boxes(
+            target.describer,
+            block.boxes[p : p + 1],
+            block.cameras[p : p + 1],
+            rotation[None],
+            distance[None],
+            poses.view[:1],
+            poses.rank[:1],
+            torch.tensor([p]),
+        )
+        poses = block.moved_inside(poses.replaced(torch.tensor([0]), found))
+        results.append(judged(target, block, p, with_evidence(target, block, poses)))
+    return results
