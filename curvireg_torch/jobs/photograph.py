@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..data import Photo, load_camera, read_photo
 from ..data.images import photo_of_picture
-from ..errors import InvalidInputError
+from ..errors import CurviregError, InvalidInputError
 from ..geometry import Camera, camera_matrix
 from ..geometry.pose_prior import PosePrior
 from ..matching import ViewBank
@@ -28,7 +28,7 @@ from ..registration.documents import detection_document, result_document
 from ..registration.hypotheses import projected_box
 from ..registration.inputs import image_item
 from ..registration.refinement import refine_items
-from ..registration.registrar import ObjectLike
+from ..registration.registrar import ObjectLike, Results
 from ..utils.likes import BoxLike, CameraLike, ImageLike, MaskLike
 from ..visualization import contour_overlay, plots
 from ..visualization.encoding import jpeg, shrink
@@ -189,22 +189,61 @@ def register_observation(
     observation: Observation, registrar: Registrar, *, bank_seconds: float = 0.0
 ) -> RegisteredPhotograph:
     """Register one photograph with the registrar of its meshes, which took ``bank_seconds`` to
-    open.
+    open."""
+    (found,) = register_observations([observation], registrar, bank_seconds=bank_seconds)
+    if isinstance(found, CurviregError):
+        raise found
+    return found
 
-    The ``document`` of the result is the content of ``result.json``, and of a line of
-    ``results.jsonl``.
+
+def register_observations(
+    observations: Sequence[Observation], registrar: Registrar, *, bank_seconds: float = 0.0
+) -> list[RegisteredPhotograph | CurviregError]:
+    """Register photographs with the registrar of their meshes, which took ``bank_seconds`` to open;
+    those with boxes together. One that cannot be registered has its error.
+
+    The ``document`` of a result is the content of ``result.json``, and of a line of
+    ``results.jsonl``; its seconds are those of the photograph and its share of those of the call.
     """
     start = time.perf_counter()
+    located = [
+        place
+        for place, observation in enumerate(observations)
+        if observation.entry.start is None
+        and not observation.entry.views
+        and (observation.entry.box is not None or observation.entry.mask is not None)
+    ]
+    items = [observations[place].item for place in located]
+    results: dict[int, Results] = {
+        place: [result]
+        for place, result in zip(located, registrar.register_items(items), strict=True)
+    }
+    seconds = (time.perf_counter() - start) / max(len(located), 1)
+    found: list[RegisteredPhotograph | CurviregError] = []
+    for place, observation in enumerate(observations):
+        start = time.perf_counter()
+        try:
+            known = results.get(place)
+            answers = _results_of(observation, registrar) if known is None else known
+            taken = time.perf_counter() - start if known is None else seconds
+            spent = {"bank": 0.0 if place else bank_seconds, "register": taken}
+            found.append(_registered(observation, registrar, answers, spent))
+        except CurviregError as error:
+            found.append(error)
+    return found
+
+
+def _results_of(observation: Observation, registrar: Registrar) -> Results:
+    """The registrations of a photograph with a start, with further views, or without a box."""
     entry = observation.entry
     camera = observation.camera
     item = observation.item
-    results: Sequence[Registration | FailedRegistration]
     if entry.start is not None:
         start_pose = start_in_unit(entry.start, mesh_unit(registrar.bank.mesh))
         confidences = [entry.start.confidence]
         alone = replace(item, prior=None)
-        results = refine_items(registrar, [alone], [start_pose], start_confidences=confidences)
-    elif entry.views:
+        return refine_items(registrar, [alone], [start_pose], start_confidences=confidences)
+    if entry.views:
         assert camera is not None  # of datasets with cameras only
         world = torch.eye(4, dtype=torch.float64)
         pixels = observation.photo.image
@@ -214,12 +253,19 @@ def register_observation(
         best = replace(
             best, projection=(together.views[0].T_cam_from_model, camera.at(item.size).matrix)
         )
-        results = [replace(together, hypotheses=(best, *others))]
-    elif entry.box is None and entry.mask is None and entry.instances > 1:
-        results = detect_items(registrar, [item], instances=entry.instances)[0]
-    else:
-        is_located = entry.box is not None or entry.mask is not None
-        results = registrar.register_items([item], detects=not is_located)
+        return [replace(together, hypotheses=(best, *others))]
+    if entry.instances > 1:
+        return detect_items(registrar, [item], instances=entry.instances)[0]
+    return registrar.register_items([item], detects=True)
+
+
+def _registered(
+    observation: Observation, registrar: Registrar, results: Results, seconds: dict[str, float]
+) -> RegisteredPhotograph:
+    """The first of the results, with its document and the others as copies."""
+    entry = observation.entry
+    camera = observation.camera
+    item = observation.item
     result = results[0]
     if isinstance(result, FailedRegistration):
         raise result.error.with_subject(entry.name)
@@ -229,9 +275,9 @@ def register_observation(
         box = result.detection.box
     elif entry.box is None and entry.mask is None:
         box = projected_box(registrar.of_mesh(result.mesh_index).describer, result.projection)
-    seconds = observation.seconds + time.perf_counter() - start
+    seconds = {**seconds, "register": observation.seconds + seconds["register"]}
     document = {
-        **result_document(result, registrar, {"bank": bank_seconds, "register": seconds}),
+        **result_document(result, registrar, seconds),
         "mesh": str(entry.meshes[result.mesh_index]) if entry.meshes else None,
         "inputs": {
             "photo": entry.name,
