@@ -9,7 +9,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from tqdm import tqdm
 
 from ..errors import (
@@ -25,16 +24,14 @@ from ..formats.meshes.files import mesh_digest
 from ..registration import Registrar
 from ..registration.documents import SCHEMA, line_document, places_document
 from ..registration.result import verdict_of_error
-from ..utils.company import map_in_company
 from ..utils.executors import Workers
 from ..utils.files import file_digest, text_digest, write_file
 from ..utils.sources import package_digest
-from ..utils.threads import map_on_threads
 from ..visualization.overlay import drawn_copies
 from ..visualization.sheet import thumbnail
-from .entry import Entry, observe
+from .entry import Entry, Observation, observe
 from .options import with_advice
-from .photograph import register_observation
+from .photograph import RegisteredPhotograph, register_observations
 from .store import ResultStore, Row, has_pose
 
 NOT_IN_RESULTS = ("cli", "viewer", "visualization")
@@ -178,45 +175,63 @@ class _OpenedRegistrar:
 
 
 def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Finished]:
-    """Register entries of the same meshes; the first pays for the bank."""
-    registrar, seconds = opened.of(tasks[0].entry.meshes)
-
-    def register_one(number: int) -> Finished:
-        task = tasks[number]
-        # before the photograph is read: one that changes meanwhile is registered again
-        digests = {"request": task.request, "photo": photo_digest(task.entry)}
-        row, picture = _row(task.entry, registrar, bank_seconds=0.0 if number else seconds)
-        return Finished({"digests": digests, **row}, picture)
-
-    device = registrar.bank.device if isinstance(registrar, Registrar) else "cpu"
-    if torch.device(device).type == "cpu":
-        return map_on_threads(register_one, range(len(tasks)))
-    return map_in_company(register_one, range(len(tasks)))
-
-
-def _row(
-    entry: Entry, registrar: Registrar | Exception, *, bank_seconds: float
-) -> tuple[Row, bytes | None]:
-    """The result of an entry, and its thumbnail."""
+    """Register entries of the same meshes together; the first pays for the bank."""
+    registrar, bank_seconds = opened.of(tasks[0].entry.meshes)
     start = time.perf_counter()
+    # before the photographs are read: one that changes meanwhile is registered again
+    digests = [{"request": task.request, "photo": photo_digest(task.entry)} for task in tasks]
+    prepared = [_prepared(task.entry, registrar) for task in tasks]
+    usable = {k: one for k, one in enumerate(prepared) if isinstance(one, Observation)}
+    answers: dict[int, RegisteredPhotograph | CurviregError] = {}
+    if isinstance(registrar, Registrar) and usable:
+        found = register_observations(list(usable.values()), registrar, bank_seconds=bank_seconds)
+        answers = dict(zip(usable, found, strict=True))
+    share = (time.perf_counter() - start) / len(tasks)
+    finished = []
+    for k, one in enumerate(prepared):
+        seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
+        row: Row
+        picture = None
+        if isinstance(one, Observation):
+            row, picture = _row(answers[k], one, seconds)
+        elif isinstance(one, CurviregError):
+            row = failed_row(one, seconds=seconds)
+        else:
+            row = one
+        finished.append(Finished({"digests": digests[k], **row}, picture))
+    return finished
+
+
+def _prepared(entry: Entry, registrar: Registrar | Exception) -> Observation | CurviregError | Row:
+    """What the photograph of an entry shows, why it cannot be registered, or the row of files that
+    cannot be read."""
     try:
         photo = entry.read()
     except (CurviregError, OSError) as error:
-        return failed_row(error, skipped="unreadable_image"), None
+        return failed_row(error, skipped="unreadable_image")
     if isinstance(registrar, Exception):
-        return failed_row(registrar, skipped="unreadable_mesh"), None
+        return failed_row(registrar, skipped="unreadable_mesh")
     try:
-        observation = observe(entry, photo)
-        found = register_observation(observation, registrar, bank_seconds=bank_seconds)
+        return observe(entry, photo)
     except CurviregError as error:
-        seconds = {"bank": bank_seconds, "register": time.perf_counter() - start}
+        return error
+
+
+def _row(
+    found: RegisteredPhotograph | CurviregError,
+    observation: Observation,
+    seconds: Mapping[str, float],
+) -> tuple[Row, bytes | None]:
+    """The result of an entry, and its thumbnail; ``seconds`` are those of one without a pose."""
+    if isinstance(found, CurviregError):
         places: Row = {}
-        if isinstance(error, LostObjectError) and error.detection is not None:
+        if isinstance(found, LostObjectError) and found.detection is not None:
             places = {
-                "detection": places_document(error.detection),
-                "inputs": {"picture": photo.facts()},
+                "detection": places_document(found.detection),
+                "inputs": {"picture": observation.photo.facts()},
             }
-        return failed_row(error, seconds=seconds, **places), None
+        return failed_row(found, seconds=seconds, **places), None
+    registrar = found.registrar
     describer = registrar.of_mesh(found.mesh_index).describer
     box = found.box.tolist()
     copies = drawn_copies(registrar, found.copies)

@@ -178,7 +178,9 @@ def test_search_stops_by_the_motion(monkeypatch):
         rounds.append(len(matcher.compared))
         errors.append((error, abs(distance - 3.7)))
     assert rounds == [1, 2, 4]
-    assert errors == [pytest.approx(e, abs=1e-4) for e in ((2.0, 0.05), (0.5, 0.05), (0.125, 0.0125))]
+    assert errors == [
+        pytest.approx(e, abs=1e-4) for e in ((2.0, 0.05), (0.5, 0.05), (0.125, 0.0125))
+    ]
 
 
 def test_an_orthographic_search_keeps_the_distance_that_it_cannot_see():
