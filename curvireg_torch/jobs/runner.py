@@ -175,31 +175,41 @@ class _OpenedRegistrar:
 
 
 def _register_block(opened: _OpenedRegistrar, tasks: Sequence[Task]) -> list[Finished]:
-    """Register entries of the same meshes together; the first pays for the bank."""
+    """Register entries of the same meshes."""
     registrar, bank_seconds = opened.of(tasks[0].entry.meshes)
-    start = time.perf_counter()
     # before the photographs are read: one that changes meanwhile is registered again
     digests = [{"request": task.request, "photo": photo_digest(task.entry)} for task in tasks]
-    prepared = [_prepared(task.entry, registrar) for task in tasks]
+    rows = _rows([task.entry for task in tasks], registrar, bank_seconds=bank_seconds)
+    return [
+        Finished({"digests": known, **row}, picture)
+        for known, (row, picture) in zip(digests, rows, strict=True)
+    ]
+
+
+def _rows(
+    entries: Sequence[Entry], registrar: Registrar | Exception, *, bank_seconds: float
+) -> list[tuple[Row, bytes | None]]:
+    """The results of entries, which are registered together, and their thumbnails; the first pays
+    for the bank, and one without a pose its share of the time."""
+    start = time.perf_counter()
+    prepared = [_prepared(entry, registrar) for entry in entries]
     usable = {k: one for k, one in enumerate(prepared) if isinstance(one, Observation)}
     answers: dict[int, RegisteredPhotograph | CurviregError] = {}
     if isinstance(registrar, Registrar) and usable:
-        found = register_observations(list(usable.values()), registrar, bank_seconds=bank_seconds)
+        together = list(usable.values())
+        found = register_observations(together, registrar, bank_seconds=bank_seconds)
         answers = dict(zip(usable, found, strict=True))
-    share = (time.perf_counter() - start) / len(tasks)
-    finished = []
+    share = (time.perf_counter() - start) / len(entries)
+    rows: list[tuple[Row, bytes | None]] = []
     for k, one in enumerate(prepared):
         seconds = {"bank": 0.0 if k else bank_seconds, "register": share}
-        row: Row
-        picture = None
         if isinstance(one, Observation):
-            row, picture = _row(answers[k], one, seconds)
+            rows.append(_row(answers[k], one, seconds))
         elif isinstance(one, CurviregError):
-            row = failed_row(one, seconds=seconds)
+            rows.append((failed_row(one, seconds=seconds), None))
         else:
-            row = one
-        finished.append(Finished({"digests": digests[k], **row}, picture))
-    return finished
+            rows.append((one, None))
+    return rows
 
 
 def _prepared(entry: Entry, registrar: Registrar | Exception) -> Observation | CurviregError | Row:

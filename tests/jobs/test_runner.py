@@ -46,14 +46,15 @@ def registered(entries, folder, *, settings=None, stop_after=None, **how):
     labels = []
     opened = []
 
-    def register(entry, registrar, *, bank_seconds):
-        if len(labels) == stop_after:
-            raise KeyboardInterrupt
-        labels.append(entry.label)
-        assert str(registrar) == entry.meshes[0].name
-        first = sum(label[1] == entry.label[1] for label in labels) == 1
-        assert (bank_seconds > 0) == first, "the first pays for the bank"
-        return {"verdict": "reliable"}, None
+    def register(block, registrar, *, bank_seconds):
+        for entry in block:
+            if len(labels) == stop_after:
+                raise KeyboardInterrupt
+            labels.append(entry.label)
+            assert str(registrar) == entry.meshes[0].name
+        is_first = sum(label[1] == block[0].label[1] for label in labels) == len(block)
+        assert (bank_seconds > 0) == is_first, "the first block pays for the bank"
+        return [({"verdict": "reliable"}, None)] * len(block)
 
     def open_registrar(meshes):
         assert not any(reference() for reference in opened), (
@@ -65,7 +66,7 @@ def registered(entries, folder, *, settings=None, stop_after=None, **how):
 
     options = {"settings": settings or {}, "label": "", "progress": False, **how}
     try:
-        with patch.object(runner, "_row", register):
+        with patch.object(runner, "_rows", register):
             registered.store = run_entries(entries, folder, open_registrar, **options)
     except KeyboardInterrupt:
         assert stop_after is not None

@@ -1,5 +1,5 @@
-"""A result does not depend on its batch, on what was registered before, or on the number of
-threads."""
+"""A result does not depend on what was registered before; its batch and the number of threads change
+it by rounding alone."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from curvireg_torch import Pipeline, Registrar, ViewBank, sample_views
+from curvireg_torch import Pipeline, Registrar, ViewBank, rotation_error, sample_views
 from curvireg_torch.registration import Registration
 from curvireg_torch.synthetic import example_mesh
-from curvireg_torch.utils.threads import one_torch_thread
 from tests._support.scenes import CAMERA, scene
 
 IMAGES = [scene(seed)[0] for seed in (0, 1)]
@@ -49,31 +48,38 @@ def numbers(result: Registration) -> list[torch.Tensor]:
     ]
 
 
-def test_registration_is_bit_identical_in_any_company(
+def check_agreement(one: Registration, other: Registration) -> None:
+    """To .05 degrees, and .01 of confidence."""
+    assert float(rotation_error(one.rotation, other.rotation)) < 0.05
+    assert other.confidence == pytest.approx(one.confidence, abs=0.01)
+    assert other.verdict == one.verdict
+
+
+def test_runs_of_the_same_call_are_bit_identical(bank: ViewBank) -> None:
+    """What was registered before does not matter."""
+    first = Registrar(bank)(IMAGES, BOXES, CAMERA)
+    registrar = Registrar(bank)
+    registrar(IMAGES[1:], BOXES[1:], CAMERA)
+    for one, other in zip(first, registrar(IMAGES, BOXES, CAMERA), strict=True):
+        assert all(map(torch.equal, numbers(one), numbers(other)))
+
+
+def test_a_photograph_alone_agrees_with_that_of_a_batch(
     bank: ViewBank, threads: Callable[[int], None]
 ) -> None:
     threads(1)
     alone = [Registrar(bank)([i], b[None], CAMERA)[0] for i, b in zip(IMAGES, BOXES, strict=True)]
     threads(3)
-    together = Registrar(bank)(IMAGES, BOXES, CAMERA)
-    registrar = Registrar(bank)
-    later = [registrar([IMAGES[k]], BOXES[k : k + 1], CAMERA)[0] for k in (1, 0)][::-1]
-    with one_torch_thread():
-        command = [
-            Registrar(bank)([i], b[None], CAMERA)[0] for i, b in zip(IMAGES, BOXES, strict=True)
-        ]
-    for one, *others in zip(alone, together, later, command, strict=True):
-        for other in others:
-            assert all(map(torch.equal, numbers(one), numbers(other)))
+    for one, other in zip(alone, Registrar(bank)(IMAGES, BOXES, CAMERA), strict=True):
+        check_agreement(one, other)
 
 
-def test_detection_is_bit_identical_in_any_company(
+def test_a_detection_alone_agrees_with_that_of_a_batch(
     bank: ViewBank, threads: Callable[[int], None]
 ) -> None:
     threads(1)
     alone = Registrar(bank)(IMAGES[1:])[0]
     threads(2)
     together = Registrar(bank)(IMAGES)[1]
-    assert torch.equal(alone.detection.boxes, together.detection.boxes)
-    assert torch.equal(alone.rotation, together.rotation)
-    assert alone.confidence == together.confidence
+    torch.testing.assert_close(alone.detection.boxes, together.detection.boxes)
+    check_agreement(alone, together)

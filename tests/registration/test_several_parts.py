@@ -42,7 +42,7 @@ def photograph(index: int, **changes: Any) -> Any:
         camera=EYE,
         K=torch.eye(3).double(),
         size=(100, 200),
-        printed=0.0,
+        printed=lambda _: 0.0,
         box=torch.tensor([10.0, 10.0, 50.0, 50.0]),
     )
 
@@ -187,7 +187,7 @@ def test_doubts_are_means_by_votes_and_warnings_those_of_all(monkeypatch):
     second.size = (300, 200)
     third.size = (100, 200)
     second.box = torch.tensor([-0.5, 10.0, 199.5, 50.0])
-    second.printed = 3.5
+    second.printed = lambda _: 3.5
     found = {0: first, 1: second, 2: third}
     scores = SCORES | {2: [1.0, 1.0, 1.0]}
     result = joint(monkeypatch, found, scores, vote={0: 0.5, 1: 1.0, 2: 0.5})
