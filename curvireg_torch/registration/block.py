@@ -138,5 +138,5 @@ def fitted_poses(
         return poses
     kept = starts[left]
     given = kept.cameras, kept.T, kept.photograph
-    seen = on_device(measure_contours, target.describer.contours, crops, *given)
+    seen = on_device(measure_contours, target.describer.device_contours, crops, *given)
     return poses.replaced(left, kept.with_fit(seen, target.describer.centre))

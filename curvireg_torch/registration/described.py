@@ -144,7 +144,7 @@ def _contours(target: Target, described: Described, poses: Hypotheses) -> Tensor
     """(N,) see :func:`.contour_evidence`; 0 without the contour fit."""
     if described.crops is None:
         return torch.zeros(len(poses), dtype=torch.float64)
-    contours = target.describer.contours
+    contours = target.describer.device_contours
     given = poses.cameras, poses.T, poses.photograph
     return on_device(contour_evidence, contours, described.crops, *given)
 
@@ -156,7 +156,7 @@ def with_details(
     photograph."""
     index = torch.cat([best, rivals])
     some = poses[index]
-    contours = target.describer.contours
+    contours = target.describer.device_contours
     given = some.cameras, some.T, some.photograph
     seen = on_device(contour_details, contours, crops, *given)
     details = poses.evidence.details.clone()

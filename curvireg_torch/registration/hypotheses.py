@@ -219,7 +219,7 @@ def fit_poses(
     **options: Any,
 ) -> Hypotheses:
     """Fit the contours of poses to crops, see :func:`fit_to_edges` and its ``options``."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.photograph
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
     finish = options.pop("finish", settings.finished_fits)
     fit = on_device(fit_to_edges, *given, settings=settings, finish=finish, **options)
     return poses.with_fit(fit, describer.centre)
@@ -230,7 +230,7 @@ def with_short_fit(
 ) -> tuple[Hypotheses, Tensor]:
     """Return the poses with their short fits, and the edge supports (H,) that these reach, see
     :func:`short_fit`."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.photograph
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
     T, support = on_device(short_fit, *given)
     return replace(poses, short_fit=T), support
 
@@ -253,7 +253,7 @@ def fit_texture_of(
 
 def with_edge_support(describer: ViewDescriber, crops: EdgeCrops, poses: Hypotheses) -> Hypotheses:
     """Poses that are not fitted, with their edge support, see :func:`contour_support`."""
-    given = describer.contours, crops, poses.cameras, poses.T, poses.photograph
+    given = describer.device_contours, crops, poses.cameras, poses.T, poses.photograph
     support = on_device(contour_support, *given)
     return replace(poses, edge_support=support)
 

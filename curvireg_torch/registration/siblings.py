@@ -80,7 +80,7 @@ def siblings_of(target: Target, block: Block, crops: EdgeCrops, best: Hypotheses
     T = copies.T @ symmetries.to(copies.T).repeat(len(best), 1, 1)
     poses = placed(copies, T, target.describer.centre)
     given = poses.cameras, poses.T, poses.photograph
-    seen = on_device(contour_details, target.describer.contours, crops, *given)
+    seen = on_device(contour_details, target.describer.device_contours, crops, *given)
     poses = with_evidence(target, block, poses)
     weights = target.score_weights(exact=True)
     return [

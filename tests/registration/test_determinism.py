@@ -1,5 +1,5 @@
-"""A result does not depend on what was registered before; its batch and the number of threads change
-it by rounding alone."""
+"""A result depends on its batch and on the number of threads by rounding alone, and not on what was
+registered before."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -122,7 +122,7 @@ class Case:
         """``keeps``: what the limits say, one call after the other."""
         target: Any = SimpleNamespace(
             telling_symmetries=TellingSymmetries(self.symmetries),
-            describer=SimpleNamespace(contours=None, centre=torch.zeros(3).double()),
+            describer=SimpleNamespace(device_contours=None, centre=torch.zeros(3).double()),
             score_weights=lambda **_: EvidenceWeights(),
         )
         answers = iter(keeps or [])
