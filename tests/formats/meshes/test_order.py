@@ -557,3 +557,11 @@ def test_of_a_kind_of_warning_a_few_are_kept(tmp_path: Path) -> None:
         source.warn("texture", "0 is missing")
     texts = [warning.text for warning in source.warnings]
     assert texts == [*(f"{k} is missing" for k in range(5)), "and more of this kind"]
+
+
+def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path: Path, load: Load) -> None:
+    threemf(tmp_path / "a.3mf", solid(1), '<item objectid="1"/>', unit='unit="millimeter"')
+    shape = '<geometry><mesh filename="a.3mf"/></geometry>'
+    mesh, _ = load(robot(tmp_path, shape))
+    assert mesh.units == "m"
+    np.testing.assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
