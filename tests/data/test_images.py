@@ -371,6 +371,9 @@ def test_exif_camera_respects_crops_and_pictures_of_pillow(tmp_path):
         ((200, 150), 250.0),
         ((200, 200), 500.0),
         ((500, 300), None),
+        ((390, 350), None),  # higher than the picture that the camera took
+        ((202, 150), math.hypot(202, 150)),  # resized: a side of 150 px is one of 149.5 to 150.5
+        ((204, 150), 500.0),  # cut out
     ):
         path = tmp_path / "photo.jpg"
         Image.new("RGB", size).save(path, exif=tags)

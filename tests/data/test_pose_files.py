@@ -52,6 +52,13 @@ def test_text_of_numpy_and_arrays(tmp_path):
     check(read_pose(tmp_path / "pose.npy"))
 
 
+def test_a_pose_without_translation_is_read_row_by_row(tmp_path):
+    """Row by row and column by column it has 0 0 0 1 at its end."""
+    centred = T.copy()
+    centred[:3, 3] = 0.0
+    check(read_pose(written(tmp_path, centred.tolist())), expected=centred)
+
+
 def test_the_confidence_of_a_result_is_kept(tmp_path):
     content = {"rotation": R.tolist(), "translation": t.tolist(), "confidence": 0.5}
     check(read_pose(written(tmp_path, content)), confidence=0.5)

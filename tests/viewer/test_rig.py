@@ -4,6 +4,7 @@ import asyncio
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from curvireg_torch.jobs.options import RegisterOptions
 from curvireg_torch.jobs.rigs import BOX, CAMERA, ROTATION, TRANSLATION
 from curvireg_torch.jobs.store import to_json
 from curvireg_torch.synthetic import example_mesh
+from curvireg_torch.viewer.session import Session
 from curvireg_torch.viewer.workspace import Workspace
 from tests._support.lists import write_bop_scene, write_colmap, write_rig_photos, written
 from tests._support.scenes import learned_registrar
@@ -257,3 +259,13 @@ def test_colmap_and_bop_come_as_several_files(workspace, rig, tmp_path):
     )
     session.shot.set_box((6.0, 6.0, 25.0, 36.0))
     assert session.command() == ""
+
+
+def test_of_two_photographs_of_one_name_the_first_has_the_row_of_the_rig():
+    row = SimpleNamespace(photo=Path("a/0.png"))
+    session = SimpleNamespace(rig=[row, SimpleNamespace(photo=Path("1.png"))])
+    shots = [SimpleNamespace(path=Path("b/0.png"), view=row)]
+    assert Session._row_of(session, Path("c/0.PNG"), []) is row
+    assert Session._row_of(session, Path("c/0.PNG"), shots) is None
+    shots[0].view = None
+    assert Session._row_of(session, Path("c/0.PNG"), shots) is row

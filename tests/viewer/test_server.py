@@ -1,4 +1,5 @@
 import asyncio
+import os
 import re
 import socket
 from http.client import HTTPConnection
@@ -9,7 +10,13 @@ import pytest
 pytest.importorskip("nicegui", reason="nicegui is not installed")
 
 from curvireg_torch.errors import InvalidInputError
-from curvireg_torch.viewer.server import SECURITY_HEADERS, guarded, listen, print_address
+from curvireg_torch.viewer.server import (
+    SECURITY_HEADERS,
+    guarded,
+    listen,
+    print_address,
+    redirect_file,
+)
 
 
 async def page(scope, _, send):
@@ -122,6 +129,19 @@ def test_the_printed_address_names_the_host(capsys, host, shown, is_warned):
     for header in (f"{shown}:{port}", f"{own}:{port}"):
         assert answer(host, also=bound, host=header)["status"] == 200, header
     assert answer(host, also=bound, host="evil.example")["status"] == (200 if is_warned else 400)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="files of other systems have no such mode")
+def test_the_file_with_the_secret_address_is_for_its_user_alone(tmp_path):
+    before = os.umask(0)
+    try:
+        page = redirect_file(tmp_path, "http://127.0.0.1:8080/secret")
+    finally:
+        os.umask(before)
+    assert page.stat().st_mode & 0o777 == 0o600
+    assert "http://127.0.0.1:8080/secret" in page.read_text(encoding="utf-8")
+    with pytest.raises(FileExistsError):  # what somebody else has put there is not written to
+        redirect_file(tmp_path, "http://127.0.0.1:8080/secret")
 
 
 def test_every_answer_has_the_security_headers():
