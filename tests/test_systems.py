@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from curvireg_torch import Registrar
-from curvireg_torch.data.calibrations import load_camera
-from curvireg_torch.data.masks import mask_file
+from curvireg_torch.data.cameras import load_camera
 from curvireg_torch.formats.boxes import BoxFile, PictureSize
+from curvireg_torch.formats.masks import mask_file
 from curvireg_torch.formats.meshes.source import MeshSource
 from curvireg_torch.utils.files import split_name
 from tests._support.scenes import CAMERA, scene, truck_registrar

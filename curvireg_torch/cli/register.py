@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import CurviregError, InvalidInputError, LostObjectError
+from ..formats.exports.ros import OPTICAL_FRAME, time_stamp
 from ..jobs.options import CAMERA_OPTIONS, PRIOR_OPTIONS, whole_number
-from ..jobs.ros import OPTICAL_FRAME, time_stamp
 from ..utils.choices import VIDEOS, check_given, is_one_photograph
 from .libraries import load_libraries
 from .options import (
@@ -389,7 +389,7 @@ def _write_pose(
     arguments: argparse.Namespace, document: dict[str, Any], registrar: "Registrar"
 ) -> None:
     """Write the pose in the format of another tool, if one is asked for."""
-    from ..jobs.ros import write_ros
+    from ..formats.exports.ros import write_ros
 
     if arguments.format in TRACKERS:
         from ..jobs import trackers

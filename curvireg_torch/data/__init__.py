@@ -7,7 +7,7 @@ Nothing is downloaded.
 
 from ._base import ObjectDataset
 from .bop import BOPDataset
-from .calibrations import load_camera
+from .cameras import load_camera
 from .crops import ObjectCrops, crops
 from .images import Photo, Video, read_image, read_photo
 from .pascal3d import Pascal3DPlus

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInputError, MissingFileError
+from ..formats.cameras.record import flattened
 from ..geometry.cameras import projected_boxes, transform
 from ..utils.checks import check_camera_matrix, check_rotation
 from ..utils.files import finite_numbers, read_json
 from ._base import IMAGE_SUFFIXES, ObjectDataset, Sample, existing_root, is_plain_name
 from .bop_models import BOPModels
-from .calibrations.record import flattened
 
 _README = "datasets/bop/README.md"
 _TRUTH = "scene_gt"

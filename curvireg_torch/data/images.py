@@ -3,11 +3,10 @@
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,43 +14,29 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..errors import MAX_IMAGE_BYTES, MAX_IMAGE_PIXELS, CurviregError, ImageError, MissingFileError
-from ..formats.boxes import PictureSize
+from ..errors import MAX_IMAGE_PIXELS, ImageError
+from ..formats.pictures import (
+    DIAGONAL_35MM,
+    Metadata,
+    as_in_file,
+    decoded,
+    oriented,
+    picture_metadata,
+)
 from ..geometry.calibration import Camera
 from ..geometry.cameras import camera_matrix
 from ..utils.checks import check_integer
 from ..utils.pictures import check_pixels, damaged_picture
-from .heif import open_photograph
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-T = TypeVar("T")
 
-_WIDTH = 256
-_HEIGHT = 257
 _PHOTOMETRIC = 262
 _BITS = 258
-_SUBFILE = 254
-_ORIENTATION = 0x0112
-_EXIF_DIRECTORY = 0x8769
-_FOCAL_35MM = 0xA405
-_FOCAL = 0x920A  # in mm, of the lens itself
-# EXIF pixels per unit of length of the sensor, and the unit: 2 = inch, 3 = cm, 4 = mm, 5 = um
-_DIGITAL_ZOOM = 0xA404
-_SENSOR_X = 0xA20E
-_SENSOR_Y = 0xA20F
-_SENSOR_UNIT = 0xA210
-_SENSOR_UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-MAX_THUMBNAILS = 20  # pages of a TIFF before its full picture
 
-# EXIF sizes in px of the picture that the camera took
-_TAKEN_WIDTH = 0xA002
-_TAKEN_HEIGHT = 0xA003
 USED_BITS = (8, 10, 12, 14)  # of cameras that write 16
 
-_DIAGONAL_35MM = math.hypot(36.0, 24.0)
-_SENSOR_DIAGONALS = (2.0, 80.0)  # mm, of telephones and of medium format: others are mistakes
 
 EXIF_DEVIATION = 0.05
 """Standard deviation of an EXIF focal length: it is rounded to whole millimetres, lens corrections
@@ -62,13 +47,8 @@ estimate, not measured."""
 ANIMATED = "one of several pictures"
 """Note about the first picture of an animation, or of a file of several."""
 
-MAX_DIGITAL_ZOOM = 200.0  # of telephones; larger values of EXIF are mistakes
 # Longer side over the shorter one beyond which a picture is a panorama, or a strip of another one
 PANORAMA_PROPORTIONS = 2.5
-_PANORAMA = re.compile(
-    rb"GPano:ProjectionType"
-)  # in XMP, of a telephone or a camera of 360 degrees
-MAX_METADATA_BYTES = 1 << 17  # at the start of a file, in which XMP is looked for
 
 
 @dataclass(frozen=True)
@@ -140,7 +120,7 @@ class Photo:
             if max(H, W) > max(taken) or min(H, W) > min(taken):
                 return None
         focal = self.focal_35mm * math.sqrt(self.digital_zoom)
-        focal *= math.hypot(*taken) / _DIAGONAL_35MM
+        focal *= math.hypot(*taken) / DIAGONAL_35MM
         return camera_matrix(focal, focal, (W - 1) / 2, (H - 1) / 2)
 
     def camera(self) -> Camera | None:
@@ -206,7 +186,7 @@ def photo_of_picture(image: "Image") -> Photo:
 
 
 def _photo(
-    rgb: NDArray[np.uint8], exif: "_Exif", notes: tuple[str, ...], *, as_stored: bool = False
+    rgb: NDArray[np.uint8], exif: "Metadata", notes: tuple[str, ...], *, as_stored: bool = False
 ) -> Photo:
     orientation = 1 if as_stored else exif.orientation
     if orientation != 1:
@@ -245,136 +225,16 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     return read_photo(path, as_stored=True).image.float().div_(255.0)
 
 
-def picture_size(path: Path) -> PictureSize:
-    """The size of a photograph as :func:`read_photo` shows it, from its header; errors are the
-    same."""
-
-    def stored_size(image: "Image", *_: object) -> tuple[int, int]:
-        # of a TIFF, whose size Pillow turns or not, by its version
-        tags = getattr(image, "tag_v2", {})
-        return int(tags.get(_WIDTH, image.width)), int(tags.get(_HEIGHT, image.height))
-
-    (width, height), orientation = decoded(path, stored_size)
-    is_turned = orientation > 4
-    return PictureSize((width, height) if is_turned else (height, width), orientation)
-
-
-class _Exif(NamedTuple):
-    """What is used of a file's metadata, see :class:`Photo`."""
-
-    orientation: int
-    focal_35mm: float | None
-    taken_size: tuple[int, int] | None
-    digital_zoom: float
-    is_stitched: bool
-
-
-def _decode(path: Path) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+def _decode(path: Path) -> tuple[NDArray[np.uint8], Metadata, tuple[str, ...]]:
     """(H, W, 3) RGB pixels as stored, metadata, and notes."""
     return decoded(path, lambda image, _, data: _decoded(image, data))[0]
 
 
-def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], _Exif, tuple[str, ...]]:
+def _decoded(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], Metadata, tuple[str, ...]]:
     notes = _notes(image)
-    exif = _exif(image, data)
+    exif = picture_metadata(image, data)
     rgb, stretched = _rgb_pixels(image, data)
     return as_in_file(rgb, image, exif.orientation), exif, (*notes, *stretched)
-
-
-def decoded(path: Path, read: Callable[["Image", int, bytes], T]) -> tuple[T, int]:
-    """What ``read`` makes of the open picture of a file, its EXIF orientation and its bytes; and
-    this orientation.
-
-    Raises:
-        MissingFileError: the file does not exist.
-        CurviregError: it cannot be decoded, or a decoder is missing.
-    """
-    if not path.is_file():
-        raise MissingFileError("no such file; check the path of the photograph", subject=path)
-    if path.stat().st_size > MAX_IMAGE_BYTES:
-        raise ImageError(f"larger than {MAX_IMAGE_BYTES:,} bytes; save it smaller", subject=path)
-    try:
-        data = path.read_bytes()
-        with open_photograph(data) as image:
-            _seek_full_image(image)
-            check_pixels(image)
-            orientation = _exif(image).orientation
-            return read(image, orientation, data), orientation
-    except CurviregError as error:
-        raise error.with_subject(path) from error.__cause__
-    except Exception as error:  # Pillow raises errors of any kind for damaged files
-        raise damaged_picture(error).with_subject(path) from error
-
-
-def as_in_file(pixels: NDArray[Any], image: "Image", orientation: int) -> NDArray[Any]:
-    """(H, W, C) decoded pixels as they are stored: Pillow applies the orientation of a TIFF, which
-    is taken back."""
-    return (
-        oriented(pixels, {6: 8, 8: 6}.get(orientation, orientation))
-        if image.format == "TIFF"
-        else pixels
-    )
-
-
-def _seek_full_image(image: "Image") -> None:
-    """Go to the first picture of a TIFF that is not marked as a reduced copy of another."""
-    if image.format == "TIFF":
-        with suppress(EOFError):
-            for page in range(MAX_THUMBNAILS):
-                image.seek(page)
-                if not int(image.tag_v2.get(_SUBFILE, 0)) & 1:  # type: ignore[attr-defined]
-                    return
-        raise ImageError("holds thumbnails only; export the picture as JPEG or PNG")
-
-
-def _exif(image: "Image", data: bytes = b"") -> _Exif:
-    """The metadata of a picture; what is damaged gives orientation 1, and None."""
-    orientation = 1
-    focal = 0.0
-    zoom = 1.0
-    width = height = 0
-    with suppress(Exception):
-        exif = image.getexif()
-        orientation = exif.get(_ORIENTATION, 1)
-        directory = exif.get_ifd(_EXIF_DIRECTORY)
-        focal = float(directory.get(_FOCAL_35MM, 0))
-        width = int(directory.get(_TAKEN_WIDTH, 0))
-        height = int(directory.get(_TAKEN_HEIGHT, 0))
-        stated = float(directory.get(_DIGITAL_ZOOM, 0))
-        zoom = stated if 1.0 < stated <= MAX_DIGITAL_ZOOM else 1.0
-        if focal == 0.0:
-            size = (width, height) if width > 0 and height > 0 else image.size
-            focal = zoom * _focal_by_sensor(directory, size)
-            zoom = 1.0
-    valid = isinstance(orientation, int) and orientation in range(1, 9)
-    return _Exif(
-        orientation if valid else 1,
-        focal if 0 < focal < math.inf else None,
-        (height, width) if width > 0 and height > 0 else None,
-        zoom if focal > 0 else 1.0,
-        any(_PANORAMA.search(part) for part in (data[:MAX_METADATA_BYTES], _xmp(image))),
-    )
-
-
-def _xmp(image: "Image") -> bytes:
-    """The XMP of a picture that Pillow has found."""
-    found = image.info.get("xmp", b"")
-    return found if isinstance(found, bytes) else str(found).encode()
-
-
-def _focal_by_sensor(directory: Mapping[int, Any], size: tuple[int, int]) -> float:
-    """The focal length in mm of a 36 x 24 mm camera of the same view, from that of the lens and the
-    distance of the sensor's pixels; 0 where they are not stated, or no sensor has this size."""
-    unit = _SENSOR_UNITS_MM[int(directory.get(_SENSOR_UNIT, 2))]
-    along_x = float(directory[_SENSOR_X]) / unit
-    along_y = float(directory.get(_SENSOR_Y, directory[_SENSOR_X])) / unit
-    width, height = size
-    diagonal = math.hypot(width / along_x, height / along_y)
-    least, most = _SENSOR_DIAGONALS
-    has_square_pixels = abs(along_x / along_y - 1.0) < 0.02
-    if not (has_square_pixels and least <= diagonal <= most):
-        return 0.0
-    return float(directory[_FOCAL]) * _DIAGONAL_35MM / diagonal
 
 
 def _rgb_pixels(image: "Image", data: bytes) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
@@ -456,12 +316,6 @@ def _notes(image: "Image") -> tuple[str, ...]:
         ANIMATED: getattr(image, "is_animated", False) and image.format != "MPO",
     }
     return tuple(text for text, applies in notes.items() if applies)
-
-
-def oriented(x: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Stored (H, W, C) pixels as viewers show them, for an EXIF orientation."""
-    x = x[:: -1 if orientation in (3, 4, 6, 7) else 1, :: -1 if orientation in (2, 3, 7, 8) else 1]
-    return x.swapaxes(0, 1) if orientation > 4 else x
 
 
 _CONTAINERS = re.compile(

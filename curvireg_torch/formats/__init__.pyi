@@ -1,4 +1,13 @@
+from .boxes import BoxFile as BoxFile
+from .boxes import ImageBox as ImageBox
+from .boxes import PictureSize as PictureSize
+from .boxes import read_boxes as read_boxes
+from .cameras import CameraRecord as CameraRecord
+from .cameras import read_camera as read_camera
+from .masks import read_mask as read_mask
 from .meshes import MeshWarning as MeshWarning
 from .meshes import ReadMesh as ReadMesh
 from .meshes import SurfaceColours as SurfaceColours
 from .meshes import read_mesh as read_mesh
+from .poses import PoseRecord as PoseRecord
+from .poses import read_pose as read_pose

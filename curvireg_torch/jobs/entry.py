@@ -9,9 +9,10 @@ from typing import Any
 
 from ..data import Photo, read_photo
 from ..data.frames import VideoFrame
-from ..data.masks import mask_as_shown, mask_file
-from ..data.pose_files import PoseFile
+from ..data.poses import PoseFile
 from ..errors import CurviregError, InvalidInputError, MissingFileError
+from ..formats.boxes import PictureSize
+from ..formats.masks import mask_as_shown, mask_file
 from ..geometry import Camera, camera_matrix
 from ..geometry.cameras import camera_of_view
 from ..geometry.pose_prior import PosePrior
@@ -133,7 +134,8 @@ def observe(entry: Entry, photo: Photo) -> Observation:
     if isinstance(entry.mask, str | PathLike) and not mask_file(entry.mask)[0].is_file():
         raise MissingFileError("no such file; check the path of the mask", subject=entry.mask)
     camera, source = camera_of(entry, photo)
-    mask = mask_as_shown(entry.mask, photo)
+    H, W = photo.image.shape[-2:]
+    mask = mask_as_shown(entry.mask, PictureSize((H, W), photo.orientation))
     boxes, masks = (None if given is None else [given] for given in (entry.box, mask))
     item = image_items([photo.image], boxes, camera, entry.prior, masks)[0]
     if isinstance(item, CurviregError):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data import Video
-from ..data.calibrations import Calibrations
+from ..data.cameras import Calibrations
 from ..data.frames import FrameReader, VideoFrame
 from ..errors import (
     MAX_LIST_COLUMNS,

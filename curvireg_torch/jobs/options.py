@@ -29,7 +29,7 @@ from ..utils.choices import (
 )
 
 if TYPE_CHECKING:
-    from ..data.pose_files import PoseFile
+    from ..data.poses import PoseFile
     from ..features import LearnedCurvilinearSaliency
     from ..formats.boxes import BoxFile
     from ..formats.boxes.files import Corners
@@ -300,8 +300,8 @@ class RegisterOptions:
     def box_of(self, photo: Path, numbers: Sequence[float] | None = None) -> "Corners | None":
         """The box of a photograph in px: ``numbers``, or those of ``box``, in the format; or that
         of a detector."""
-        from ..data.images import picture_size
         from ..formats.boxes import pixel_box
+        from ..formats.pictures import picture_size
 
         numbers = self.box if numbers is None else numbers
         if numbers is None:
@@ -323,7 +323,7 @@ class RegisterOptions:
         """The pose of the file ``start``, or None."""
         if self.start is None:
             return None
-        from ..data.pose_files import read_pose
+        from ..data.poses import read_pose
 
         mesh = self.meshes[0].stem if self.meshes else ""
         return read_pose(self.start, convention=self.start_convention or "opencv", mesh=mesh)

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InvalidInputError, OutputError
+from ..formats.exports import ros
 from ..utils.files import check_writable, read_json, write_file
-from . import ros
 
 try:
     import fcntl

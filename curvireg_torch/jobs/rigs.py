@@ -14,7 +14,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..data.bop import bop_box, entry_at
-from ..data.calibrations import Calibrations
+from ..data.cameras import Calibrations
 from ..errors import MAX_RIG_VIEWS, CurviregError, InvalidInputError, MissingFileError
 from ..geometry import Camera
 from ..geometry.cameras import transform

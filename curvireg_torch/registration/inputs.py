@@ -17,8 +17,8 @@ from PIL.Image import Image as Picture
 from torch import Tensor
 
 from ..data.images import photo_of_picture, read_photo
-from ..data.masks import mask_of_values, read_mask
 from ..errors import CurviregError, ImageError, InvalidInputError
+from ..formats.masks import mask_of_values, read_mask
 from ..geometry.calibration import Camera, undistorted
 from ..geometry.crops import box_iou, check_boxes, crop_squares, square_boxes, whole_image_box
 from ..geometry.pose_prior import PosePrior

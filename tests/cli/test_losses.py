@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from curvireg_torch.cli import main
+from curvireg_torch.formats.exports.ros import FILES
 from curvireg_torch.jobs.outputs import MARKER
-from curvireg_torch.jobs.ros import FILES
 from tests._support.lists import CAMERA, box_of, lines, table, written
 from tests._support.scenes import scene
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from curvireg_torch.data import images, read_image, read_photo
 from curvireg_torch.errors import ImageError, MissingFileError
+from curvireg_torch.formats import pictures
 from tests._support.exif import exif, with_exif
 from tests._support.miniature import write_image
 
@@ -275,7 +276,7 @@ def test_read_photo_bounds_scans_and_bytes(tmp_path, monkeypatch):
     path.write_bytes(data[:-2] + 64 * last + data[-2:])
     with pytest.raises(ImageError, match="scans, more than 64"):
         read_photo(path)
-    monkeypatch.setattr(images, "MAX_IMAGE_BYTES", 100)  # before the file is read
+    monkeypatch.setattr(pictures, "MAX_IMAGE_BYTES", 100)  # before the file is read
     with pytest.raises(ImageError, match="larger than 100 bytes"):
         read_photo(path)
 
@@ -336,7 +337,7 @@ def test_sixteen_bits_that_are_used_are_not_stretched(tmp_path):
     assert note == "16 bits, of which the lower ones are used: 16 levels remain; save it as PNG"
 
 
-@pytest.mark.parametrize("count", [1, 2, images.MAX_THUMBNAILS - 1])
+@pytest.mark.parametrize("count", [1, 2, pictures.MAX_THUMBNAILS - 1])
 def test_thumbnails_before_the_picture_of_a_tiff_are_passed_over(tmp_path, count):
     pages = [Image.new("L", (4, 4), 10 * page) for page in range(count)]
     for page in pages:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from curvireg_torch.data.images import oriented, picture_size
 from curvireg_torch.errors import CurviregWarning, InvalidInputError, MissingFileError
 from curvireg_torch.formats.boxes import BoxFile, PictureSize, pixel_box, read_boxes
+from curvireg_torch.formats.pictures import oriented, picture_size
 from curvireg_torch.jobs.options import with_advice
 from curvireg_torch.registration.inputs import image_items
 from tests._support.exif import exif, with_exif

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from curvireg_torch.data import calibrations
 from curvireg_torch.errors import MAX_LIST_COLUMNS, InvalidInputError, MissingFileError
+from curvireg_torch.formats.cameras import files as calibrations
 from curvireg_torch.jobs import rigs
 from curvireg_torch.jobs.lists import read_list
 from curvireg_torch.jobs.options import RegisterOptions

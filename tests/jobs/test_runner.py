@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from curvireg_torch import Camera, PosePrior
-from curvireg_torch.data.pose_files import PoseFile
+from curvireg_torch.data.poses import PoseFile
 from curvireg_torch.errors import MeshError, WorkerError
 from curvireg_torch.jobs import runner
 from curvireg_torch.jobs.entry import Entry

@@ -14,7 +14,7 @@ import trimesh
 
 from curvireg_torch.cli import main, parse
 from curvireg_torch.cli.options import register_options
-from curvireg_torch.data.pose_files import read_pose
+from curvireg_torch.data.poses import read_pose
 from curvireg_torch.errors import CurviregError, CurviregWarning, InvalidInputError
 from curvireg_torch.geometry import Camera, rotation_error, rotation_from_viewpoint, undistorted
 from curvireg_torch.jobs.options import WITHIN, RegisterOptions

@@ -14,8 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from ...errors import InvalidInputError
-from ...utils.files import foreign_content
+from ..errors import InvalidInputError
+from ..utils.files import foreign_content
 
 EXPECTED = (
     "YAML, XML or JSON of OpenCV, camera_info of ROS, camchain of Kalibr, cameras.txt of COLMAP, "

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ImageError, InvalidInputError, MissingFileError
-from .images import Photo, as_in_file, decoded, oriented
+from .boxes import PictureSize
+from .pictures import as_in_file, decoded, oriented
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -65,16 +66,16 @@ def read_mask(mask: str | os.PathLike[str]) -> NDArray[np.float32]:
         raise error.with_subject(mask) from error
 
 
-def mask_as_shown(mask: Any, photo: Photo) -> Any:
+def mask_as_shown(mask: Any, picture: PictureSize) -> Any:
     """The mask of a photograph, a path or (H, W) values, turned as its EXIF orientation says where
     its shape is that of the pixels in the file; other ones as they are."""
-    shown = tuple(photo.image.shape[-2:])
-    if photo.orientation <= 4 or shown[0] == shown[1] or mask is None:
+    is_square = picture.shown[0] == picture.shown[1]
+    if picture.orientation <= 4 or is_square or mask is None:
         return mask
     values = read_mask(mask) if isinstance(mask, str | os.PathLike) else np.asarray(mask)
-    if values.shape != shown[::-1]:
+    if values.shape != picture.stored:
         return values
-    return np.array(oriented(values[..., None], photo.orientation)[..., 0])
+    return np.array(oriented(values[..., None], picture.orientation)[..., 0])
 
 
 def mask_of_values(values: NDArray[Any], largest: int) -> NDArray[np.float32]:

@@ -7,9 +7,10 @@ import pytest
 import torch
 from PIL import Image, features
 
-from curvireg_torch.data import heif, read_image, read_photo
-from curvireg_torch.data.heif import heif_kind, open_photograph
+from curvireg_torch.data import read_image, read_photo
 from curvireg_torch.errors import ImageError, MissingDependencyError
+from curvireg_torch.formats import heif
+from curvireg_torch.formats.heif import heif_kind, open_photograph
 from curvireg_torch.utils.choices import IMAGES
 from tests._support.exif import exif
 

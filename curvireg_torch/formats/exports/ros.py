@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidInputError
-from ..utils.choices import UNITS
-from ..utils.files import write_file
+from ...errors import InvalidInputError
+from ...utils.choices import UNITS
+from ...utils.files import write_file
 
 FILES = ("pose.yaml", "pose_with_covariance.yaml", "tf.yaml")
 """A geometry_msgs/PoseStamped, a geometry_msgs/PoseWithCovarianceStamped where the covariance is

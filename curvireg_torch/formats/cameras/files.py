@@ -9,12 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import MAX_CAMERA_BYTES, InvalidInputError, MissingFileError
-from ...geometry.calibration import Camera
-from .documents import EXPECTED, read_document
-from .formats import FORMATS, Format
-from .record import Record, Used, distortion_keys, distortion_keys_inside, flattened, plain
-
-__all__ = ["Calibrations", "load_camera"]
+from ...utils.files import split_name
+from ..documents import EXPECTED, read_document
+from .kinds import FORMATS, Format
+from .record import (
+    CameraRecord,
+    Record,
+    Used,
+    distortion_keys,
+    distortion_keys_inside,
+    flattened,
+    plain,
+)
 
 _STEREO = re.compile(
     r"(left|right)?(cameramatrix|mtx|m|k|d|dist|distcoeffs|distortion|distortioncoefficients)"
@@ -27,8 +33,8 @@ _ITEM_NAMES = ("name", "id", "file_path")  # of a camera in a list
 _PAIR = {"l": "left", "r": "right"}
 
 
-def load_camera(path: str | os.PathLike[str]) -> Camera:
-    """Read a calibration file; of one with several cameras, ``FILE:NAME`` names one.
+def read_camera(path: str | os.PathLike[str]) -> CameraRecord:
+    """The camera of a calibration file; of one with several, ``FILE:NAME`` names one.
 
     Read are YAML, XML and JSON of OpenCV, also stereo (``M1``, ``D1``: ``FILE:1``), and ``.npz``
     with ``mtx`` and ``dist``; ``camera_info`` of ROS with ``roi`` and ``binning`` (``FILE:P`` is
@@ -37,9 +43,10 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
     (``FILE:IMAGE_ID``) of BOP; ``cam_K.txt`` of 3 x 3 numbers; ``camera_data.json`` of MegaPose;
     ``transforms.json`` of nerfstudio; ORB-SLAM's files; ``camera_models.json`` of OpenSfM;
     ``calib.txt`` of KITTI (``FILE:P2``); TOML of aniposelib; XML of Metashape; ppx, ppy of
-    RealSense; matrices that Open3D and ARKit write column by column; ``result.json``. Principal
-    points that count from the corner of the picture (COLMAP, nerfstudio) are converted. Four
-    coefficients without a model's name are read as k1, k2, p1, p2, with a warning.
+    RealSense; ``cameraIntrinsics`` of MATLAB; matrices that Open3D and ARKit write column by
+    column; ``result.json``. Principal points that count from the corner of the picture (COLMAP,
+    nerfstudio) are converted. Four coefficients without a model's name are read as k1, k2, p1, p2,
+    with a warning.
 
     Raises:
         MissingFileError: the file does not exist.
@@ -50,29 +57,24 @@ def load_camera(path: str | os.PathLike[str]) -> Camera:
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp(), "cameras.txt")
         >>> _ = file.write_text("1 SIMPLE_RADIAL 640 480 500 320 240 -0.1")
-        >>> camera = load_camera(f"{file}:1")
-        >>> camera.matrix.tolist()
-        [[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]
+        >>> camera = read_camera(f"{file}:1")
+        >>> camera.matrix
+        ((500.0, 0.0, 319.5), (0.0, 500.0, 239.5), (0.0, 0.0, 1.0))
         >>> camera.distortion, camera.size
         ((-0.1, 0.0, 0.0, 0.0), (480, 640))
     """
-    return Calibrations().load(path)
+    return CameraFiles().read(path)
 
 
-class Calibrations:
+class CameraFiles:
     """Calibration files, each of which is read once, however many of its cameras are asked for."""
 
     def __init__(self) -> None:
         self._files: dict[Path, _Cameras] = {}
 
-    def load(self, path: str | os.PathLike[str]) -> Camera:
-        """:func:`load_camera`."""
-        file = Path(path)
-        name = ""
-        # unlike Path.is_file, whatever the name is
-        if not os.path.isfile(file) and ":" in str(path):
-            front, _, name = str(path).rpartition(":")
-            file = Path(front)
+    def read(self, path: str | os.PathLike[str]) -> CameraRecord:
+        """:func:`read_camera`."""
+        file, name = split_name(path)
         if not os.path.isfile(file):
             message = "no such file; check the path of the calibration"
             raise MissingFileError(message, subject=path, kind="calibration")
@@ -130,14 +132,14 @@ class _Cameras:
                 self.by_name.setdefault(name, []).append(camera)
         self.inside = Counter(id(values) for camera in self.found for values in camera.around)
 
-    def camera(self, name: str) -> Camera:
+    def camera(self, name: str) -> CameraRecord:
         """The camera with a name; without one, the only camera. Its distortion is all read, or the
         file refused."""
         chosen, parse = self._chosen(name)
         inherits = chosen.format.inherits
         around = [values for values in chosen.around if inherits or self.inside[id(values)] == 1]
         used: Used = set()
-        camera: Camera = parse(Record(chosen.values, used, around))
+        camera: CameraRecord = parse(Record(chosen.values, used, around))
         inside = distortion_keys_inside(chosen.values, self.identities)
         unread = [key for place, key in (*inside, *self.outside) if (place, key) not in used]
         if unread:

@@ -1,21 +1,18 @@
-"""Files of one pose: our own results, and those of other tools."""
+"""Files of one pose: results of this library, and those of other tools."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from scipy.spatial.transform import Rotation
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import InvalidInputError, MissingFileError
-from ..geometry.cameras import transform
-from ..utils.checks import check_numbers, check_pose
 from ..utils.files import check_table_size, finite_numbers, split_name
-from .calibrations.documents import read_document
-from .calibrations.record import flattened, plain
+from .cameras.record import flattened, plain
+from .documents import read_document
 
 _README = "docs/guides/known-pose.md"
 _MATRICES = {
@@ -36,21 +33,21 @@ FORMATS = (
 
 
 @dataclass(frozen=True, eq=False)
-class PoseFile:
+class PoseRecord:
     """A pose that a file holds.
 
     Attributes:
-        T: (4, 4) float64 model -> OpenCV camera.
+        T: (4, 4) float64 model -> OpenCV camera, finite; its rotation is not checked.
         unit: of the translation, "m" or "mm", where the format fixes it; None: that of the mesh.
         confidence: of the pose, if the file has one.
     """
 
-    T: Tensor
+    T: NDArray[np.float64]
     unit: str | None = None
     confidence: float | None = None
 
 
-def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> PoseFile:
+def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> PoseRecord:
     """Read the pose of an object in a camera.
 
     Args:
@@ -62,7 +59,7 @@ def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> Pose
 
     Raises:
         MissingFileError: the file does not exist.
-        InvalidInputError: it holds no such pose, or several, or one that is not rigid.
+        InvalidInputError: it holds no such pose, or several.
 
     Example:
         >>> import tempfile
@@ -77,18 +74,16 @@ def read_pose(path: Path, *, convention: str = "opencv", mesh: str = "") -> Pose
     check_table_size(file)
     try:
         found = _pose_of(read_document(file, FORMATS), name, mesh)
-        check_pose(found.T, "rotation, translation")
     except RecursionError:
         raise InvalidInputError("nested too deeply; write it again", subject=path) from None
     except InvalidInputError as error:
         raise error.with_subject(path) from error
     if convention == "opencv":
         return found
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-    return PoseFile(flip @ found.T, found.unit, found.confidence)
+    return replace(found, T=np.diag([1.0, -1.0, -1.0, 1.0]) @ found.T)
 
 
-def _pose_of(content: Any, name: str, mesh: str) -> PoseFile:
+def _pose_of(content: Any, name: str, mesh: str) -> PoseRecord:
     content = _named(content, name, mesh)
     if not isinstance(content, dict):
         raise InvalidInputError(f"expected {FORMATS}")
@@ -98,7 +93,7 @@ def _pose_of(content: Any, name: str, mesh: str) -> PoseFile:
         return reader(content)
     matrices = [flattened(content[key]) for name, key in keys.items() if name in _MATRICES]
     if numbers := next((values for values in matrices if len(values) in (12, 16)), None):
-        return PoseFile(pose_matrix(numbers), None, _confidence(content))
+        return PoseRecord(pose_matrix(numbers), None, _confidence(content))
     return _rotation_and_translation(content)
 
 
@@ -156,24 +151,37 @@ def _item(items: Sequence[Any], name: str, mesh: str) -> Any:
     return chosen[0]
 
 
-def pose_matrix(numbers: Sequence[Any]) -> Tensor:
-    """(4, 4) float64 of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1
-    in the last column and the translation in the last row."""
-    values = check_numbers(list(numbers), "pose")
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    if len(values) == 12:
-        values = torch.cat([values, last])
-    T = values.view(4, 4)
-    by_column = torch.equal(T[:, 3], last) and not torch.equal(T[3], last)
-    T = T.T.contiguous() if by_column else T
-    if not torch.equal(T[3], last):
+def pose_matrix(numbers: Sequence[Any]) -> NDArray[np.float64]:
+    """(4, 4) of 12 or 16 numbers row by row; or of 16 column by column, which have 0 0 0 1 in the
+    last column and the translation in the last row."""
+    last = [0.0, 0.0, 0.0, 1.0]
+    values = _numbers(numbers, "pose", len(numbers))
+    T = np.append(values, last if len(values) == 12 else []).reshape(4, 4)
+    is_by_column = T[:, 3].tolist() == last and T[3].tolist() != last
+    T = np.ascontiguousarray(T.T) if is_by_column else T
+    if T[3].tolist() != last:
         raise InvalidInputError(
             "pose: expected a last row of 0 0 0 1; give T_cam_from_model row by row"
         )
     return T
 
 
-def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
+def _numbers(values: Any, name: str, count: int) -> NDArray[np.float64]:
+    """``count`` finite numbers of nested lists."""
+    numbers = finite_numbers(_flat(values), count)
+    if numbers is None:
+        raise InvalidInputError(f"{name}: expected {count} finite numbers, got {values!r:.80}")
+    return np.array(numbers)
+
+
+def _transform(R: NDArray[np.float64], t: NDArray[np.float64]) -> NDArray[np.float64]:
+    T = np.eye(4)
+    T[:3, :3] = R.reshape(3, 3)
+    T[:3, 3] = t
+    return T
+
+
+def _rotation_and_translation(content: Mapping[str, Any]) -> PoseRecord:
     if content.get("frame") == "world":
         message = (
             "a result of several photographs, whose pose is in the world; give that in one "
@@ -192,12 +200,9 @@ def _rotation_and_translation(content: Mapping[str, Any]) -> PoseFile:
     if rotation is None or translation is None:
         missing = "rotation of 3 x 3 numbers" if rotation is None else "translation"
         raise InvalidInputError(f"no {missing}; expected {FORMATS}")
-    R = check_numbers(_flat(rotation), "rotation", 9).view(3, 3)
-    return PoseFile(
-        transform(R, check_numbers(_flat(translation), "translation", 3)),
-        None,
-        _confidence(content),
-    )
+    R = _numbers(rotation, "rotation", 9)
+    t = _numbers(translation, "translation", 3)
+    return PoseRecord(_transform(R, t), None, _confidence(content))
 
 
 def _flat(values: Any) -> Any:
@@ -209,26 +214,25 @@ def _confidence(content: Mapping[str, Any]) -> float | None:
     return numbers[0] if numbers else None
 
 
-def _bop(content: Mapping[str, Any]) -> PoseFile:
+def _bop(content: Mapping[str, Any]) -> PoseRecord:
     """An entry of scene_gt.json: millimetres."""
-    R = check_numbers(_flat(content.get("cam_R_m2c")), "cam_R_m2c", 9).view(3, 3)
-    return PoseFile(
-        transform(R, check_numbers(_flat(content.get("cam_t_m2c")), "cam_t_m2c", 3)), "mm"
-    )
+    R = _numbers(content.get("cam_R_m2c"), "cam_R_m2c", 9)
+    t = _numbers(content.get("cam_t_m2c"), "cam_t_m2c", 3)
+    return PoseRecord(_transform(R, t), "mm")
 
 
-def _megapose(content: Mapping[str, Any]) -> PoseFile:
+def _megapose(content: Mapping[str, Any]) -> PoseRecord:
     """An entry of object_data.json: a quaternion x, y, z, w and metres, in the camera, which is the
     world."""
-    numbers = check_numbers(flattened(content.get("TWO")), "TWO", 7)
+    numbers = _numbers(flattened(content.get("TWO")), "TWO", 7)
     if "TWC" in content:
         raise InvalidInputError(
             "TWO: in the world of TWC; give the pose in the camera, TWC^-1 TWO, without TWC"
         )
-    return PoseFile(transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
+    return PoseRecord(_transform(_rotation(numbers[:4], "TWO"), numbers[4:]), "m")
 
 
-def _ros(content: Mapping[str, Any]) -> PoseFile:
+def _ros(content: Mapping[str, Any]) -> PoseRecord:
     """A PoseStamped, as ``--format ros`` writes it: metres, in the camera's optical frame."""
     header = content.get("header")
     frame = str(header.get("frame_id") or "") if isinstance(header, dict) else ""
@@ -247,22 +251,24 @@ def _ros(content: Mapping[str, Any]) -> PoseFile:
         raise InvalidInputError(
             "pose: expected position and orientation; or a matrix of 4 x 4 numbers"
         )
-    t = check_numbers([place.get(axis) for axis in "xyz"], "position", 3)
-    q = check_numbers([turn.get(axis) for axis in "xyzw"], "orientation", 4)
-    return PoseFile(transform(_rotation(q, "orientation"), t), "m")
+    t = _numbers([place.get(axis) for axis in "xyz"], "position", 3)
+    q = _numbers([turn.get(axis) for axis in "xyzw"], "orientation", 4)
+    return PoseRecord(_transform(_rotation(q, "orientation"), t), "m")
 
 
-def _rotation(quaternion: Tensor, name: str) -> Tensor:
+def _rotation(quaternion: NDArray[np.float64], name: str) -> NDArray[np.float64]:
     """(3, 3) of x, y, z, w."""
-    if abs(float(quaternion.norm()) - 1.0) > 1e-2:
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1.0) > 1e-2:
         raise InvalidInputError(
-            f"{name}: expected a quaternion x, y, z, w of length 1, got "
-            f"{float(quaternion.norm()):.3g}"
+            f"{name}: expected a quaternion x, y, z, w of length 1, got {length:.3g}"
         )
-    return torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
+    x, y, z, w = quaternion / length
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + 2.0 * (w * cross + cross @ cross))
 
 
-_READERS: dict[str, Callable[[Mapping[str, Any]], PoseFile]] = {
+_READERS: dict[str, Callable[[Mapping[str, Any]], PoseRecord]] = {
     "camrm2c": _bop,
     "two": _megapose,
     "header": _ros,

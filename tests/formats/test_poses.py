@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from curvireg_torch.data.pose_files import read_pose
+from curvireg_torch.data.poses import read_pose
 from curvireg_torch.errors import InvalidInputError, MissingFileError
 
 R = Rotation.from_euler("xyz", [20, -30, 50], degrees=True).as_matrix()

@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ...errors import InvalidInputError
 from ...utils.files import finite_numbers
-from .documents import number
+from ..documents import number
 
 Used = set[tuple[int, str]]
 """Keys that were read, each with the identity of its dict."""
@@ -22,6 +23,29 @@ _DISTORTION_KEY = re.compile(
 def plain(key: str) -> str:
     """A key without case and punctuation: "dist_coeffs" and "distCoeffs" are the same."""
     return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    """A camera of a calibration file: pixels count from the centre of the first one, x right, y
+    down.
+
+    Attributes:
+        matrix: 3 x 3, in px.
+        distortion: coefficients in OpenCV's order.
+        model: "radial-tangential", or "fisheye" for the equidistant one of ``cv2.fisheye``.
+        size: (H, W) of the pictures; None if the file does not state it.
+        focal_deviation: standard deviation of the focal length, as a fraction of it; 0 of a known
+            one.
+        source: "given", or "estimated" in a photograph.
+    """
+
+    matrix: tuple[tuple[float, ...], ...]
+    distortion: tuple[float, ...] = ()
+    model: str = "radial-tangential"
+    size: tuple[int, int] | None = None
+    focal_deviation: float = 0.0
+    source: str = "given"
 
 
 class Record:

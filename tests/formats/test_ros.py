@@ -7,10 +7,10 @@ import pytest
 import torch
 import yaml
 
-from curvireg_torch.data.pose_files import read_pose
+from curvireg_torch.data.poses import read_pose
 from curvireg_torch.errors import InvalidInputError
+from curvireg_torch.formats.exports.ros import FILES, ros_covariance, time_stamp, write_ros
 from curvireg_torch.geometry import rotation_from_axis_angle
-from curvireg_torch.jobs.ros import FILES, ros_covariance, time_stamp, write_ros
 
 DOCUMENT = {
     "translation": [1000.0, -2000.0, 500.0],

@@ -9,8 +9,9 @@ import torch
 from PIL import Image
 
 from curvireg_torch.data.images import read_photo
-from curvireg_torch.data.masks import mask_as_shown, mask_file, read_mask
 from curvireg_torch.errors import InvalidInputError, MissingFileError
+from curvireg_torch.formats.masks import mask_as_shown, mask_file, read_mask
+from curvireg_torch.formats.pictures import picture_size
 from curvireg_torch.registration.inputs import image_item
 from tests._support.exif import exif, with_exif
 
@@ -132,5 +133,7 @@ def test_masks_of_the_pixels_in_the_file_are_turned_with_the_photograph(
     mask = written(tmp_path / "mask.png", 255 * given.astype(np.uint8))
     forms = {"path": mask, "array": given, "tensor": torch.from_numpy(np.array(given))}
     for shown in (forms[form], as_shown):
-        item = image_item(photo.image, None, mask=mask_as_shown(shown, photo))
+        item = image_item(
+            photo.image, None, mask=mask_as_shown(shown, picture_size(tmp_path / "photo.png"))
+        )
         assert np.array_equal(item.mask.numpy() >= 0.5, as_shown)

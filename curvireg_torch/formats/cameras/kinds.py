@@ -9,16 +9,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import torch
-
 from ...errors import CurviregWarning, InvalidInputError
-from ...geometry.calibration import MODELS as CAMERA_MODELS
-from ...geometry.calibration import Camera
-from .documents import number
-from .record import Record, flattened, plain
+from ..documents import number
+from .record import CameraRecord, Record, flattened, plain
 
 RADIAL_TANGENTIAL = "radial-tangential"
 FISHEYE = "fisheye"
+CAMERA_MODELS = (RADIAL_TANGENTIAL, FISHEYE)
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -114,8 +111,8 @@ class Format:
 
     name: str
     detect: Callable[[Record], bool]
-    parse: Callable[[Record], Camera]
-    others: Mapping[str, Callable[[Record], Camera]] = field(default_factory=dict)
+    parse: Callable[[Record], CameraRecord]
+    others: Mapping[str, Callable[[Record], CameraRecord]] = field(default_factory=dict)
     inherits: bool = False
 
 
@@ -124,7 +121,7 @@ def camera_from(
     distortion: Sequence[float] = (),
     model: str = RADIAL_TANGENTIAL,
     size: Any = None,
-) -> Camera:
+) -> CameraRecord:
     """The camera with fx, fy, cx, cy or a matrix row by row, or column by column, and a size of (H,
     W)."""
     rows = matrix_rows(matrix)
@@ -133,7 +130,7 @@ def camera_from(
             "camera matrix: in fractions of the picture, not in px; multiply fx and cx by its "
             "width, fy and cy by its height"
         )
-    return Camera(torch.tensor(rows, dtype=torch.float64), tuple(distortion), model, size)
+    return CameraRecord(tuple(map(tuple, rows)), tuple(distortion), model, size)
 
 
 def matrix_rows(numbers: Sequence[float]) -> list[list[float]]:
@@ -294,7 +291,7 @@ def checked_size(size: Sequence[float]) -> tuple[int, int] | None:
     return (int(size[1]), int(size[0])) if size else None
 
 
-def plain_camera(record: Record) -> Camera:
+def plain_camera(record: Record) -> CameraRecord:
     """A camera with OpenCV's conventions, and a size of width, height."""
     model = read_model(record)
     matrix = read_matrix(record)
@@ -328,13 +325,13 @@ _PLAIN_MATRIX = {plain(name) for name in MATRIX}
 _PLAIN_PAIRS = {plain(name) for names in PAIRS for name in names}
 
 
-def _unknown_order(record: Record) -> Camera:
+def _unknown_order(record: Record) -> CameraRecord:
     """MegaPose writes height, width and others width, height: the principal point lies near the
     centre."""
     camera = plain_camera(record)
     if camera.size is None:
         return camera
-    cx, cy = (float(value) for value in camera.matrix[:2, 2])
+    cx, cy = (row[2] for row in camera.matrix[:2])
 
     def distance(size: tuple[int, int]) -> float:
         H, W = size
@@ -361,16 +358,16 @@ def _is_matlab(record: Record) -> bool:
     return {"ImageSize", "FocalLength", "PrincipalPoint"} <= record.values.keys()
 
 
-def _matlab(record: Record) -> Camera:
+def _matlab(record: Record) -> CameraRecord:
     """The properties of a ``cameraIntrinsics``: pixels count from 1, and the size is rows,
     columns."""
     camera = plain_camera(record)
-    matrix = camera.matrix.clone()
-    matrix[:2, 2] -= 1.0
+    columns, rows, last = camera.matrix
+    matrix = ((*columns[:2], columns[2] - 1.0), (*rows[:2], rows[2] - 1.0), last)
     return replace(camera, matrix=matrix, size=camera.size and camera.size[::-1])
 
 
-def _own_result(record: Record) -> Camera:
+def _own_result(record: Record) -> CameraRecord:
     """The object "camera" of result.json: its size is height, width. A focal length that was
     estimated remains as uncertain as it was."""
     camera = plain_camera(record)
@@ -384,11 +381,11 @@ def _own_result(record: Record) -> Camera:
     return replace(camera, focal_deviation=deviations[0], source=source)
 
 
-def _ros(record: Record) -> Camera:
+def _ros(record: Record) -> CameraRecord:
     return _region(record, plain_camera(record))
 
 
-def _ros_rectified(record: Record) -> Camera:
+def _ros_rectified(record: Record) -> CameraRecord:
     """The camera of ``image_rect``: the left 3 x 3 of the projection matrix, without distortion."""
     numbers = record.numbers("P", "projection_matrix")
     if len(numbers) != 12:
@@ -398,7 +395,7 @@ def _ros_rectified(record: Record) -> Camera:
     return _region(record, camera_from(rows, size=checked_size(read_size(record))))
 
 
-def _region(record: Record, camera: Camera) -> Camera:
+def _region(record: Record, camera: CameraRecord) -> CameraRecord:
     """The camera of the pixels that a message's ``roi`` and ``binning`` leave; its matrix is that
     of all pixels."""
     roi = record.inside("roi") or Record({}, record.used)
@@ -410,16 +407,16 @@ def _region(record: Record, camera: Camera) -> Camera:
     H, W = camera.size or (0, 0)
     width = width or W - left
     height = height or H - top
-    move = torch.eye(3, dtype=torch.float64)
-    for axis, (step, offset) in enumerate(zip(steps, (left, top), strict=True)):
-        move[axis, axis] = 1.0 / step
+    rows = []
+    for (a, b, c), step, offset in zip(camera.matrix, steps, (left, top), strict=False):
         # a pixel covers the ``step`` ones from its first edge on
-        move[axis, 2] = (0.5 - offset) / step - 0.5
+        rows.append((a / step, b / step, (c + 0.5 - offset) / step - 0.5))
     size = (int(height // steps[1]), int(width // steps[0]))
-    return replace(camera, matrix=move @ camera.matrix, size=size if min(size) > 0 else None)
+    matrix = (*rows, camera.matrix[2])
+    return replace(camera, matrix=matrix, size=size if min(size) > 0 else None)
 
 
-def _nerfstudio(record: Record) -> Camera:
+def _nerfstudio(record: Record) -> CameraRecord:
     """Of nerfstudio and instant-ngp: pixels count from the picture's corner, as COLMAP's."""
     model = read_model(record)
     width = record.number("w")
@@ -446,7 +443,7 @@ OPENSFM = dict.fromkeys(
 """Models of OpenSfM, and OpenCV's."""
 
 
-def _opensfm(record: Record) -> Camera:
+def _opensfm(record: Record) -> CameraRecord:
     """Of OpenSfM and OpenDroneMap: lengths are fractions of the longer side, and count from the
     picture's centre."""
     name = record.get("projection_type")
@@ -469,7 +466,7 @@ def _opensfm(record: Record) -> Camera:
     )
 
 
-def _kitti(record: Record) -> Camera:
+def _kitti(record: Record) -> CameraRecord:
     """The left 3 x 3 of a projection matrix of KITTI, whose last column is the place of the camera
     beside the first one."""
     numbers = record.numbers("kitti")
@@ -490,7 +487,7 @@ COLMAP = {
 }
 
 
-def _colmap(record: Record) -> Camera:
+def _colmap(record: Record) -> CameraRecord:
     """A line of ``cameras.txt``: the corner of the picture is (0, 0)."""
     words = record.values["colmap"]
     line = f"line {record.values['line']}"
@@ -512,7 +509,7 @@ def _colmap(record: Record) -> Camera:
     return camera_from(matrix, distortion, model, checked_size([width, height]))
 
 
-def _metashape(record: Record) -> Camera:
+def _metashape(record: Record) -> CameraRecord:
     """Of Agisoft Metashape: cx and cy count from the picture's centre, p1 and p2 change places, k4
     is a power of r."""
     size = read_size(record)
@@ -540,7 +537,7 @@ def _metashape(record: Record) -> Camera:
     )
 
 
-def _kannala_brandt(record: Record) -> Camera:
+def _kannala_brandt(record: Record) -> CameraRecord:
     """Of camodocal: k2 to k5 are OpenCV's k1 to k4 of a fisheye."""
     matrix = [value for name in ("mu", "mv", "u0", "v0") for value in record.numbers(name)]
     distortion = [value for name in ("k2", "k3", "k4", "k5") for value in record.numbers(name)]
@@ -548,7 +545,7 @@ def _kannala_brandt(record: Record) -> Camera:
     return camera_from(matrix, distortion, FISHEYE, checked_size(read_size(record)))
 
 
-def _mei(record: Record) -> Camera:
+def _mei(record: Record) -> CameraRecord:
     record.words(*MODEL_NAMES)
     raise InvalidInputError(f"camera model 'MEI' is not supported; choose from {KNOWN_MODELS}")
 
@@ -576,7 +573,7 @@ UNREAD = {
 def _unread(keys: str, sentence: str) -> Format:
     """A format that is refused with a sentence that says how to write the camera."""
 
-    def refuse(_: Record) -> Camera:
+    def refuse(_: Record) -> CameraRecord:
         raise InvalidInputError(sentence)
 
     names = keys.split()

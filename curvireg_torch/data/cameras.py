@@ -1,0 +1,53 @@
+"""Calibration files as cameras of the library."""
+
+import os
+
+import torch
+
+from ..errors import InvalidInputError
+from ..formats.cameras import CameraFiles
+from ..geometry.calibration import Camera
+
+
+def load_camera(path: str | os.PathLike[str]) -> Camera:
+    """The camera of a calibration file, ``FILE`` or ``FILE:NAME``; :func:`.read_camera` names the
+    formats.
+
+    Raises:
+        MissingFileError: the file does not exist.
+        InvalidInputError: it is of no such format, or describes a camera that is not supported.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> file = Path(tempfile.mkdtemp(), "cameras.txt")
+        >>> _ = file.write_text("1 SIMPLE_RADIAL 640 480 500 320 240 -0.1")
+        >>> camera = load_camera(f"{file}:1")
+        >>> camera.matrix.tolist()
+        [[500.0, 0.0, 319.5], [0.0, 500.0, 239.5], [0.0, 0.0, 1.0]]
+        >>> camera.distortion, camera.size
+        ((-0.1, 0.0, 0.0, 0.0), (480, 640))
+    """
+    return Calibrations().load(path)
+
+
+class Calibrations:
+    """Calibration files, each of which is read once, however many of its cameras are asked for."""
+
+    def __init__(self) -> None:
+        self._files = CameraFiles()
+
+    def load(self, path: str | os.PathLike[str]) -> Camera:
+        """:func:`load_camera`."""
+        record = self._files.read(path)
+        try:
+            return Camera(
+                torch.tensor(record.matrix, dtype=torch.float64),
+                record.distortion,
+                record.model,
+                record.size,
+                focal_deviation=record.focal_deviation,
+                source=record.source,
+            )
+        except InvalidInputError as error:
+            raise InvalidInputError(str(error), subject=path, kind="calibration") from error

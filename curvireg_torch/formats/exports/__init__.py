@@ -1,0 +1,1 @@
+"""Poses as other tools read them: ROS, M3T and ViSP."""
