@@ -100,14 +100,6 @@ class QueryFeatures:
                 query.computed[name] = part
         return queries
 
-    @staticmethod
-    def cat(queries: "Sequence[QueryFeatures]") -> "QueryFeatures":
-        """The photographs together."""
-        names = [field.name for field in fields(QueryFeatures) if field.name != "computed"]
-        known = [[getattr(query, name) for query in queries] for name in names]
-        parts = [None if some[0] is None else torch.cat(some) for some in known]
-        return QueryFeatures(*parts)  # type: ignore[arg-type]
-
 
 def photograph_field(field: nn.Module, crops: Tensor) -> tuple[Tensor, Tensor | None]:
     """(B, 2, S, S) field of (B, 1 or 3, S, S) crops, in grey unless the filter has an attribute

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import torch
 import trimesh
@@ -56,6 +56,20 @@ class Target:
         self.mesh_is = mesh_is
         self.symmetries = symmetries
         self.progress = progress
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what follows from the rest: renderers cannot be pickled."""
+        of_classes = [vars(one).items() for one in type(self).__mro__]
+        computed = {
+            name for items in of_classes for name, x in items if isinstance(x, cached_property)
+        }
+        return {name: value for name, value in vars(self).items() if name not in computed}
+
+    def __copy__(self) -> Self:
+        """With what was computed: it follows from the mesh, which a copy shares."""
+        other = type(self).__new__(type(self))
+        vars(other).update(vars(self))
+        return other
 
     @property
     def is_exact(self) -> bool:
@@ -152,7 +166,7 @@ class Target:
             mirrored(known.view_mesh), known.settings, device=self.bank.device
         )
         image = copy(self)
-        image.__dict__["describer"] = describer
+        vars(image)["describer"] = describer
         return image
 
     @cached_property

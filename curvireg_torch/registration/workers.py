@@ -10,15 +10,6 @@ from ..utils.executors import Workers
 from .inputs import ImageItem
 from .result import FailedRegistration, Registration
 
-# attributes of a registrar that follow from the others
-COMPUTED = (
-    "describer",
-    "detector",
-    "mesh_warnings",
-    "telling_symmetries",
-    "_keypoints",
-    "_mirror_image",
-)
 MAX_BLOCK = 8  # photographs that a worker gets at a time
 
 Results = list[Registration | FailedRegistration]
@@ -61,7 +52,7 @@ def register_by_workers(
     size = max(1, min(MAX_BLOCK, len(tasks) // (2 * workers.count)))
     blocks = (tasks[start : start + size] for start in range(0, len(tasks), size))
     found: dict[int, Registration | FailedRegistration] = {}
-    for task, result in workers.map(_register_block, _without_renderers(registrar), blocks):
+    for task, result in workers.map(_register_block, _quiet_copy(registrar), blocks):
         if isinstance(result, WorkerError):
             found[task.number] = FailedRegistration(result.of_image(task.number))
         else:
@@ -81,13 +72,11 @@ def _register_block(registrar: RegistersItems, tasks: Sequence[_Task]) -> Result
     ]
 
 
-def _without_renderers(registrar: Copied) -> Copied:
-    """A copy without what is computed from the rest, and cannot be pickled."""
+def _quiet_copy(registrar: Copied) -> Copied:
+    """A copy that shows no progress and has no workers of its own."""
     other: Any = copy(registrar)
-    for name in COMPUTED:
-        other.__dict__.pop(name, None)
     other.progress = False
     other.workers = None
-    other.others = [_without_renderers(one) for one in registrar.others]
+    other.others = [_quiet_copy(one) for one in registrar.others]
     copied: Copied = other
     return copied

@@ -1,5 +1,7 @@
 import math
+import pickle
 from contextlib import nullcontext
+from copy import copy
 from dataclasses import replace
 
 import cv2
@@ -469,3 +471,13 @@ def test_a_mesh_that_is_absent_does_not_hide_the_answer_of_another(monkeypatch):
         both.register_views([IMAGE], None, CAMERA, None)
     absent.remove(both)
     assert both.register_views([IMAGE], None, CAMERA, None).mesh_index == 0
+
+
+def test_a_registrar_that_was_used_can_be_pickled_and_copied():
+    registrar = truck_registrar()
+    expected = registrar([IMAGE], BOX[None], CAMERA)[0]
+    content = pickle.dumps(registrar)
+    for other in (pickle.loads(content), copy(registrar)):
+        found = other([IMAGE], BOX[None], CAMERA)[0]
+        assert torch.equal(found.rotation, expected.rotation)
+    assert copy(registrar).describer is registrar.describer

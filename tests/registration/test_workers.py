@@ -1,12 +1,10 @@
 import os
-from functools import cached_property
 
 import pytest
 import torch
 
 from curvireg_torch import Registrar
 from curvireg_torch.errors import CurviregError, InvalidInputError, WorkerError
-from curvireg_torch.registration import workers
 from curvireg_torch.utils.executors import Workers
 from tests._support.scenes import CAMERA, scene, truck_bank
 
@@ -54,9 +52,3 @@ def test_one_photograph_needs_no_process(monkeypatch):
 def test_workers_are_counted(count):
     with pytest.raises(InvalidInputError, match="workers"):
         Registrar(truck_bank(), workers=count)
-
-
-def test_what_is_not_copied_is_computed_by_a_registrar():
-    """A name that is none of its would be copied, or fail to."""
-    for name in workers.COMPUTED:
-        assert isinstance(getattr(Registrar, name), cached_property), name
