@@ -127,78 +127,119 @@ def fit_to_edges(
     T0: Tensor,
     image_index: Tensor,
     *,
-    finish: int | None = None,
+    finish: int | Tensor | None = None,
     wide_angles: Sequence[float] = (),
     short_fits: Tensor | None = None,
     refit: bool = False,
     settings: FitSettings = FitSettings(),
 ) -> ContourFit:
-    """:func:`fit_contours` in crops that are cut, from checked starts ``T0`` (N, 4, 4) with cameras
-    ``K`` (N, 3, 3). ``short_fits`` (N, 4, 4) are the poses of a :func:`short_fit` from them, if
-    there was one. A pose that is fitted again (``refit``) is kept if the best fit at half size
-    returns to it."""
-    N = len(T0)
-    device = T0.device
-    rows = torch.arange(N, device=device)
-    full, half = (
-        ContourProblem.of(contours, crops, K, image_index, factor=factor) for factor in (1, 2)
-    )
+    """:func:`fit_contours` in crops that are cut, from checked starts, those of many photographs at
+    a time.
+
+    Args:
+        contours: of the mesh.
+        crops: of B photographs.
+        K: (N, 3, 3) cameras of the whole photographs.
+        T0: (N, 4, 4) starts.
+        image_index: (N,) the crop of each start.
+        finish: number of starts of each photograph that are fitted to the end, as one number or
+            (N,), that of the photograph of each start; None: all.
+        wide_angles: degrees, see :func:`fit_contours`.
+        short_fits: (N, 4, 4) poses of a :func:`short_fit` from the starts, if there was one.
+        refit: the starts are fitted poses. One is kept if the best fit at half size returns to it.
+        settings: of the fit.
+    """
+    full = ContourProblem.of(contours, crops, K, image_index)
+    half = ContourProblem.of(contours, crops, K, image_index, factor=2)
     if short_fits is None:
-        wide = _rotated(T0, half.centre, wide_angles)
-        every = rows.repeat_interleave(wide.shape[1])
-        short_fits = short_fit(contours, crops, K[every], wide.flatten(0, 1), image_index[every])[0]
+        short_fits = _short_fits_around(contours, crops, K, T0, image_index, wide_angles)
     angles = (settings.start_angle, settings.far_angle) if refit else (settings.start_angle,)
     rotated = _rotated(T0, half.centre, angles, roll=settings.start_roll)
-    around = torch.cat([rotated, short_fits.view(N, -1, 4, 4)], dim=1)
-    M = around.shape[1]
-    every = rows.repeat_interleave(M)
+    around = torch.cat([rotated, short_fits.view(len(T0), -1, 4, 4)], dim=1)
+
     begun = half.state(T0)
-    coarse = replace(half[every], density=COARSE_DENSITY)
-    before, weighted_before = half.supports(begun)
-    fits = coarse.moved(coarse.state(around.flatten(0, 1)), FIRST_RADII[0])
-    kept = (
-        coarse.supports(fits)[1]
-        .view(N, M)
-        .argsort(dim=1, descending=True, stable=True)[:, : settings.kept_starts]
-    )
-    T = fits.T[(kept + M * rows[:, None]).flatten()]
-    M = kept.shape[1]
-    every = rows.repeat_interleave(M)
-    fits = half[every].descend(half[every].state(T), FIRST_RADII[1:])
-    supports = half[every].supports(fits)[1].view(N, M)
-    support, best = supports.max(dim=1)
-    first = fits[rows * M + best]
-    chosen = (
-        torch.ones(N, dtype=torch.bool, device=device)
-        if finish is None
-        else _among_best(support, image_index, finish)
-    )
+    start_support, start_weighted = half.supports(begun)
+    promising = _promising(half, around, settings.kept_starts)
+    fits, supports = _fitted_at_half_size(half, promising)
+    support = supports.amax(dim=1)
+    chosen = torch.ones_like(support, dtype=torch.bool)
+    if finish is not None:
+        chosen = _among_best(support, image_index, finish)
     index = chosen.nonzero()[:, 0]
-    others = (~chosen).nonzero()[:, 0]
     source, T = _two_best(half, fits, supports, index)
     if refit:
-        leaves = (
-            half[index].mean_shift(begun.points[index], T0[index], T[: len(index)])
-            > SAME_POSE_SHIFT
-        )
-        source, T = source[leaves[source]], T[leaves[source]]
-    # Candidates: the starts, the half-size fits of unfinished starts, and the full-size fits. Ties
-    # go to the first.
-    owner = torch.cat([index, others, index[source]])
-    unfinished = torch.where(
-        (support > weighted_before)[others, None, None], first.T[others], T0[others]
-    )
-    fixed = torch.cat([T0[index], unfinished])
-    state = full[owner[: len(fixed)]].state(fixed)
+        shift = half[index].mean_shift(begun.points[index], T0[index], T[: len(index)])
+        leaves = (shift > SAME_POSE_SHIFT)[source]
+        source = source[leaves]
+        T = T[leaves]
+    # A start that is not finished ends with its best fit at half size, or stays.
+    rows = torch.arange(len(T0), device=T0.device)
+    best = fits.T.view(*supports.shape, 4, 4)[rows, supports.argmax(dim=1)]
+    improves = ~chosen & (support > start_weighted)
+    fixed = torch.where(improves[:, None, None], best, T0)
+    state, support, support_of_fixed = _best_at_full_size(full, fixed, T, index[source])
+    start_support = torch.where(chosen, support_of_fixed, start_support)
+    return measured_fit(full, state, support, start_support)
+
+
+def _short_fits_around(
+    contours: MeshContours,
+    crops: EdgeCrops,
+    K: Tensor,
+    T0: Tensor,
+    image_index: Tensor,
+    wide_angles: Sequence[float],
+) -> Tensor:
+    """(N * M, 4, 4) poses of short fits from starts (N, 4, 4) and from these rotated by
+    ``wide_angles``."""
+    wide = _rotated(T0, contours.centre, wide_angles)
+    every = _repeated(len(wide), wide.shape[1], T0.device)
+    poses = wide.flatten(0, 1)
+    return short_fit(contours, crops, K[every], poses, image_index[every])[0]
+
+
+def _promising(half: ContourProblem, around: Tensor, count: int) -> Tensor:
+    """(N, ``count``, 4, 4), or fewer: of the poses ``around`` (N, M, 4, 4) each start, those with
+    the most weighted support after a round with few points, as they are then."""
+    N, M, _, _ = around.shape
+    coarse = replace(half[_repeated(N, M, around.device)], density=COARSE_DENSITY)
+    fits = coarse.moved(coarse.state(around.flatten(0, 1)), FIRST_RADII[0])
+    supports = coarse.supports(fits)[1].view(N, M)
+    order = supports.argsort(dim=1, descending=True, stable=True)[:, :count]
+    return fits.T.view(N, M, 4, 4)[torch.arange(N, device=order.device)[:, None], order]
+
+
+def _fitted_at_half_size(half: ContourProblem, T: Tensor) -> tuple[ContourState, Tensor]:
+    """The fits (N * M) of poses (N, M, 4, 4) at half size, and their weighted supports (N, M)."""
+    N, M, _, _ = T.shape
+    each = half[_repeated(N, M, T.device)]
+    fits = each.descend(each.state(T.flatten(0, 1)), FIRST_RADII[1:])
+    return fits, each.supports(fits)[1].view(N, M)
+
+
+def _best_at_full_size(
+    full: ContourProblem, fixed: Tensor, T: Tensor, owner: Tensor
+) -> tuple[ContourState, Tensor, Tensor]:
+    """Of the ``fixed`` poses (N, 4, 4), one of each start, and the fits at full size from ``T`` (M,
+    4, 4), which belong to the starts ``owner`` (M,), the one with the most weighted support, the
+    first if several have it: its state and its support (N,); and the supports (N,) of the fixed
+    ones."""
+    N = len(fixed)
+    starts = torch.arange(N, device=owner.device)
+    candidates = torch.cat([starts, owner])
+    each = full[candidates]
+    state = each.state(torch.cat([fixed, T]))
     if len(T):
-        fitted = full[index[source]]
-        state = ContourState.cat([state, fitted.descend(fitted.state(T), FULL_SIZE_RADII)])
-    support, weighted = full[owner].supports(state)
-    before[index] = support[: len(index)]
-    best = torch.where(owner == rows[:, None], weighted, -1.0).argmax(dim=1)
-    state = state[best]
-    support = support[best]
-    return measured_fit(full, state, support, before)
+        fitted = each[N:].descend(state[N:], FULL_SIZE_RADII)
+        state = ContourState.cat([state[:N], fitted])
+    support, weighted = each.supports(state)
+    best = torch.where(candidates == starts[:, None], weighted, -1.0).argmax(dim=1)
+    return state[best], support[best], support[:N]
+
+
+def _repeated(count: int, times: int, device: torch.device) -> Tensor:
+    """Each of the rows 0 to ``count`` - 1 so many ``times``."""
+    return torch.arange(count, device=device).repeat_interleave(times)
 
 
 @torch.no_grad()
@@ -260,9 +301,9 @@ def _two_best(
     return source, each[source].descend(fits[chosen], SECOND_RADII).T
 
 
-def _among_best(support: Tensor, image_index: Tensor, count: int) -> Tensor:
-    """(N,) bool: whether fewer than ``count`` other starts of the same photograph have more
-    support."""
+def _among_best(support: Tensor, image_index: Tensor, count: int | Tensor) -> Tensor:
+    """(N,) bool: whether fewer than ``count``, a number or (N,), other starts of the same
+    photograph have more support."""
     order = torch.arange(len(support), device=support.device)
     ahead = (support > support[:, None]) | (
         (support == support[:, None]) & (order < order[:, None])

@@ -65,29 +65,39 @@ def contour_details(
 
 def compared(details: ContourDetails) -> tuple[Tensor, Tensor]:
     """The result of :func:`compare_details`."""
-    uv = details.uv
-    strength = details.strength
-    counted = details.counted
-    N = len(uv)
-    total = torch.zeros(N, N, dtype=torch.float64)
-    count = torch.zeros(N, N, dtype=torch.float64)
-    for a in range(N):
-        for b in range(N):
-            alone = counted[a] & _is_apart(uv[a], uv[b][details.valid[b]])
-            shared = counted[a] & ~alone
-            # Half of what contours have that both poses predict: the middle between a contour and
-            # none.
-            middle = 0.5 * strength[a][shared].sum() / shared.sum().clamp(min=1)
-            total[a, b] = ((strength[a] - middle) * alone).sum()
-            count[a, b] = alone.sum()
-    differ = torch.maximum(count, count.T)
-    scores = DETAILS_WEIGHT * (total - total.T) / differ.clamp(min=ENOUGH_POINTS)
+    N = len(details.uv)
+    first, second = torch.triu_indices(N, N, 1).unbind(0)
+    score, differs = compare_pairs(details, first, second)
+    scores = torch.zeros(N, N, dtype=torch.float64)
+    scores[first, second] = score
+    look_different = torch.zeros(N, N, dtype=torch.bool)
+    look_different[first, second] = differs
+    return scores - scores.T, look_different | look_different.T
+
+
+def compare_pairs(details: ContourDetails, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """:func:`compare_details` of M pairs of poses, of one photograph or of many: ``first`` and
+    ``second`` (M,) are their rows. (M,) scores, positive where the first is better, and (M,) bool,
+    whether they look different."""
+    distance = torch.cdist(details.uv[first], details.uv[second])
+    # what is valid and lies outside the photograph is near, too
+    to_second = distance.masked_fill(~details.valid[second, None], torch.inf).amin(dim=2)
+    to_first = distance.masked_fill(~details.valid[first][:, :, None], torch.inf).amin(dim=1)
+    gain, count = _alone(details, first, to_second > APART)
+    gain_of_second, count_of_second = _alone(details, second, to_first > APART)
+    differ = torch.maximum(count, count_of_second)
+    scores = DETAILS_WEIGHT * (gain - gain_of_second) / differ.clamp(min=ENOUGH_POINTS)
     looks_different = differ >= MIN_POINTS
     return torch.where(looks_different, scores, 0.0), looks_different
 
 
-def _is_apart(uv: Tensor, others: Tensor) -> Tensor:
-    """(P,) bool: points (P, 2) that are far from all others (Q, 2)."""
-    if not len(others):
-        return torch.ones(len(uv), dtype=torch.bool)
-    return torch.cdist(uv, others).amin(dim=1) > APART
+def _alone(details: ContourDetails, rows: Tensor, is_apart: Tensor) -> tuple[Tensor, Tensor]:
+    """(M,) by how much the strength of the points (M, P) that only these poses have exceeds the
+    middle between a contour and none, summed; and (M,) their number."""
+    strength = details.strength[rows]
+    counted = details.counted[rows]
+    alone = counted & is_apart
+    shared = counted & ~is_apart
+    # half of what contours have that both poses predict
+    middle = 0.5 * (strength * shared).sum(dim=1) / shared.sum(dim=1).clamp(min=1)
+    return ((strength - middle[:, None]) * alone).sum(dim=1), alone.sum(dim=1).double()

@@ -112,8 +112,10 @@ def least_squares_step(A: Tensor, b: Tensor, T: Tensor, centre: Tensor, damping:
 def step_fraction(step: Tensor, T: Tensor, centre: Tensor) -> Tensor:
     """(N,) in [0, 1]: the part of steps (N, 6) of poses that is not too long."""
     z = point_in_cameras(T, centre)[:, 2].clamp(min=0.0)
-    w, t = (torch.linalg.vector_norm(part, dim=1).clamp(min=1e-12) for part in step.split(3, dim=1))
-    return torch.minimum(MAX_ROTATION / w, MAX_TRANSLATION * z / t).clamp(max=1.0)
+    lengths = torch.linalg.vector_norm(step.unflatten(1, (2, 3)), dim=2).clamp(min=1e-12)
+    rotation, translation = lengths.unbind(1)
+    longest = torch.minimum(MAX_ROTATION / rotation, MAX_TRANSLATION * z / translation)
+    return longest.clamp(max=1.0)
 
 
 def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
@@ -121,7 +123,8 @@ def damped_solution(A: Tensor, b: Tensor, damping: float) -> Tensor:
     measurements."""
     damped = A.clone()
     diagonal = damped.diagonal(dim1=-2, dim2=-1)
-    diagonal += damping * diagonal + (1e-12 * damping * diagonal.amax(dim=-1, keepdim=True) + 1e-12)
+    largest = diagonal.amax(dim=-1, keepdim=True)
+    diagonal += damping * diagonal + (1e-12 * damping * largest + 1e-12)
     # without the check, which takes as long
     solution: Tensor = torch.linalg.solve_ex(damped, b).result[..., 0]
     return solution
@@ -232,29 +235,10 @@ def pose_covariance(
         (N, 6, 6) of (rotation, translation of the model's origin), NaN where too few edges were
         matched; (N,) number of known directions, 0 to 6.
     """
-    n = points.normals
     W = measured.weight
-    uv, along = project(points.model, torch.stack([-n[..., 1], n[..., 0]], dim=-1), T, K, centre)
-    position = point_in_cameras(T, centre)
-    cam = (points.model - centre) @ T[:, :3, :3].mT + position[:, None]
-    ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
-    sight = torch.zeros_like(along)
-    sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
+    uv, E = _information_of_errors(measured, points, T, K, centre, radius)
     A = measured.J.mT @ (W * measured.J)
-    E = NORMAL_ERROR**2 * along.mT @ (W * along) + (SIGHT_ERROR * radius) ** 2 * sight.mT @ (
-        W * sight
-    )
-    # Basis of directions in which A + E is the identity and A is diagonal; first normalise the
-    # units.
-    unit = (A + E).diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
-    identity = torch.eye(6, dtype=A.dtype, device=A.device)
-    total = unit[:, :, None] * (A + E) * unit[:, None] + 1e-9 * identity
-    lower = torch.linalg.cholesky(total)
-    half = torch.linalg.solve_triangular(lower, unit[:, :, None] * A * unit[:, None], upper=False)
-    fraction, vectors = torch.linalg.eigh(
-        torch.linalg.solve_triangular(lower, half.mT, upper=False)
-    )
-    basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
+    basis, fraction = _directions(A, A + E)
     known = fraction > OBSERVABLE_FRACTION
 
     g = summed_by_cells(uv, W * measured.distance * measured.J)
@@ -265,15 +249,51 @@ def pose_covariance(
     rotation, translation = (
         torch.linalg.vector_norm(part, dim=1).clamp(min=1e-300) for part in basis.split(3, dim=1)
     )
-    distance = torch.linalg.vector_norm(position, dim=1)[:, None]
+    distance = torch.linalg.vector_norm(point_in_cameras(T, centre), dim=1)[:, None]
     size = torch.minimum(UNKNOWN_ROTATION / rotation, distance / translation)
     unknown = basis * (~known * size)[:, None]
     C = C + unknown @ unknown.mT
     # From the translation e of the centre to that of the origin, e - w x (R centre).
-    lever = identity.repeat(len(C), 1, 1)
+    lever = torch.eye(6, dtype=C.dtype, device=C.device).repeat(len(C), 1, 1)
     lever[:, 3:, :3] = cross_matrix(T[:, :3, :3] @ centre)
     C = lever @ C @ lever.mT
+    C = 0.5 * (C + C.mT)
     enough = W.sum(dim=(1, 2)) > MIN_TOTAL_WEIGHT
-    return torch.where(enough[:, None, None], 0.5 * (C + C.mT), torch.nan), known.sum(
-        dim=1
-    ) * enough
+    return torch.where(enough[:, None, None], C, torch.nan), known.sum(dim=1) * enough
+
+
+def _information_of_errors(
+    measured: Measurements,
+    points: ContourPoints,
+    T: Tensor,
+    K: Tensor,
+    centre: Tensor,
+    radius: float,
+) -> tuple[Tensor, Tensor]:
+    """Pixels (N, P, 2) of contour points, and the information E (N, 6, 6) that errors of their
+    normals and of their places along the line of sight produce."""
+    n = points.normals
+    W = measured.weight
+    tangents = torch.stack([-n[..., 1], n[..., 0]], dim=-1)
+    uv, along = project(points.model, tangents, T, K, centre)
+    cam = (points.model - centre) @ T[:, :3, :3].mT + point_in_cameras(T, centre)[:, None]
+    ray = cam / torch.linalg.vector_norm(cam, dim=-1, keepdim=True).clamp(min=1e-12)
+    sight = torch.zeros_like(along)
+    sight[..., :3] = torch.linalg.cross(ray, measured.J[..., 3:])
+    of_normals = NORMAL_ERROR**2 * along.mT @ (W * along)
+    of_sight = (SIGHT_ERROR * radius) ** 2 * sight.mT @ (W * sight)
+    return uv, of_normals + of_sight
+
+
+def _directions(A: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Bases (N, 6, 6) of columns in which ``total`` is the identity and A is diagonal, and this
+    diagonal (N, 6): the fraction of the information in each direction."""
+    unit = total.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()  # normalises the units
+    scale = unit[:, :, None] * unit[:, None]
+    identity = torch.eye(6, dtype=A.dtype, device=A.device)
+    lower = torch.linalg.cholesky(scale * total + 1e-9 * identity)
+    half = torch.linalg.solve_triangular(lower, scale * A, upper=False)
+    whitened = torch.linalg.solve_triangular(lower, half.mT, upper=False)
+    fraction, vectors = torch.linalg.eigh(whitened)
+    basis = unit[:, :, None] * torch.linalg.solve_triangular(lower.mT, vectors, upper=True)
+    return basis, fraction

@@ -10,8 +10,9 @@ COLOUR_LEVELS = 8  # Levels of each colour channel in a histogram
 SECTORS = 12  # Directions from the object's centre in the image, each with its own histograms
 DIRECTIONS = 72  # Directions of which the log ratios are kept, each between two sectors
 LOCAL_WEIGHT = 0.7  # Weight of a sector's own histogram; the rest is the mean of all sectors
+BINS = COLOUR_LEVELS**3  # of a histogram
 # Added to probabilities, so that a colour never seen is not proof
-MIN_PROBABILITY = 0.3 / COLOUR_LEVELS**3
+MIN_PROBABILITY = 0.3 / BINS
 MAX_LOG_RATIO = 4.0  # Largest log ratio of one pixel
 LOG_RATIO_FACTOR = 0.3  # Factor of log ratios: neighbouring pixels are not independent
 LEARNING_RATE = 0.2  # Weight of a new frame in the histograms
@@ -41,11 +42,14 @@ def line_posterior(log_ratio: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     lines that point out of the object, L = 2 h + 1, h >= ``radius``.
     """
     half = log_ratio.shape[-1] // 2
-    log_likelihood = log_ratio.cumsum(dim=-1)[..., half - radius : half + radius]
-    d = torch.arange(-radius, radius, dtype=log_ratio.dtype) + 0.5  # between two pixels
+    within = slice(half - radius, half + radius)
+    log_likelihood = log_ratio.cumsum(dim=-1)[..., within]
     p = log_likelihood.softmax(dim=-1)
+    d = torch.arange(-radius, radius, dtype=log_ratio.dtype) + 0.5  # between two pixels
     mean = (p * d).sum(dim=-1)
-    return mean, (p * (d - mean[..., None]).square()).sum(dim=-1)
+    square = (d - mean[..., None]).square()
+    variance = (p * square).sum(dim=-1)
+    return mean, variance
 
 
 class Silhouette(NamedTuple):
@@ -67,10 +71,12 @@ class RegionModel:
     two sectors both count."""
 
     def __init__(self) -> None:
-        self._histograms = torch.zeros(2, SECTORS, COLOUR_LEVELS**3)
-        self._log_ratio = torch.zeros(DIRECTIONS * COLOUR_LEVELS**3)
-        apart = torch.arange(DIRECTIONS)[:, None] * (SECTORS / DIRECTIONS) - torch.arange(SECTORS)
-        apart = (apart + 0.5 * SECTORS) % SECTORS - 0.5 * SECTORS
+        self._histograms = torch.zeros(2, SECTORS, BINS)
+        self._log_ratio = torch.zeros(DIRECTIONS * BINS)
+        directions = torch.arange(DIRECTIONS) * (SECTORS / DIRECTIONS)
+        apart = directions[:, None] - torch.arange(SECTORS)
+        half_turn = 0.5 * SECTORS
+        apart = (apart + half_turn) % SECTORS - half_turn
         self._sectors = (1.0 - apart.abs()).clamp(min=0.0)  # weights in each direction
 
     def learn(self, bins: Tensor, uv: Tensor, directions: Tensor, inside: Tensor) -> None:
@@ -79,19 +85,25 @@ class RegionModel:
         object; empty histograms take all of them."""
         colour, seen = _colours_at(bins, uv)
         row = torch.where(inside, 0, DIRECTIONS) + _nearest(directions)[:, None]
-        place = row * COLOUR_LEVELS**3 + colour
-        counts = torch.zeros(2, DIRECTIONS, COLOUR_LEVELS**3)
+        place = row * BINS + colour
+        counts = torch.zeros(2, DIRECTIONS, BINS)
         counts.view(-1).index_add_(0, place.flatten(), seen.float().flatten())
-        new = self._sectors.mT @ counts
-        count = new.sum(dim=-1, keepdim=True)
-        new = new / count.clamp(min=1e-9)
+        of_sectors = self._sectors.mT @ counts
+        count = of_sectors.sum(dim=-1, keepdim=True)
+        new = of_sectors / count.clamp(min=1e-9)
         step = LEARNING_RATE * count / (count + HALF_RATE_COUNT)
         empty = self._histograms.sum(dim=-1, keepdim=True) == 0
-        self._histograms = torch.where(empty, new, (1.0 - step) * self._histograms + step * new)
-        p = _smooth(self._histograms)
-        p = LOCAL_WEIGHT * p + (1.0 - LOCAL_WEIGHT) * p.mean(dim=1, keepdim=True) + MIN_PROBABILITY
-        ratio = LOG_RATIO_FACTOR * (p[0] / p[1]).log().clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
-        self._log_ratio = (self._sectors @ ratio).view(-1)
+        moved = torch.lerp(self._histograms, new, step)
+        self._histograms = torch.where(empty, new, moved)
+        self._log_ratio = (self._sectors @ self._log_ratio_of_sectors()).view(-1)
+
+    def _log_ratio_of_sectors(self) -> Tensor:
+        """(SECTORS, BINS) of the histograms, smoothed, those of a sector mixed with the mean."""
+        local = _smooth(self._histograms)
+        mean = local.mean(dim=1, keepdim=True)
+        inside, outside = torch.lerp(mean, local, LOCAL_WEIGHT) + MIN_PROBABILITY
+        ratio: Tensor = (inside / outside).log()
+        return LOG_RATIO_FACTOR * ratio.clamp(-MAX_LOG_RATIO, MAX_LOG_RATIO)
 
     def ends(self, bins: Tensor, silhouette: Silhouette, radius: int) -> tuple[Tensor, Tensor]:
         """Mean and variance (Q,) of where within ``radius`` px of a silhouette the object's colours
@@ -105,7 +117,7 @@ class RegionModel:
         at (P, L, 2) px of lines in ``directions`` (P,); 0 outside the window."""
         colour, seen = _colours_at(bins, uv)
         row = _nearest(directions)[:, None]
-        return self._log_ratio[row * COLOUR_LEVELS**3 + colour] * seen
+        return self._log_ratio[row * BINS + colour] * seen
 
 
 def _colours_at(bins: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:

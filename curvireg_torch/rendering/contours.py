@@ -40,7 +40,7 @@ CREASE_BEND = 0.36
 LEVELS = ((64, 800), (128, 2500), (256, 8000))
 NEAR_PLANE = 1e-3  # Depth in object radii below which points are not projected
 BEHIND = 16  # Bit of a vertex nearer than that
-LENGTH_UNITS = 4096.0  # Parts of a px in which lengths of edges are measured
+LENGTH_UNITS = 2.0**20  # Parts of a px in which lengths of edges are measured
 EDGES_AT_A_TIME = 2**22  # Edges of all poses that are looked at together
 
 
@@ -235,29 +235,29 @@ class _Views:
     def _spread(self, pose: Tensor, edge: Tensor, count: int) -> _Places:
         """``count`` places in each view, evenly along its edges (M,), whose poses (M,) ascend."""
         N, V, _ = self.vertices.shape
-        # a last edge without length, so that there is one
-        pose = F.pad(pose, (0, 1), value=N - 1)
-        edge = F.pad(edge, (0, 1))
+        has_edges = len(edge) > 0
+        if not has_edges:
+            pose = edge = edge.new_zeros(1)
         vertices_before = V * pose
-        start = _taken(self.level.starts, edge) + vertices_before
-        end = _taken(self.level.ends, edge) + vertices_before
-        along = _taken(self.pixels, end) - _taken(self.pixels, start)
+        start = self.level.starts.index_select(0, edge) + vertices_before
+        end = self.level.ends.index_select(0, edge) + vertices_before
+        along = self.pixels.index_select(0, end) - self.pixels.index_select(0, start)
         span = along.abs()
-        beyond_start = _taken(self.beyond, start)
-        beyond_end = _taken(self.beyond, end)
+        beyond_start = self.beyond.index_select(0, start)
+        beyond_end = self.beyond.index_select(0, end)
         # Outside are edges whose ends share a bit, and those that reach behind the camera.
         outside = (beyond_start & beyond_end) | ((beyond_start | beyond_end) & BEHIND)
         length = span.masked_fill(outside != 0, 0.0).nan_to_num_(0.0, posinf=0.0)
-        length[-1] = 0.0
-        number, fraction, valid = _spread_evenly(length, pose, N, count)
-        chosen = _taken(edge, number)
+        number, fraction, valid = _spread_evenly(length * has_edges, pose, N, count)
+        chosen = edge.index_select(0, number).view(N, count)
         vertices = self.vertices.flatten(0, 1)
-        first = _taken(vertices, _taken(start, number))
-        second = _taken(vertices, _taken(end, number))
+        first = vertices.index_select(0, start.index_select(0, number)).view(N, count, 3)
+        second = vertices.index_select(0, end.index_select(0, number)).view(N, count, 3)
         at = torch.lerp(first, second, fraction[..., None])
-        sign = torch.where(self.side.gather(1, chosen), -1.0, 1.0)
-        scale = sign / _taken(span, number).clamp(min=1e-30)
-        normal = torch.view_as_real(1j * scale * _taken(along, number))
+        # across the edge, to the side on which its faces are not
+        turn = torch.where(self.side.gather(1, chosen), -1j, 1j)
+        unit = along / span.clamp(min=1e-30)
+        normal = torch.view_as_real(turn * unit.index_select(0, number).view(N, count))
         return _Places(chosen, fraction, at, normal, valid)
 
     def _smoothed(self, places: _Places) -> _Places:
@@ -315,8 +315,8 @@ def _spread_evenly(
     length: Tensor, pose: Tensor, poses: int, count: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """``count`` places for each of N ``poses``, evenly along its edges of lengths (M,); ``pose``
-    (M,) are the edges' poses, ascending. Returns (N, count): the number of the edge, the fraction
-    of its length, whether there is one."""
+    (M,) are the edges' poses, ascending. Returns the numbers (N * count,) of the edges, and, (N,
+    count), the fractions of their lengths, and whether there are edges."""
     # in whole units, whose sums are exact: places of a pose do not depend on the other poses
     length = (LENGTH_UNITS * length.double()).round()
     end = length.cumsum(dim=0)
@@ -327,14 +327,17 @@ def _spread_evenly(
     # Place k lies at (k + 1/2) / count of a pose's length: the number of places up to each edge's
     # end, in all poses
     rate = torch.where(has_edges, count / total, 0.0)
-    passed = ((end - _taken(before, pose)) * _taken(rate, pose) + 0.5).long() + count * pose
+    passed = (
+        (end - before.index_select(0, pose)) * rate.index_select(0, pose) + 0.5
+    ).long() + count * pose
     passed[-1] = count * poses
     places = torch.diff(passed, prepend=passed.new_zeros(1))
-    number = torch.repeat_interleave(places, output_size=count * poses).view(poses, count)
+    number = torch.repeat_interleave(places, output_size=count * poses)
     place = (torch.arange(count, device=pose.device) + 0.5) / count
     target = before[:-1, None] + place * total[:, None]
-    behind = _taken(end, number) - target
-    fraction = 1.0 - behind / _taken(length, number).clamp(min=1e-30)
+    behind = end.index_select(0, number).view(poses, count) - target
+    length_there = length.index_select(0, number).view(poses, count)
+    fraction = 1.0 - behind / length_there.clamp(min=1e-30)
     return number, fraction.clamp(0.0, 1.0).float(), has_edges[:, None].expand(poses, count)
 
 

@@ -78,14 +78,17 @@ def _drawn(
     N = len(pixels)
     buffer = torch.zeros(N * H * W, dtype=torch.float32, device=pixels.device)
     corners = pixels[:, faces]  # (N, F, 3, 2)
+    heights = z[:, faces]
     end = torch.tensor([W - 1, H - 1], dtype=pixels.dtype, device=pixels.device)
     # outside by a pixel at most, so that whole numbers hold them
-    low = torch.minimum(corners.amin(dim=2).ceil().clamp(min=0), end + 1).long()
-    high = torch.maximum(torch.minimum(corners.amax(dim=2).floor(), end), end.new_tensor(-1.0))
-    sides = (high.long() - low + 1).clamp(min=0)
-    is_visible = (z[:, faces] > NEAREST).all(dim=2)
-    count = sides[..., 0] * sides[..., 1] * is_visible
-    planes = _planes(corners, z[:, faces], orthographic)
+    first_pixel = corners.amin(dim=2).ceil()
+    last_pixel = corners.amax(dim=2).floor()
+    low = torch.minimum(first_pixel.clamp(min=0), end + 1).long()
+    high = torch.minimum(last_pixel, end).clamp(min=-1.0).long()
+    sides = (high - low + 1).clamp(min=0)
+    is_visible = (heights > NEAREST).all(dim=2)
+    count = sides.prod(dim=2) * is_visible
+    planes = _planes(corners, heights, orthographic)
     for first, last in _groups(count.sum(dim=1).tolist(), FRAGMENTS_AT_A_TIME):
         views = slice(first, last)
         some = _Triangles(low[views], sides[views], count[views], planes[views])
@@ -103,10 +106,12 @@ def _planes(corners: Tensor, z: Tensor, orthographic: bool) -> Tensor:
     a, b, c = corners.unbind(dim=2)
     u = b - a
     v = c - a
-    area = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    ux, uy = u.unbind(-1)
+    vx, vy = v.unbind(-1)
+    area = ux * vy - uy * vx
     scale = torch.where(area.abs() > 1e-9, 1.0 / area, torch.nan)  # no pixel: seen from the side
-    second = torch.stack([v[..., 1], -v[..., 0]], dim=-1) * scale[..., None]
-    third = torch.stack([-u[..., 1], u[..., 0]], dim=-1) * scale[..., None]
+    second = torch.stack([scale * vy, -scale * vx], dim=-1)
+    third = torch.stack([-scale * uy, scale * ux], dim=-1)
     height = z if orthographic else 1.0 / z.clamp(min=NEAREST)
     slopes = height[..., 1:] - height[..., :1]
     return torch.cat([a, second, third, height[..., :1], slopes], dim=-1).float()
@@ -133,16 +138,20 @@ def _draw(
     start = count.cumsum(dim=0) - count
     place = torch.arange(len(triangle), device=count.device) - start[triangle]
     width = triangles.sides[..., 0].flatten()[triangle]
-    corner = triangles.low.flatten(0, 1)[triangle]
-    x = corner[:, 0] + place % width
-    y = corner[:, 1] + place // width
+    left, top = triangles.low.flatten(0, 1)[triangle].unbind(1)
+    x = left + place % width
+    y = top + place // width
     plane = triangles.planes.flatten(0, 1)[triangle]
-    dx = x - plane[:, 0]
-    dy = y - plane[:, 1]
-    second = dx * plane[:, 2] + dy * plane[:, 3]
-    third = dx * plane[:, 4] + dy * plane[:, 5]
-    least = torch.minimum(torch.minimum(second, third), 1.0 - second - third)
-    value = plane[:, 6] + second * plane[:, 7] + third * plane[:, 8]
+    x0, y0, second_x, second_y, third_x, third_y, height, second_slope, third_slope = plane.unbind(
+        1
+    )
+    dx = x - x0
+    dy = y - y0
+    second = dx * second_x + dy * second_y
+    third = dx * third_x + dy * third_y
+    first_coordinate = 1.0 - second - third
+    least = torch.minimum(torch.minimum(second, third), first_coordinate)
+    value = height + second * second_slope + third * third_slope
     inverse = 1.0 / value if orthographic else value
     inverse = torch.where(least >= -BESIDE_TRIANGLE, inverse, 0.0)
     pixel = ((first + triangle // F) * H + y) * W + x

@@ -182,3 +182,38 @@ def test_points_outside_the_photograph_are_no_details(monkeypatch):
     own = line(-200.0, 12)
     found = closed_case(monkeypatch, [SHARED + own, SHARED], outside=-95.0)
     assert found == (0.0, False), "one of twelve is inside"
+
+
+def test_points_near_a_contour_outside_the_photograph_are_not_alone(monkeypatch):
+    own = [-94.5] * 8
+    beside = [-96.5] * 8
+    assert closed_case(monkeypatch, [SHARED + own, SHARED + beside], outside=-95.0) == (0.0, False)
+    alone = closed_case(monkeypatch, [SHARED + own, SHARED], outside=-95.0)
+    assert alone == (pytest.approx(10.0 * 8 * 0.4 / 16), True)
+
+
+def test_pairs_of_many_photographs_are_compared_as_each_alone():
+    generator = torch.Generator().manual_seed(0)
+    uv = 60.0 * torch.rand(5, 40, 2, generator=generator).double()
+    strength = torch.rand(5, 40, generator=generator).double()
+    valid = torch.rand(5, 40, generator=generator) < 0.8
+    counted = valid & (torch.rand(5, 40, generator=generator) < 0.8)
+    table = details.ContourDetails(uv, strength, valid, counted)
+    scores, differ = details.compared(table)
+    first = torch.tensor([0, 3, 4])
+    second = torch.tensor([2, 1, 0])
+    found, looks_different = details.compare_pairs(table, first, second)
+    assert bool(differ[first, second].all())
+    assert torch.equal(looks_different, differ[first, second])
+    torch.testing.assert_close(found, scores[first, second])
+    # by hand, of the first pair
+    gains = []
+    counts = []
+    for a, b in ((0, 2), (2, 0)):
+        far = torch.cdist(uv[a], uv[b][valid[b]]).amin(dim=1) > 4.0
+        alone = strength[a][counted[a] & far]
+        shared = strength[a][counted[a] & ~far]
+        gains.append(float((alone - 0.5 * shared.mean()).sum()))
+        counts.append(len(alone))
+    expected = 10.0 * (gains[0] - gains[1]) / max(*counts, 16)
+    assert float(found[0]) == pytest.approx(expected)

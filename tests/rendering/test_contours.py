@@ -130,6 +130,7 @@ def test_places_lie_evenly_along_the_edges_of_each_pose():
     length = torch.tensor([1.0, 0.0, 3.0, 2.0, 2.0, 0.0])
     pose = torch.tensor([0, 0, 0, 2, 2, 2])
     number, fraction, valid = _spread_evenly(length, pose, 3, 4)
+    number = number.view(3, 4)
     assert number[[0, 2]].tolist() == [[0, 2, 2, 2], [3, 3, 4, 4]]
     expected = torch.tensor([[1 / 2, 1 / 6, 1 / 2, 5 / 6], [1 / 4, 3 / 4, 1 / 4, 3 / 4]])
     torch.testing.assert_close(fraction[[0, 2]], expected)
