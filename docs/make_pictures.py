@@ -41,6 +41,16 @@ STEPS = {
     "confidence": (6, 0.5, "confidence", "registration/confidence.py"),
     "result": (7, 0.5, "result", "registration/result.py"),
 }
+TILE = 300  # px of the sides of an overlay of the README
+# Picture and part (left, top, right, bottom) of each
+OVERLAYS = (
+    ("demo", (340, 170, 840, 670)),
+    ("buddha-all", (376, 424, 560, 608)),
+    ("cup", (0, 0, 340, 340)),
+    ("buddha-all", (188, 212, 372, 396)),
+    ("buddha-all", (752, 212, 936, 396)),
+    ("buddha-all", (188, 636, 372, 820)),
+)
 ARROWS = (
     "mesh views saliency bank ranking",
     "photograph crop field query ranking fit confidence result",
@@ -158,6 +168,16 @@ def draw_architecture() -> None:
     save(figure, PICTURES / "architecture.webp")
 
 
+def draw_overlays() -> None:
+    """Six overlays, cut out of the pictures of other pages."""
+    picture = Image.new("RGB", (3 * TILE + 8, 2 * TILE + 4), "white")
+    for number, (name, place) in enumerate(OVERLAYS):
+        with Image.open(PICTURES / f"{name}.webp") as source:
+            tile = source.convert("RGB").crop(place).resize((TILE, TILE))
+        picture.paste(tile, ((TILE + 4) * (number % 3), (TILE + 4) * (number // 3)))
+    picture.save(PICTURES / "overlays.webp", quality=75)
+
+
 def tiled(pictures: Any, columns: int = 3) -> Any:
     """(N, 1, H, W) side by side, in rows, of which the last one is filled up with nothing."""
     import torch
@@ -171,6 +191,7 @@ def tiled(pictures: Any, columns: int = 3) -> Any:
 def main() -> None:
     matplotlib.use("agg")
     PAGE.write_text(page(), encoding="utf-8")
+    draw_overlays()
     draw_architecture()
     draw_overview(run())
 

@@ -1,6 +1,8 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -9,7 +11,7 @@ import torch
 
 from curvireg_torch import Registrar, ViewBank, camera_matrix
 from curvireg_torch.cli import main, parse
-from curvireg_torch.cli.register import _advice, _print_rivals, print_result
+from curvireg_torch.cli.register import _advice, _print_rivals, _write_pose, print_result
 from curvireg_torch.geometry import rotation_error, up_rotation, viewpoint_from_rotation
 from curvireg_torch.matching import list_cache
 from curvireg_torch.pipeline import PRESETS, Pipeline, ViewPolicy
@@ -330,10 +332,13 @@ def inputs_with(*, box=(300, 200, 500, 400), **picture):
 
 def test_advice_names_what_was_measured_or_says_less():
     document = {"warnings": [], "ambiguous": None, "translation": [0, 0, 1], "edge_support": 0.1}
+    document |= {"verdict": "no match"}
     document["confidence_features"] = {"border": 0, "undetermined": 0.1}
     assert "contours" not in _advice(document), "few edges alone are no cause"
     for change, words in (
         ({"warnings": ["?"]}, "what the warning names"),
+        ({"verdict": "unsure"}, "look whether its contours fit in the overlay"),
+        ({}, "check that the box is tight, and that the mesh is the object's"),
         ({"ambiguous": "half turn"}, "more than one pose"),
         ({"confidence_features": {"border": 1}}, "border of the photograph"),
         ({"translation": None}, "--camera"),
@@ -419,3 +424,15 @@ def test_rivals_and_hidden_features_are_named(capsys):
     )
     _print_rivals(tied | {"ambiguous": None})
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("covariance", [None, np.eye(6).tolist()])
+def test_a_pose_for_ros_without_a_covariance_is_named(tmp_path, capsys, covariance):
+    pose = {"translation": [1.0, 2.0, 3.0], "quaternion": [1.0, 0.0, 0.0, 0.0], "unit": "m"}
+    document = {**pose, "frame": "camera", "mesh": "part.stl", "covariance": covariance}
+    arguments = SimpleNamespace(format="ros", out=tmp_path, stamp=None, frame=None)
+    _write_pose(arguments, document, Mock())
+    assert (tmp_path / "pose.yaml").is_file()
+    assert (tmp_path / "pose_with_covariance.yaml").is_file() is (covariance is not None)
+    said = "curvireg: no pose_with_covariance.yaml, as this pose has no covariance\n"
+    assert capsys.readouterr().err == ("" if covariance else said)
