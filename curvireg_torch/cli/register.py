@@ -256,6 +256,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _checked_options(arguments: argparse.Namespace) -> "RegisterOptions":
     """The options; errors in them come before any photograph is read."""
     check_given(arguments.photos, arguments.meshes, arguments.list or arguments.views)
+    if arguments.list is not None and arguments.progress:  # a long one takes seconds
+        print(f"{arguments.list}: reading", file=sys.stderr, flush=True)
     load_libraries()
     options = register_options(arguments, arguments.photos, arguments.meshes)
     _ = options.open_pipeline(), options.network

@@ -219,19 +219,20 @@ def _as_workers_start() -> Iterator[None]:
 
 
 def _begin_work(alive: Connection) -> None:
-    """Prepare a new process: one thread, no Ctrl-C, and an end when the other end of the pipe
-    closes."""
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
+    """Prepare a new process: an end when the other end of the pipe closes, no Ctrl-C, and one
+    thread."""
 
     def watch() -> None:
         with suppress(EOFError, OSError):
             alive.recv_bytes()
         os._exit(1)
 
+    # before torch is imported, which takes seconds
     threading.Thread(target=watch, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    import torch
+
+    torch.set_num_threads(1)
 
 
 @dataclass

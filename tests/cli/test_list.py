@@ -2,6 +2,7 @@
 meshes."""
 
 import json
+import subprocess
 import sys
 
 import cv2
@@ -343,3 +344,25 @@ def test_photographs_of_telephones_in_folders_and_alone(folder, register, tmp_pa
     jpeg, missing = lines(tmp_path / "without")
     assert jpeg["verdict"] != "failed"
     assert "HEIC needs pi-heif: pip install 'curvireg_torch[heic]'" in missing["message"]
+
+
+FIRST_WORD = """
+import sys
+from curvireg_torch.cli import main, register
+
+def stop():
+    sys.exit(7)
+
+register.load_libraries = stop
+main(sys.argv[1:])
+"""
+
+
+def test_a_list_says_its_first_word_before_libraries_are_loaded(folder, tmp_path):
+    """Reading a long list takes seconds, too."""
+    path = written(tmp_path / "list.csv", "photo,x0,y0,x1,y1", ["a.png", *box_of(0)])
+    words = ["register", "--list", path, folder / "truck.safetensors", "--out", tmp_path / "out"]
+    for quiet, said in ((["--quiet"], ""), ([], f"{path}: reading\n")):
+        command = [sys.executable, "-c", FIRST_WORD, *map(str, words), *quiet]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240)
+        assert (done.returncode, done.stderr) == (7, said)
