@@ -201,60 +201,42 @@ def _xml(text: str) -> Any:
 
 
 def _yaml(text: str, expected: str) -> Any:
-    """The first document with content. Tags say nothing here, and aliases, which can blow a file
-    up, are refused."""
+    """The first document with content. Tags say nothing here."""
     text = re.sub(r"(?m)^%.*", "", text)  # OpenCV's "%YAML:1.0" is none of YAML's directives
-    root: list[Any] = []
-    open_values: list[Any] = [root]  # lists, and dicts in which a key waits for its value
-    keys: list[str | None] = [None]
     try:
-        for event in yaml.parse(text, Loader=_YAML_LOADER):
-            if isinstance(event, yaml.AliasEvent):
-                raise InvalidInputError(
-                    "has aliases (*name), which are not read; write it without them"
-                )
-            if isinstance(event, yaml.CollectionEndEvent):
-                open_values.pop()
-                keys.pop()
-            elif isinstance(event, yaml.NodeEvent):
-                _put(open_values, keys, event)
-            elif isinstance(event, yaml.DocumentEndEvent) and root[-1:] != [None]:
-                break
+        documents = (
+            _value(node, set(), MAX_DEPTH) for node in yaml.compose_all(text, _YAML_LOADER)
+        )
+        return next((value for value in documents if value is not None), None)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = "" if mark is None else f"line {mark.line + 1}: "
         raise InvalidInputError(f"{place}expected 'key: value'; expected {expected}") from error
-    return root[-1] if root else None
 
 
-def _put(open_values: list[Any], keys: list[str | None], event: Any) -> None:
-    """Add the value of an event of YAML where it belongs; it becomes the innermost open one if it
-    holds others."""
-    if len(open_values) > MAX_DEPTH:
+def _value(node: Any, known: set[int], depth: int) -> Any:
+    """The value of a node of YAML. A node that is met again is an alias, and refused: those can
+    blow a file up."""
+    if depth < 0:
         raise InvalidInputError("nested too deeply; write it again")
-    inside = open_values[-1]
-    if isinstance(event, yaml.ScalarEvent):
-        value: Any = _scalar(event)
-        if isinstance(inside, dict) and keys[-1] is None:
-            keys[-1] = str(event.value)
-            return
-    else:
-        value = {} if isinstance(event, yaml.MappingStartEvent) else []
-    if isinstance(inside, list):
-        inside.append(value)
-    elif keys[-1] is None:
-        raise InvalidInputError("a list or mapping where a key is expected; write it again")
-    else:
-        inside[keys[-1]] = value
-        keys[-1] = None
-    if not isinstance(event, yaml.ScalarEvent):
-        open_values.append(value)
-        keys.append(None)
+    if id(node) in known:
+        raise InvalidInputError("has aliases (*name), which are not read; write it without them")
+    known.add(id(node))
+    if isinstance(node, yaml.ScalarNode):
+        return _scalar(node)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, known, depth - 1) for item in node.value]
+    values = {}
+    for key, item in node.value:
+        if not isinstance(key, yaml.ScalarNode):
+            raise InvalidInputError("a list or mapping where a key is expected; write it again")
+        values[str(key.value)] = _value(item, known, depth - 1)
+    return values
 
 
-def _scalar(event: Any) -> Any:
-    text = event.value
-    if event.style in ("'", '"'):
+def _scalar(node: Any) -> Any:
+    text = node.value
+    if node.style in ("'", '"'):
         return text
     known = {"": None, "~": None, "null": None, "true": True, "false": False}
     return known.get(text.lower(), number(text))
