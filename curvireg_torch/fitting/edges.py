@@ -144,19 +144,21 @@ class _Pictures:
         # from px of the crop to the units of grid_sample, in which a picture's sides are 2
         unit = uv.new_tensor([2.0 / width, 2.0 / height])
         scale = unit * (self.side / size)
-        first_row = image_index * ((self.side + 2) * 2.0 / height)
-        start = scale * (uv + 0.5) + unit - 1.0
-        start[..., 1] += first_row[:, None]
+        start = torch.addcmul(0.5 * scale + unit - 1.0, uv, scale)
+        has_several = height > width
+        if has_several:
+            first_row = image_index[:, None] * (width * 2.0 / height)
+            start[..., 1] += first_row
         # A matrix product is four times as fast as start + offset x normal with its short rows.
         lines = torch.cat([start, scale * normals], dim=-1).float()
-        steps = torch.kron(
-            torch.stack([torch.ones_like(offsets), offsets]).float(),
-            torch.eye(2, dtype=torch.float32, device=offsets.device),
-        )
+        steps = torch.stack([torch.ones_like(offsets), offsets]).float()
+        axes = torch.eye(2, dtype=torch.float32, device=offsets.device)
+        steps = (steps[:, None, :, None] * axes[:, None]).view(4, 2 * L)
         grid = (lines.flatten(0, 1) @ steps).view(N, P * L, 2)
-        lowest = (first_row[:, None] + (0.5 * unit[1] - 1.0)).float()
-        highest = lowest + (self.side + 1) * 2.0 / height
-        grid[..., 1].clamp_(min=lowest, max=highest)
+        if has_several:
+            lowest = (first_row + (1.0 / height - 1.0)).float()
+            highest = lowest + (width - 1) * 2.0 / height
+            grid[..., 1].clamp_(min=lowest, max=highest)
         sampled = F.grid_sample(
             self.joined, grid.view(1, N * P, L, 2), padding_mode="border", align_corners=False
         )
