@@ -24,7 +24,7 @@ from .._support import miniature
 from .._support.exif import exif, with_exif
 from .._support.pages import DOCS, PAGES, ROOT, split_command, steps
 from .._support.peers import write_peers
-from ..mesh.step import step_file
+from ..formats.meshes.step import step_file
 
 # Commands that are not run here, and the reason
 SKIPPED = {
