@@ -3,6 +3,7 @@ and on which side a face lies."""
 
 import itertools
 import math
+import warnings
 import zipfile
 from collections.abc import Callable
 from io import BytesIO
@@ -565,3 +566,42 @@ def test_parts_of_a_robot_are_in_metres_whatever_their_own_unit(tmp_path: Path, 
     mesh, _ = load(robot(tmp_path, shape))
     assert mesh.units == "m"
     np.testing.assert_allclose(mesh.extents, [0.03, 0.02, 0.01])
+
+
+def test_colours_of_a_material_in_memory() -> None:
+    """Of one that states none, trimesh makes a grey, which is no colour of the mesh."""
+    for material, expected in (
+        (trimesh.visual.material.SimpleMaterial(diffuse=[10, 20, 30, 255]), [10, 20, 30]),
+        (trimesh.visual.material.SimpleMaterial(), None),
+        (trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255]), RED),
+    ):
+        mesh = trimesh.Trimesh(TRIANGLE, [[0, 1, 2]], process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((3, 2)), material=material)
+        colours = surface_colours(mesh)
+        found = None if colours is None else colours.corners[0, 0].tolist()
+        assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("length", "is_plausible"), [(0.004, False), (0.006, True), (99.0, True), (101.0, False)]
+)
+def test_sizes_of_objects_that_are_photographed(
+    tmp_path: Path, length: float, is_plausible: bool
+) -> None:
+    side = length / math.sqrt(3.0)
+    trimesh.creation.box((side, side, side)).export(tmp_path / "a.stl")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        cr.load_mesh(tmp_path / "a.stl", unit="m")
+    assert (caught == []) == is_plausible
+
+
+def test_objects_of_one_number_in_two_models_are_no_copies(tmp_path: Path, load: Load) -> None:
+    inner = threemf(tmp_path / "inner.3mf", solid(1), "")
+    with zipfile.ZipFile(inner) as archive:
+        content = archive.read("3D/3dmodel.model")
+    move = 'transform="1 0 0 0 1 0 0 0 1 100 0 0"'
+    items = f'<item objectid="1"/><item objectid="1" p:path="/3D/b.model" {move}/>'
+    path = threemf(tmp_path / "a.3mf", solid(1), items, more={"3D/b.model": content})
+    mesh, _ = load(path)
+    assert mesh.bounds[:, 0].tolist() == [-15, 115]
