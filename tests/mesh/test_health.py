@@ -202,3 +202,12 @@ def test_the_pose_of_a_mesh_far_from_its_origin() -> None:
     (first, near), (second, far) = poses
     assert float(cr.rotation_error(first, second)) < 1e-3
     np.testing.assert_allclose(far, near, atol=1e-6)
+
+
+def test_a_part_of_half_a_percent_is_no_leftover() -> None:
+    parts = [trimesh.creation.box((1.0, 1.0, 1.0))]
+    for side, place in ((0.07, 3.0), (0.02, -3.0)):
+        part = trimesh.creation.box((side, side, side))
+        parts.append(part.apply_translation([place, 0.0, 0.0]))
+    stray = stray_faces(trimesh.util.concatenate(parts))
+    assert stray.tolist() == [False] * 24 + [True] * 12

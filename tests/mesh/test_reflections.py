@@ -20,3 +20,11 @@ def test_plane_is_that_to_which_a_mesh_is_most_nearly_symmetric():
     bow = trimesh.creation.box((0.3, 0.8, 1.0)).apply_translation((0.9, 0.0, 0.4))
     plane = reflection_plane(trimesh.util.concatenate([hull, bow, mast]))
     assert abs(float(plane[1])) > 0.95, "but for its mast, the ship is symmetric from side to side"
+
+
+def test_a_knob_at_one_corner_is_no_symmetry() -> None:
+    """Most points of the surface have a mirror image: the few that have none count."""
+    knob = trimesh.creation.box((0.2, 0.2, 0.2))
+    knob.apply_translation([0.55, 0.7, 0.9])
+    whole = trimesh.util.concatenate([trimesh.creation.box((1.0, 1.3, 1.7)), knob])
+    assert reflection_plane(whole) is not None
