@@ -21,7 +21,7 @@ def run(words, **variables):
     return subprocess.run(
         [*PYTHON, "tests._support.small", *map(str, words)],
         env={**environment, **{name: str(value) for name, value in variables.items()}},
-        cwd=REPOSITORY, capture_output=True, text=True, timeout=120,
+        cwd=REPOSITORY, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
 
 
